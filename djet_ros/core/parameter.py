@@ -1,0 +1,55 @@
+"""
+How a parameter of a configuration dataclass describes itself.
+
+Everything that shows parameters to people (ROS declarations, YAML files, command-line flags)
+is derived from this description, so it is written once, beside the default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a parameter means and which values it takes; units belong into the text."""
+
+    text: str
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    odd: bool = False
+
+
+def parameter(default: Any, text: str, *, minimum: float | None = None,
+              maximum: float | None = None, choices: tuple[str, ...] = (),
+              odd: bool = False) -> Any:
+    """Declare a dataclass field with its default and its description."""
+    description = Description(text, minimum, maximum, choices, odd)
+    return field(default=default, metadata={'description': description})
+
+
+def describe(config: Any) -> dict[str, Description]:
+    """Descriptions of the plain (not nested) parameters of a config class or instance, by name."""
+    return {f.name: f.metadata['description'] for f in fields(config)
+            if 'description' in f.metadata}
+
+
+def check(config: Any) -> None:
+    """
+    Raise ValueError naming the first parameter whose value is outside its description.
+
+    For use in ``__post_init__``: a config that exists is a config that is valid.
+    """
+    for name, description in describe(config).items():
+        value = getattr(config, name)
+        if description.choices and value not in description.choices:
+            raise ValueError(f"{name} is '{value}'; choose from {', '.join(description.choices)}")
+        for bound, outside in ((description.minimum, lambda b: not value >= b),
+                               (description.maximum, lambda b: not value <= b)):
+            if bound is not None and outside(bound):
+                raise ValueError(f'{name} is {value}; it must lie between '
+                                 f'{description.minimum} and {description.maximum}')
+        if description.odd and value % 2 == 0:
+            raise ValueError(f'{name} is {value}; it must be odd')

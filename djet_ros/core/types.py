@@ -1,0 +1,77 @@
+"""The values that travel through the core: camera, features, and the relative pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, unique
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@unique
+class Status(str, Enum):
+    """What became of a frame or of a pair of frames."""
+
+    OK = 'OK'
+    FIRST_FRAME = 'FIRST_FRAME'
+    TOO_FEW_FEATURES = 'TOO_FEW_FEATURES'
+    TOO_FEW_MATCHES = 'TOO_FEW_MATCHES'
+    NO_PARALLAX = 'NO_PARALLAX'
+    DEGENERATE = 'DEGENERATE'
+    TIME_JUMP = 'TIME_JUMP'
+    SIZE_CHANGED = 'SIZE_CHANGED'
+
+
+@dataclass(frozen=True)
+class Features:
+    """
+    ORB features of one image.
+
+    points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) pyramid levels;
+    angles: (N,) degrees; responses: (N,); descriptors: (N, 32) uint8, rotated (for matching only).
+    """
+
+    points: Array
+    octaves: NDArray[np.int32]
+    angles: NDArray[np.float32]
+    responses: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """
+    The motion between two frames, ``x_current = R x_previous + t``, and what vouches for it.
+
+    R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be told
+    (status NO_PARALLAX and all failures). covariance_5: (5, 5) over (rotation vector in rad,
+    two tangent coordinates of t on the sphere); covariance_6: (6, 6) over (rotation vector, t),
+    of rank 5 because the length of t is fixed.
+
+    x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
+    the place of y after its final step onto the epipolar line; inliers: (N,) bool;
+    residuals: (N,) signed distances in pixels of y to its epipolar line;
+    hamming: (N,) descriptor distances at the final place in bits (NaN where not computed);
+    culled: how many matches left the sampled window; timings: stage -> seconds.
+    """
+
+    status: Status
+    R: Array = field(default_factory=lambda: np.eye(3))
+    t: Array = field(default_factory=lambda: np.zeros(3))
+    covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
+    covariance_6: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    x: Array = field(default_factory=lambda: np.empty((0, 2)))
+    y: Array = field(default_factory=lambda: np.empty((0, 2)))
+    y_opt: Array = field(default_factory=lambda: np.empty((0, 2)))
+    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
+    residuals: Array = field(default_factory=lambda: np.empty(0))
+    hamming: Array = field(default_factory=lambda: np.empty(0))
+    culled: int = 0
+    iterations: int = 0
+    timings: dict[str, float] = field(default_factory=dict)
