@@ -25,20 +25,63 @@ class EstimatorConfig:
         'or five_point (the start alone)', choices=METHODS)
     max_features: int = parameter(
         2000, 'ORB features detected per image', minimum=8, maximum=20000)
+    fast_threshold: int = parameter(
+        20, 'contrast in gray levels that makes a corner; lower it for dim images',
+        minimum=1, maximum=255)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)
+    ransac_threshold: float = parameter(
+        1.0, 'inlier threshold of the 5-point RANSAC start, in pixels', minimum=0.05, maximum=20.0)
+    starts: str = parameter(
+        'several', 'starting poses: five_point (RANSAC inliers only), or several (robust 5-point, '
+        'previous motion, pure forward; all matches)', choices=('several', 'five_point'))
     window: int = parameter(
-        7, 'side of the square in which a residual surface is sampled, in pixels',
+        5, 'side of the square in which a residual surface is sampled, in pixels',
         minimum=3, maximum=15, odd=True)
+    window_sigma: float = parameter(
+        1.0, 'Gaussian weight of the samples in the quadratic fit, in pixels; 0 weighs all alike',
+        minimum=0.0, maximum=15.0)
+    snap_reference: bool = parameter(
+        True, 'take geometry from the whole pixel at which the reference descriptor was sampled')
+    indefinite: str = parameter(
+        'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
+        'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
+    loss: str = parameter(
+        'geman_mcclure', 'robust loss over matches',
+        choices=('none', 'huber', 'cauchy', 'geman_mcclure'))
+    loss_scale: float = parameter(
+        3.0, 'where the loss bends, in robust standard deviations of the residuals',
+        minimum=0.1, maximum=100.0)
+    step: str = parameter(
+        'full', 'how far a keypoint moves towards its optimum per iteration: full, share (of the '
+        'way), or pixel (one pixel at most)', choices=('full', 'share', 'pixel'))
+    step_share: float = parameter(
+        0.3, "share of the way that a keypoint moves with step 'share'", minimum=0.01, maximum=1.0)
+    max_iterations: int = parameter(
+        2, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
+    epsilon: float = parameter(
+        1e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
+        minimum=1e-12, maximum=1.0)
+    min_parallax: float = parameter(
+        0.25, 'median parallax below which the direction of translation is not told '
+        '(NO_PARALLAX), in pixels', minimum=0.0, maximum=100.0)
 
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""
         check(self)
 
 
+# The paper does not say what becomes of surfaces without a minimum: they are kept.
+_PAPER: dict[str, Any] = {
+    'starts': 'five_point', 'window': 7, 'window_sigma': 0.0, 'snap_reference': False,
+    'indefinite': 'keep', 'loss': 'none', 'step': 'share', 'step_share': 0.3,
+    'max_iterations': 20,
+}
+
+
 def preset(name: str, **changes: Any) -> EstimatorConfig:
     """Give the preset 'best' or 'paper', with some parameters changed."""
     if name not in PRESETS:
         raise ValueError(f"preset is '{name}'; choose from {', '.join(PRESETS)}")
-    printed: dict[str, Any] = {} if name == 'best' else {}
+    printed = _PAPER if name == 'paper' else {}
     return replace(EstimatorConfig(), **{**printed, **changes})

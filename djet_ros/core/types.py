@@ -45,6 +45,21 @@ class Features:
 
 
 @dataclass(frozen=True)
+class View:
+    """
+    One image as the estimator wants it.
+
+    gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix; features: its ORB
+    features; smoothed: (H, W) uint8, gray as ORB's binary tests see it.
+    """
+
+    gray: NDArray[np.uint8]
+    K: Array
+    features: Features
+    smoothed: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class RelativePose:
     """
     The motion between two frames, ``x_current = R x_previous + t``, and what vouches for it.
@@ -57,8 +72,10 @@ class RelativePose:
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
     the place of y after its final step onto the epipolar line; inliers: (N,) bool;
     residuals: (N,) signed distances in pixels of y to its epipolar line;
-    hamming: (N,) descriptor distances at the final place in bits (NaN where not computed);
-    culled: how many matches left the sampled window; timings: stage -> seconds.
+    hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
+    losses: (N,) each match's loss on its surface, the last known one where it was culled;
+    culled: how many matches had no surface in the end; indefinite: how many surfaces had no
+    minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds.
     """
 
     status: Status
@@ -72,6 +89,8 @@ class RelativePose:
     inliers: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
     residuals: Array = field(default_factory=lambda: np.empty(0))
     hamming: Array = field(default_factory=lambda: np.empty(0))
+    losses: Array = field(default_factory=lambda: np.empty(0))
     culled: int = 0
+    indefinite: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,94 @@
+"""
+Two-view geometry: rotations, the essential and fundamental matrix, epipolar lines, chirality.
+
+Convention everywhere in the core: x in the previous image A, y in the current image B, and
+``X_B = R X_A + t``, so that ``y^T F x = 0`` with F = K^-T [t]_x R K^-1 (paper, "Epipolar
+Constrained Tracking").
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from djet_ros.core.types import Array
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrix [v]_x of a (3,) vector: ``skew(v) @ w == cross(v, w)``."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def rotation_exp(omega: Array) -> Array:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
+    return np.asarray(Rotation.from_rotvec(omega).as_matrix())
+
+
+def unit(v: Array) -> Array:
+    """Scale vectors along the last axis to length one; zero vectors stay zero."""
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.asarray(v / np.where(length > 0, length, 1.0))
+
+
+def sphere_tangents(t: Array) -> Array:
+    """Two orthonormal directions (3, 2) perpendicular to the unit vector t (3,)."""
+    axis = np.eye(3)[np.argmin(np.abs(t))]
+    first = unit(np.cross(t, axis))
+    return np.stack([first, np.cross(t, first)], axis=1)
+
+
+def homogeneous(points: Array) -> Array:
+    """Append a one: (N, 2) -> (N, 3)."""
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def rays(K: Array, points: Array) -> Array:
+    """Viewing rays K^-1 x (N, 3), with z = 1, of pixels (N, 2)."""
+    return np.asarray(homogeneous(points) @ np.linalg.inv(K).T)
+
+
+def essential(R: Array, t: Array) -> Array:
+    """Essential matrix E = [t]_x R, (3, 3)."""
+    return np.asarray(skew(t) @ R)
+
+
+def fundamental(K: Array, R: Array, t: Array) -> Array:
+    """Fundamental matrix F = K^-T [t]_x R K^-1, (3, 3)."""
+    K_inv = np.linalg.inv(K)
+    return np.asarray(K_inv.T @ essential(R, t) @ K_inv)
+
+
+def epipolar_lines(F: Array, x: Array) -> Array:
+    """Epipolar lines l = F x (N, 3) in image B, of pixels x (N, 2) of image A."""
+    return np.asarray(homogeneous(x) @ F.T)
+
+
+def line_distances(lines: Array, y: Array) -> Array:
+    """Signed distances (N,) in pixels of points y (N, 2) to lines (N, 3)."""
+    norm = np.hypot(lines[:, 0], lines[:, 1])
+    return np.asarray((homogeneous(y) * lines).sum(1) / np.maximum(norm, 1e-12))
+
+
+def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:
+    """
+    Tell, (N,) bool, which points have positive depth in both cameras (chirality).
+
+    Only signs are taken, so that far points count like near ones: cv2.recoverPose ignores points
+    beyond 50 baselines and then decides forward motion on a handful.
+    """
+    m = rays_x @ R.T
+    normal = np.cross(m, rays_y)
+    depth_x = -(np.cross(t, rays_y) * normal).sum(1)
+    depth_y = -(np.cross(t, m) * normal).sum(1)
+    return np.asarray((depth_x > 0) & (depth_y > 0))
+
+
+def rotation_angle(Ra: Array, Rb: Array) -> float:
+    """Angle in radians of the rotation between two rotations (Rodrigues' angle, section 5.1)."""
+    return float(Rotation.from_matrix(Ra.T @ Rb).magnitude())
+
+
+def direction_angle(ta: Array, tb: Array) -> float:
+    """Angle in radians between two directions (translation error, section 5.1)."""
+    return float(np.arctan2(np.linalg.norm(np.cross(ta, tb)), np.dot(ta, tb)))

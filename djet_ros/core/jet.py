@@ -1,0 +1,188 @@
+"""
+Joint epipolar tracking: one optimiser over (R, t) for every residual surface.
+
+With y* = y - A'^-1 b the minimum of a paraboloid and l = (g, l_3) = F x its epipolar line, the
+least value of the paraboloid on the line is
+
+    Q(v_opt) = Q(y*) + (y*^T l)^2 / (g^T A'^-1 g),
+
+so the summed loss of "Joint Epipolar Tracking" is a least-squares problem with one residual per
+match: the distance of y* to its epipolar line, weighed by the match's own 2x2 precision.
+R is moved on SO(3) from the left, t on the unit sphere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
+from djet_ros.core.paraboloid import Paraboloids, inverse_2x2
+from djet_ros.core.types import Array
+
+_MAX_STEPS = 30
+_STEP_TOLERANCE = 1e-8
+_MAX_DAMPING = 1e6
+
+
+@dataclass(frozen=True)
+class JetProblem:
+    """
+    Matches as the optimiser sees them; the last axis runs over the N matches.
+
+    rays_x, rays_y: (3, N) viewing rays of x and of the paraboloids' minima y*;
+    spread: (3, N) the entries 11, 12, 22 of K^-1 A'^-1 K^-T, so that g^T A'^-1 g is taken in
+    viewing-ray units. Residuals are in pixels for a surface of typical sharpness.
+    """
+
+    rays_x: Array
+    rays_y: Array
+    spread: Array
+
+    def subset(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice) -> JetProblem:
+        """Give the same problem on some of the matches."""
+        return JetProblem(self.rays_x[:, chosen], self.rays_y[:, chosen], self.spread[:, chosen])
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """
+    Weighed epipolar distances r (N,), their signs of curvature (N,) and Jacobian (5, N).
+
+    The match's loss is ``sign * r^2``; sign is -1 only for indefinite surfaces kept as printed.
+    tangents: (3, 2) the basis in which the last two parameters move t.
+    """
+
+    r: Array
+    sign: Array
+    jacobian: Array
+    tangents: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A pose (R, t), its summed loss, and the residuals there."""
+
+    R: Array
+    t: Array
+    cost: float
+    residuals: Residuals
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Robust loss rho(r) by name, with its bend at `scale` (in the unit of the residuals)."""
+
+    name: str = 'none'
+    scale: float = 1.0
+
+    def __call__(self, squared: Array) -> tuple[Array, Array]:
+        """Give rho(r) and the weight rho'(r) / 2r, both (N,), for squared residuals."""
+        u = squared / self.scale**2
+        if self.name == 'none':
+            return squared, np.ones_like(squared)
+        if self.name == 'cauchy':
+            return self.scale**2 * np.log1p(u), 1 / (1 + u)
+        if self.name == 'geman_mcclure':
+            return squared / (1 + u), 1 / (1 + u)**2
+        if self.name == 'huber':
+            root = np.sqrt(np.maximum(u, 1.0))
+            return self.scale**2 * np.where(u <= 1, u, 2 * root - 1), 1 / root
+        raise ValueError(f"loss is '{self.name}'; choose none, huber, cauchy or geman_mcclure")
+
+
+def jet_problem(K: Array, x: Array, paraboloids: Paraboloids) -> JetProblem:
+    """
+    Pose the problem for matches x (N, 2) with their paraboloids around y.
+
+    Paraboloids are divided by their typical (median) curvature, which leaves the optimum where
+    it is and gives residuals in pixels, so that losses compare across surfaces.
+    """
+    S = inverse_2x2(paraboloids.A)
+    widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
+    S = S / max(float(np.median(widths)), 1e-12) if len(S) else S
+    G = np.linalg.inv(K)[:2, :2]
+    M = G.T @ S @ G
+    return JetProblem(rays(K, x).T.copy(), rays(K, paraboloids.minima()).T.copy(),
+                      np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]))
+
+
+def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
+    """Residuals at the pose (R, t) with their analytic Jacobian over 3 + 2 parameters."""
+    m = R @ problem.rays_x
+    l1, l2, l3 = essential(R, t) @ problem.rays_x
+    y1, y2, y3 = problem.rays_y
+    s11, s12, s22 = problem.spread
+    e = y1 * l1 + y2 * l2 + y3 * l3
+    Ml1, Ml2 = s11 * l1 + s12 * l2, s12 * l1 + s22 * l2
+    variance = l1 * Ml1 + l2 * Ml2  # g^T A'^-1 g
+    size = np.maximum(np.abs(variance), 1e-24)
+    root, pull = np.sqrt(size), e * np.sign(variance) / size
+    # dr = w^T dl, with dl = t x (omega x m) for the rotation and dt x m for the translation.
+    w1, w2, w3 = (y1 - pull * Ml1) / root, (y2 - pull * Ml2) / root, y3 / root
+    w = np.stack([w1, w2, w3])
+    by_rotation = (t @ m) * w - (w * m).sum(0) * t[:, None]
+    m1, m2, m3 = m
+    moment = np.stack([m2 * w3 - m3 * w2, m3 * w1 - m1 * w3, m1 * w2 - m2 * w1])
+    tangents = sphere_tangents(t)
+    return Residuals(e / root, np.where(variance < 0, -1.0, 1.0),
+                     np.concatenate([by_rotation, tangents.T @ moment]), tangents)
+
+
+def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
+             max_steps: int = _MAX_STEPS) -> Solution:
+    """
+    Minimise the summed loss from a starting pose by Levenberg-Marquardt, iteratively reweighted.
+
+    Never ends above the cost of the start. t must have unit length.
+    """
+    residuals, (cost, weights) = _evaluate(problem, R, t, loss)
+    damping = 1e-4
+    for _ in range(max_steps):
+        step = _step(residuals, weights, damping)
+        if step is None:
+            break
+        R_new, t_new = moved(R, t, residuals.tangents, step)
+        trial, (trial_cost, trial_weights) = _evaluate(problem, R_new, t_new, loss)
+        if trial_cost < cost:
+            gain = cost - trial_cost
+            R, t, residuals, cost, weights = R_new, t_new, trial, trial_cost, trial_weights
+            damping = max(damping / 10, 1e-9)
+            if np.linalg.norm(step) < _STEP_TOLERANCE or gain < 1e-9 * abs(cost):
+                break
+        else:
+            damping *= 10
+            if damping > _MAX_DAMPING or np.linalg.norm(step) < _STEP_TOLERANCE:
+                break
+    return Solution(R, t, cost, residuals)
+
+
+def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
+    """Move a pose by a step (5,): rotation vector in rad from the left, then along the sphere."""
+    return rotation_exp(step[:3]) @ R, unit(t + tangents @ step[3:])
+
+
+def robust_scale(residuals: Array) -> float:
+    """Give the standard deviation of the inliers, from the median absolute residual."""
+    return 1.4826 * float(np.median(np.abs(residuals))) if len(residuals) else 1.0
+
+
+def _evaluate(problem: JetProblem, R: Array, t: Array,
+              loss: Loss) -> tuple[Residuals, tuple[float, Array]]:
+    residuals = epipolar_residuals(problem, R, t)
+    values, weights = loss(residuals.r**2)
+    return residuals, (float((residuals.sign * values).sum()), weights)
+
+
+def _step(residuals: Residuals, weights: Array, damping: float) -> Array | None:
+    """Damped Gauss-Newton step; indefinite surfaces pull with their sign, but curve upwards."""
+    J = residuals.jacobian
+    H = (J * weights) @ J.T
+    gradient = J @ (weights * residuals.sign * residuals.r)
+    diagonal = np.diag(H)
+    if not np.isfinite(H).all() or not diagonal.any():
+        return None
+    H = H + np.diag(damping * diagonal + 1e-12 * diagonal.max())
+    return np.asarray(-np.linalg.solve(H, gradient))

@@ -1,0 +1,116 @@
+"""
+Local paraboloids: the quadratic fit of the Appendix, and their minima on epipolar lines.
+
+A paraboloid is Q(v) = v^T A' v + 2 v^T b + c with v relative to its centre, in pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.types import Array
+
+# Least curvature of a projected paraboloid, as a share of the median curvature of all of them:
+# keeps a flat direction weak, and the algebra finite.
+_CURVATURE_FLOOR = 0.02
+
+
+@dataclass(frozen=True)
+class Paraboloids:
+    """
+    One paraboloid per match: v^T A' v + 2 v^T b + c with v = y - centre.
+
+    centres: (N, 2) pixels; A: (N, 2, 2) per square pixel; b: (N, 2) per pixel; c: (N,).
+    usable: (N,) bool, False where no paraboloid could be had and A, b, c mean nothing.
+    """
+
+    centres: Array
+    A: Array
+    b: Array
+    c: Array
+    usable: NDArray[np.bool_]
+
+    def minima(self) -> Array:
+        """Places y* = centre - A'^-1 b (N, 2) where the gradient vanishes."""
+        return np.asarray(self.centres - (inverse_2x2(self.A) @ self.b[:, :, None])[:, :, 0])
+
+    def values(self, y: Array) -> Array:
+        """Values (N,) of the paraboloids at pixels y (N, 2)."""
+        v = y - self.centres
+        quadratic = np.einsum('ni,nij,nj->n', v, self.A, v)
+        return np.asarray(quadratic + 2 * (v * self.b).sum(1) + self.c)
+
+
+@lru_cache(maxsize=32)
+def fit_operator(window: int, sigma: float) -> Array:
+    """
+    Least-squares solution (6, window^2) of z = D a (Appendix), row-major samples of a square.
+
+    Rows of the answer: a_11, a_22, a_12, a_1, a_2, a_0. With sigma > 0 pixels, samples are weighed
+    by a Gaussian: the outer part of a Hamming surface is not quadratic.
+    """
+    radius = window // 2
+    x2, x1 = np.mgrid[-radius:radius + 1, -radius:radius + 1].reshape(2, -1).astype(float)
+    D = np.stack([x1**2, x2**2, x1 * x2, x1, x2, np.ones_like(x1)], axis=1)
+    root = np.exp(-(x1**2 + x2**2) / (4 * sigma**2)) if sigma > 0 else np.ones_like(x1)
+    operator = np.linalg.pinv(D * root[:, None]) * root
+    operator.setflags(write=False)
+    return np.asarray(operator)
+
+
+def fit_paraboloids(surfaces: NDArray[np.uint16], centres: Array, sigma: float) -> Paraboloids:
+    """Fit sampled surfaces (P, P, N), indexed [v_y, v_x, k], around centres (N, 2)."""
+    window, _, count = surfaces.shape
+    a = fit_operator(window, sigma) @ surfaces.reshape(-1, count).astype(float)
+    a11, a22, a12, a1, a2, a0 = a
+    A = np.stack([a11, a12 / 2, a12 / 2, a22], axis=1).reshape(-1, 2, 2)
+    return Paraboloids(centres, A, np.stack([a1, a2], axis=1) / 2, a0, np.ones(count, bool))
+
+
+def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
+    """Tell, (N,) bool, which paraboloids have no minimum."""
+    A = paraboloids.A
+    determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1]**2
+    return np.asarray((determinant <= 0) | (A[:, 0, 0] + A[:, 1, 1] <= 0))
+
+
+def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
+    """Raise the eigenvalues of A' to a small positive floor, so that every surface has a minimum."""
+    eigenvalues, vectors = np.linalg.eigh(paraboloids.A)
+    positive = eigenvalues[eigenvalues > 0]
+    floor = _CURVATURE_FLOOR * (float(np.median(positive)) if len(positive) else 1.0)
+    raised = vectors * np.maximum(eigenvalues, floor)[:, None, :]
+    return replace(paraboloids, A=raised @ vectors.transpose(0, 2, 1))
+
+
+def inverse_2x2(A: Array) -> Array:
+    """Inverses of (N, 2, 2) symmetric matrices; singular ones get a huge, finite inverse."""
+    a, b, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 1]
+    determinant = a * d - b * b
+    determinant = np.where(np.abs(determinant) < 1e-12, 1e-12, determinant)
+    return np.asarray(np.stack([d, -b, -b, a], axis=1).reshape(-1, 2, 2)
+                      / determinant[:, None, None])
+
+
+def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
+    """
+    Optimum v_opt (N, 2) of v^T A' v + 2 v^T b + c on the epipolar lines g . v = h.
+
+    Paper: the closed form of "Epipolar Constrained Tracking". Its v_2 divides by g_2, which
+    vanishes for vertical lines; walking from the foot point along the line has no such hole.
+    g: (N, 2) first components of the lines; h: (N,) equals -(y, 1) F (x, 1)^T.
+    """
+    norm = np.maximum(np.hypot(g[:, 0], g[:, 1]), 1e-300)
+    normal = g / norm[:, None]
+    along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+    foot = normal * (h / norm)[:, None]
+    slope = (along * ((A @ foot[:, :, None])[:, :, 0] + b)).sum(1)
+    curvature = np.einsum('ni,nij,nj->n', along, A, along)
+    # A surface that is flat along its line gives no reason to move along it.
+    flat = np.abs(curvature) < 1e-12
+    walk = np.where(flat, 0.0, -slope / np.where(flat, 1.0, curvature))
+    return np.asarray(foot + walk[:, None] * along)

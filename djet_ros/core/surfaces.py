@@ -1,0 +1,155 @@
+"""
+The three residual surfaces: descriptor (D-JET), photometric (P-JET), re-projection (RP-E).
+
+They differ only in the paraboloid that they put around a point of the current image; the joint
+optimiser does not know which one it is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.hamming import describable, descriptor_bits, hamming_surfaces
+from djet_ros.core.paraboloid import (
+    Paraboloids,
+    fit_paraboloids,
+    indefinite,
+    project_to_positive,
+)
+from djet_ros.core.types import Array, View
+
+
+class ResidualSurface(Protocol):
+    """
+    What the joint optimiser asks of a match residual.
+
+    x: (N, 2) pixels of the reference points in the previous image.
+    """
+
+    x: Array
+
+    def around(self, y: Array) -> Paraboloids:
+        """Paraboloids of the residual, valid in the neighbourhood of y (N, 2)."""
+        ...
+
+
+class DescriptorSurface:
+    """Hamming match residual Q_k(v) = H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET)."""
+
+    def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
+        pixels = np.rint(x).astype(np.int64)
+        self._has_reference = describable(pixels, previous.smoothed.shape)
+        self._bits = np.zeros((256, len(x)), bool)
+        self._bits[:, self._has_reference] = descriptor_bits(
+            previous.smoothed, pixels[self._has_reference])
+        self._smoothed = current.smoothed
+        self._radius = config.window // 2
+        self._sigma = config.window_sigma
+        self.x = pixels.astype(float) if config.snap_reference else x
+
+    def around(self, y: Array) -> Paraboloids:
+        """Fit paraboloids to the Hamming surfaces around the whole pixels next to y."""
+        centres = np.rint(y).astype(np.int64)
+        usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
+        surfaces = hamming_surfaces(self._bits[:, usable], self._smoothed, centres[usable],
+                                    self._radius)
+        fitted = fit_paraboloids(surfaces, centres[usable].astype(float), self._sigma)
+        return _spread(fitted, usable, y)
+
+    def distances(self, y: Array) -> Array:
+        """Hamming distances (N,) in bits at the pixels next to y (N, 2); NaN off the image."""
+        pixels = np.rint(y).astype(np.int64)
+        usable = self._has_reference & describable(pixels, self._smoothed.shape)
+        distances = np.full(len(y), np.nan)
+        bits = descriptor_bits(self._smoothed, pixels[usable])
+        distances[usable] = (bits != self._bits[:, usable]).sum(0)
+        return distances
+
+
+class PhotometricSurface:
+    """Lucas-Kanade residual with structure tensor A' and a weight window (P-JET)."""
+
+    def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
+        radius = config.window // 2
+        steps = np.arange(-radius, radius + 1, dtype=np.float32)
+        self._offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        self._radius = radius
+        self._weights = _weight_window(self._offsets, config.window_sigma)
+        self._image = current.smoothed.astype(np.float32)
+        self._gradient = [cv2.Scharr(self._image, cv2.CV_32F, *order, scale=1 / 32)
+                          for order in ((1, 0), (0, 1))]
+        self._reference = self._sample(previous.smoothed.astype(np.float32), x)
+        self._has_reference = self._inside(x, previous.smoothed.shape)
+        self.x = x
+
+    def around(self, y: Array) -> Paraboloids:
+        """Second-order expansion of the intensity residual at the sub-pixel positions y."""
+        difference = self._reference - self._sample(self._image, y)
+        gx, gy = (self._sample(component, y) for component in self._gradient)
+        W = self._weights
+        a11, a12, a22 = (((gx * gx) @ W), ((gx * gy) @ W), ((gy * gy) @ W))
+        A = np.stack([a11, a12, a12, a22], axis=1).reshape(-1, 2, 2).astype(float)
+        b = -np.stack([(gx * difference) @ W, (gy * difference) @ W], axis=1).astype(float)
+        c = (difference**2 @ W).astype(float)
+        usable = self._has_reference & self._inside(y, self._image.shape)
+        return Paraboloids(np.array(y, float), A, b, c, usable)
+
+    def _sample(self, image: NDArray[np.float32], points: Array) -> NDArray[np.float32]:
+        """Bilinear samples (N, P^2) of the window around each point."""
+        places = points[:, None, :].astype(np.float32) + self._offsets
+        return np.asarray(cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR,
+                                    borderMode=cv2.BORDER_REPLICATE))
+
+    def _inside(self, points: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        margin = self._radius + 1
+        upper = np.array([shape[1], shape[0]]) - 1 - margin
+        return np.asarray(((points >= margin) & (points <= upper)).all(1))
+
+
+class ReprojectionSurface:
+    """Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E)."""
+
+    def __init__(self, x: Array, y: Array) -> None:
+        self.x = x
+        self._y = y
+
+    def around(self, y: Array) -> Paraboloids:
+        """Give the same circular paraboloid wherever the keypoint has moved."""
+        n = len(y)
+        return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
+                           np.zeros(n), np.ones(n, bool))
+
+
+def with_minimum(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloids, int]:
+    """
+    Decide what becomes of indefinite surfaces, and count them.
+
+    policy: 'project' gives them the nearest bowl, 'drop' marks them unusable, 'keep' leaves them
+    as the paper prints them.
+    """
+    bad = indefinite(paraboloids) & paraboloids.usable
+    if policy == 'project':
+        paraboloids = project_to_positive(paraboloids)
+    elif policy == 'drop':
+        paraboloids = replace(paraboloids, usable=paraboloids.usable & ~bad)
+    return paraboloids, int(bad.sum())
+
+
+def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    if sigma <= 0:
+        return np.ones(len(offsets), np.float32)
+    return np.asarray(np.exp(-(offsets**2).sum(1) / (2 * sigma**2)), np.float32)
+
+
+def _spread(fitted: Paraboloids, usable: NDArray[np.bool_], y: Array) -> Paraboloids:
+    """Put the fits of the usable points back among all N."""
+    n = len(y)
+    centres, A, b, c = y.copy(), np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)), np.zeros(n)
+    centres[usable], A[usable], b[usable], c[usable] = fitted.centres, fitted.A, fitted.b, fitted.c
+    return Paraboloids(centres, A, b, c, usable)
