@@ -1,0 +1,56 @@
+"""``djet kitti-to-bag``: a KITTI odometry sequence as a rosbag2."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from djet_ros.data.bag_writers import STORAGES, write_kitti_bag
+from djet_ros.data.kitti import KittiSequence
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+DESCRIPTION = """\
+Write a KITTI odometry sequence (image_0/*.png, calib.txt, times.txt) as a rosbag2 with
+/camera/image_rect, /camera/camera_info, /tf_static and, where there are poses,
+/ground_truth/pose. Stamps are those of times.txt plus 1000 s, because ROS takes 0 for "no time".
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        'kitti-to-bag', help='write a KITTI odometry sequence as a rosbag2',
+        description=DESCRIPTION)
+    parser.add_argument('sequence', type=Path, metavar='SEQUENCE_DIR',
+                        help='folder such as sequences/00')
+    parser.add_argument('out', type=Path, metavar='OUT', help='folder of the new bag')
+    parser.add_argument('--poses', type=Path, metavar='FILE',
+                        help='ground truth (default: ../../poses/NN.txt where it exists)')
+    parser.add_argument('--storage', choices=tuple(STORAGES), default='mcap',
+                        help='file format of the bag (default: %(default)s)')
+    parser.add_argument('--start', type=int, default=0, metavar='N',
+                        help='first frame (default: %(default)s)')
+    parser.add_argument('--end', type=int, metavar='N',
+                        help='frame after the last one (default: all)')
+    parser.add_argument('--overwrite', action='store_true',
+                        help='replace an existing bag once the new one is complete')
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert, with a progress bar on stderr, and say what was written."""
+    sequence = KittiSequence(args.sequence, args.poses, args.start, args.end)
+    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
+                  TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+        task = bar.add_task(sequence.name, total=len(sequence))
+        write_kitti_bag(sequence, args.out, args.storage, overwrite=args.overwrite,
+                        progress=lambda written: bar.update(task, completed=written))
+    seconds = (sequence.stamps_ns[-1] - sequence.stamps_ns[0]) / 1e9
+    truth = 'with' if sequence.poses is not None else 'without'
+    width, height = sequence.size
+    print(f'{args.out}: {len(sequence)} frames of {width}x{height}, {seconds:.1f} s, '
+          f'{truth} ground truth')
+    return 0

@@ -1,0 +1,1 @@
+"""Floor 2, data: image sequences, bags and trajectory files. Everything that touches a disk."""

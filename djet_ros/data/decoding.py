@@ -1,0 +1,137 @@
+"""
+Serialised messages of any ROS 1 or ROS 2 bag to message objects of ROS 2 Jazzy.
+
+A recording carries the definitions of its types. Where they are Jazzy's, or where it has none,
+Jazzy's own classes read it. Otherwise the recorded definition reads the bytes, and fields go by
+name into Jazzy's class: ROS 1's ``K`` becomes ``k``, its ``header.seq`` is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, TypeAlias
+
+from djet_ros.data.storages.base import BrokenFile, Connection
+from djet_ros.data.storages.compression import decompress_message, ZSTD_MAGIC
+from djet_ros.data.text import one_line
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+Decoder: TypeAlias = Callable[[memoryview], Any]
+
+# rosbags compiles a definition to code, one line per element of a fixed array.
+LONGEST_DEFINITION = 64 << 10
+LONGEST_FIXED_ARRAY = 1024
+
+FAMILIES = {'bool': 'bool', 'string': 'text', 'float32': 'float', 'float64': 'float'}
+
+
+@cache
+def jazzy() -> Typestore:
+    """Message types of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def message_type(name: str) -> type:
+    """Class of a message type of Jazzy, such as 'sensor_msgs/msg/Image'."""
+    return jazzy().types[name]
+
+
+def decoder(connection: Connection) -> Decoder:
+    """Make the function from bytes to a message for one connection, else BrokenFile."""
+    if connection.encoding not in ('cdr', 'ros1'):
+        raise BrokenFile(f"encoding '{connection.encoding[:40]}' is neither cdr nor ros1")
+    # The definition becomes generated code in rosbags, which fails on hostile text in any way.
+    try:
+        store = _store(connection)
+        store.get_msgdef(connection.msgtype)
+    except Exception as error:
+        raise BrokenFile(f"type '{connection.msgtype[:80]}' can't be read: "
+                             f'{type(error).__name__} {one_line(error)[:80]}') from error
+    convert: Callable[[Any], Any] = _identity
+    if store is not jazzy() and connection.msgtype in jazzy().types:
+        convert = _converter(store, connection.msgtype)
+    return partial(_decode, connection, store, convert)
+
+
+def _decode(connection: Connection, store: Typestore, convert: Callable[[Any], Any],
+            data: memoryview) -> Any:
+    ros1 = connection.encoding == 'ros1'
+    if not ros1 and data[:4] == ZSTD_MAGIC:
+        data = decompress_message(data)
+    deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    # As above: the code that reads the bytes was generated from what the file says.
+    try:
+        return convert(deserialize(data, connection.msgtype))
+    except Exception as error:
+        raise BrokenFile(f'it is no {connection.msgtype}: {one_line(error)[:120]}') from error
+
+
+def _store(connection: Connection) -> Typestore:
+    """Types to read a connection with: Jazzy's own if they are the same."""
+    if not connection.definition:
+        return get_typestore(Stores.ROS1_NOETIC) if connection.encoding == 'ros1' else jazzy()
+    if len(connection.definition) > LONGEST_DEFINITION:
+        raise ValueError(f'its definition has {len(connection.definition)} characters')
+    types = get_types_from_msg(connection.definition, connection.msgtype)
+    for _, fields in types.values():
+        for name, (kind, detail) in fields:
+            if kind == Nodetype.ARRAY and int(detail[1]) > LONGEST_FIXED_ARRAY:
+                raise ValueError(f"its field '{name}' is an array of {detail[1]}")
+    if connection.encoding == 'cdr' and all(
+            jazzy().fielddefs.get(name, ((), None))[1] == fields
+            for name, (_, fields) in types.items()):
+        return jazzy()
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+def _identity(message: Any) -> Any:
+    return message
+
+
+def _converter(source: Typestore, name: str) -> Callable[[Any], Any]:
+    """Make the function that copies a message of another store into Jazzy's class."""
+    recorded = {field.lower(): (field, kind) for field, kind in source.fielddefs[name][1]}
+    steps = []
+    for field, kind in jazzy().fielddefs[name][1]:
+        attribute, have = recorded.get(field.lower(), (field, None))
+        if have is None or not _alike(have, kind):
+            raise BrokenFile(f"type '{name}' was recorded without a field '{field}' as ROS 2 "
+                             'Jazzy has it')
+        steps.append((attribute, _copier(source, kind)))
+    cls = message_type(name)
+    return lambda message: cls(*(copy(getattr(message, attribute)) for attribute, copy in steps))
+
+
+def _copier(source: Typestore, kind: Any) -> Callable[[Any], Any]:
+    """Make the function that copies one field of a kind."""
+    if kind[0] == Nodetype.NAME:
+        return _converter(source, kind[1])
+    if kind[0] == Nodetype.BASE:
+        return _identity
+    inner, _ = kind[1]
+    if inner[0] == Nodetype.NAME:
+        convert = _converter(source, inner[1])
+        return lambda items: [convert(item) for item in items]
+    if inner[1][0] == 'string':
+        return _identity
+    dtype = getattr(np, {'bool': 'bool_', 'char': 'uint8', 'byte': 'uint8'}.get(
+        inner[1][0], inner[1][0]))
+    return lambda items: np.asarray(items, dtype=dtype)
+
+
+def _alike(have: Any, want: Any) -> bool:
+    """Tell whether values of one kind of field fit into another."""
+    if have[0] != want[0]:
+        return False
+    if have[0] == Nodetype.NAME:
+        return bool(have[1] == want[1])
+    if have[0] == Nodetype.BASE:
+        return FAMILIES.get(have[1][0], 'int') == FAMILIES.get(want[1][0], 'int')
+    fixed = have[0] == Nodetype.ARRAY
+    return _alike(have[1][0], want[1][0]) and (not fixed or have[1][1] == want[1][1])
