@@ -1,0 +1,157 @@
+"""The configuration: one source, read strictly, written so that it reads back."""
+
+import argparse
+from pathlib import Path
+
+from djet_ros.config import (
+    add_flags,
+    Config,
+    dump_yaml,
+    flag_values,
+    flat,
+    from_flat,
+    load_yaml,
+    with_values,
+)
+from djet_ros.core.config import preset
+from djet_ros.errors import DjetError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+SHIPPED = Path(__file__).parent.parent / 'config' / 'vo.yaml'
+
+
+def written(tmp_path, text):
+    path = tmp_path / 'some.yaml'
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_yaml_is_the_generated_one():
+    expected = dump_yaml(Config(), preset_as_comments=True)
+    assert SHIPPED.read_text() == expected, (
+        "write config/vo.yaml anew: python -c 'from djet_ros.config import *; "
+        "print(dump_yaml(Config(), preset_as_comments=True), end=str())' > config/vo.yaml")
+
+
+def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
+    assert load_yaml(SHIPPED) == Config()
+    assert load_yaml(SHIPPED, from_flat({'preset': 'paper'})).preset == 'best'
+    assert '# method: "djet"' in SHIPPED.read_text()
+
+
+def test_every_parameter_says_what_it_means():
+    for item in flat(Config()).values():
+        assert len(item.description.text) > 10, item.name
+
+
+@pytest.mark.parametrize('as_comments', [False, True])
+def test_a_written_configuration_reads_back_equal(tmp_path, as_comments):
+    config = from_flat({'preset': 'paper', 'estimator.window': 9, 'odometry.odom_frame': 'a: "b"',
+                        'odometry.scale_value': 1e-6, 'ros.publish_tf': True,
+                        'odometry.rectified': 'true'})
+    path = written(tmp_path, dump_yaml(config, preset_as_comments=as_comments))
+    assert load_yaml(path) == config
+
+
+def test_plain_and_ros_layout_give_the_same(tmp_path):
+    plain = load_yaml(written(tmp_path, 'estimator: {method: rpe}\nros.qos_depth: 7\n'))
+    ros = load_yaml(written(tmp_path, """
+        /other: {ros__parameters: {speed: 1}}
+        /**: {ros__parameters: {use_sim_time: true, estimator.method: djet}}
+        /robot/vo_node: {ros__parameters: {estimator: {method: rpe}, ros: {qos_depth: 7}}}
+        """))
+    assert plain == ros == from_flat({'estimator.method': 'rpe', 'ros.qos_depth': 7})
+
+
+def test_a_small_float_without_a_point_is_a_number(tmp_path):
+    config = load_yaml(written(tmp_path, 'odometry: {scale_value: 1e-3}'))
+    assert config.odometry.scale_value == 1e-3
+
+
+def test_a_preset_sets_the_estimator_and_explicit_values_come_on_top():
+    config = from_flat({'estimator.window': 11, 'preset': 'paper'})
+    assert config.estimator == preset('paper', window=11)
+    again = with_values(config, {'preset': 'best'})
+    assert again.estimator == preset('best')
+
+
+def test_integers_are_taken_for_floats_and_floats_not_for_integers():
+    config = from_flat({'odometry.max_gap': 2})
+    assert config.odometry.max_gap == 2.0
+    assert type(config.odometry.max_gap) is float
+    with pytest.raises(DjetError, match=r'estimator\.window is 7\.0; it must be of type int'):
+        from_flat({'estimator.window': 7.0})
+
+
+@pytest.mark.parametrize('name, value, message', [
+    ('estimator.windw', 7, "did you mean 'estimator.window'"),
+    ('max_gap', 1.0, "did you mean 'odometry.max_gap'"),
+    ('zzzzzz', 1, "unknown parameter 'zzzzzz'"),
+    ('estimator.window', 8, 'must be odd'),
+    ('estimator.window', 700, 'between 3 and 15'),
+    ('estimator.window', True, 'of type int'),
+    ('estimator.method', 'sift', 'choose from djet'),
+    ('preset', 'worst', 'choose from best'),
+    ('odometry.max_gap', float('nan'), 'finite'),
+    ('odometry.max_gap', 10 ** 400, 'finite'),
+    ('odometry.max_gap', -1, 'between'),
+    ('odometry.max_gap', None, 'of type float'),
+    ('ros.publish_tf', 1, 'of type bool'),
+])
+def test_a_wrong_value_is_refused_in_one_line_that_names_it(name, value, message):
+    with pytest.raises(DjetError, match=message) as caught:
+        from_flat({name: value})
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', [
+    'estimator: [1, 2]', '- 1', 'a: &a [*a]', 'x: {y: {z: 1}}', 'estimator: {window: {a: 1}}',
+    '!!python/object/apply:os.system [true]', '{', '\x00', 'estimator: 2001-99-99',
+    '[' * 5000, 'n: ' + '9' * 5000, 'odometry: {max_gap: 0x' + 'f' * 5000 + '}', '/**: {ros__parameters: 7}', 'text',
+])
+def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text):
+    path = written(tmp_path, text)
+    with pytest.raises(DjetError) as caught:
+        load_yaml(path)
+    assert str(caught.value).startswith(str(path))
+    assert '\n' not in str(caught.value)
+
+
+def test_a_missing_a_huge_and_a_binary_file_are_refused(tmp_path):
+    huge = written(tmp_path, '# ' + 'x' * 3_000_000)
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(bytes(range(128, 256)))
+    for path in (tmp_path / 'absent.yaml', tmp_path, huge, binary):
+        with pytest.raises(DjetError):
+            load_yaml(path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(
+    st.one_of(st.sampled_from([*flat(Config()), 'estimator', 'ros']), st.text(max_size=8)),
+    st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+                 lambda inner: st.lists(inner, max_size=2), max_leaves=3), max_size=4))
+def test_no_values_raise_anything_but_our_error(values):
+    try:
+        config = from_flat(values)
+    except DjetError:
+        return
+    assert {name: flat(config)[name].value for name in values}.keys() == values.keys()
+
+
+def test_flags_carry_only_what_was_given():
+    parser = argparse.ArgumentParser()
+    add_flags(parser, ['preset', 'estimator.method', 'odometry.max_gap', 'ros.publish_tf'])
+    args = parser.parse_args(['--method', 'rpe', '--max-gap', '3', '--publish-tf', 'true'])
+    assert flag_values(args) == {
+        'estimator.method': 'rpe', 'odometry.max_gap': 3.0, 'ros.publish_tf': True}
+    assert '--max-gap' in parser.format_help()
+
+
+def test_a_flag_that_cannot_be_read_is_named():
+    parser = argparse.ArgumentParser()
+    add_flags(parser, ['odometry.max_gap'])
+    with pytest.raises(DjetError, match=r"odometry\.max_gap is 'soon'; it must be of type float"):
+        flag_values(parser.parse_args(['--max-gap', 'soon']))
