@@ -46,6 +46,8 @@ class EstimatorConfig:
     indefinite: str = parameter(
         'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
+    cull_outside: bool = parameter(
+        True, 'leave out matches whose surface has its minimum outside the sampled window')
     loss: str = parameter(
         'geman_mcclure', 'robust loss over matches',
         choices=('none', 'huber', 'cauchy', 'geman_mcclure'))
@@ -74,7 +76,7 @@ class EstimatorConfig:
 # The paper does not say what becomes of surfaces without a minimum: they are kept.
 _PAPER: dict[str, Any] = {
     'starts': 'five_point', 'window': 7, 'window_sigma': 0.0, 'snap_reference': False,
-    'indefinite': 'keep', 'loss': 'none', 'step': 'share', 'step_share': 0.3,
+    'indefinite': 'keep', 'cull_outside': False, 'loss': 'none', 'step': 'share', 'step_share': 0.3,
     'max_iterations': 20,
 }
 

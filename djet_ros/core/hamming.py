@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from djet_ros.core.orb_pattern import REACH, TESTS
+from djet_ros.core.types import Array
 
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]
@@ -30,10 +31,10 @@ def smooth(gray: Image) -> Image:
     return np.asarray(cv2.sepFilter2D(gray, -1, kernel, kernel), np.uint8)
 
 
-def describable(points: Pixels, shape: tuple[int, int], radius: int = 0) -> NDArray[np.bool_]:
+def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0) -> NDArray[np.bool_]:
     """Tell, (N,) bool, where a descriptor can be had at every pixel within `radius`."""
     margin = REACH + radius
-    height, width = shape
+    height, width = shape[:2]
     return np.asarray((points[:, 0] >= margin) & (points[:, 0] < width - margin)
                       & (points[:, 1] >= margin) & (points[:, 1] < height - margin))
 
@@ -71,6 +72,21 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
         patches = _gather_patches(smoothed, centres[block], REACH + radius)
         surfaces[:, :, block] = _count_differing_tests(bits[:, block], patches, radius)
     return surfaces
+
+
+def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) -> Array:
+    """
+    Hamming match residuals H(d(x), d(y)), (N,) bits, at the whole pixels next to x, y (N, 2).
+
+    NaN where one of the two is too close to the border for a descriptor.
+    """
+    x_pixels, y_pixels = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+    inside = describable(x_pixels, smoothed_a.shape) & describable(y_pixels, smoothed_b.shape)
+    distances = np.full(len(x), np.nan)
+    differing = (descriptor_bits(smoothed_a, x_pixels[inside])
+                 != descriptor_bits(smoothed_b, y_pixels[inside]))
+    distances[inside] = differing.sum(0)
+    return distances
 
 
 def _gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:

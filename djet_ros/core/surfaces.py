@@ -62,15 +62,6 @@ class DescriptorSurface:
         fitted = fit_paraboloids(surfaces, centres[usable].astype(float), self._sigma)
         return _spread(fitted, usable, y)
 
-    def distances(self, y: Array) -> Array:
-        """Hamming distances (N,) in bits at the pixels next to y (N, 2); NaN off the image."""
-        pixels = np.rint(y).astype(np.int64)
-        usable = self._has_reference & describable(pixels, self._smoothed.shape)
-        distances = np.full(len(y), np.nan)
-        bits = descriptor_bits(self._smoothed, pixels[usable])
-        distances[usable] = (bits != self._bits[:, usable]).sum(0)
-        return distances
-
 
 class PhotometricSurface:
     """Lucas-Kanade residual with structure tensor A' and a weight window (P-JET)."""

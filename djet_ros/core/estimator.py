@@ -1,0 +1,142 @@
+"""From two views to their relative pose: the way of a pair on one screen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.covariance import pose_covariance
+from djet_ros.core.features import detect_orb, match_features
+from djet_ros.core.geometry import epipolar_lines, fundamental, in_front, line_distances, rays
+from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.starts import Pose, five_point, several
+from djet_ros.core.surfaces import (
+    DescriptorSurface,
+    PhotometricSurface,
+    ReprojectionSurface,
+    ResidualSurface,
+)
+from djet_ros.core.tracking import Track, hold, track_jointly
+from djet_ros.core.types import Array, Features, RelativePose, Status, View
+
+
+class TwoViewEstimator:
+    """
+    Estimates the relative pose of two calibrated views, ``x_current = R x_previous + t``.
+
+    Has no state but its parameters: the same views and prior give the same result.
+    """
+
+    def __init__(self, config: EstimatorConfig | None = None) -> None:
+        self.config = config or EstimatorConfig()
+
+    def view(self, gray: NDArray[np.uint8], K: Array) -> View:
+        """Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3)."""
+        return View(gray, K, self.features(gray), smooth(gray))
+
+    def features(self, gray: NDArray[np.uint8]) -> Features:
+        """Detect the ORB features of a gray image (H, W) uint8."""
+        return detect_orb(gray, self.config.max_features, self.config.fast_threshold)
+
+    def estimate(self, previous: View, current: View,
+                 prior: RelativePose | None = None) -> RelativePose:
+        """
+        Estimate the motion from the previous to the current view.
+
+        prior: the motion before this one, as one more starting pose. Never raises on image
+        content: what can't be estimated comes back with a status that says why.
+        """
+        timings: dict[str, float] = {}
+        with _timed(timings, 'matching'):
+            matches = match_features(previous.features, current.features)
+        x = previous.features.points[matches[:, 0]]
+        y = current.features.points[matches[:, 1]]
+        return replace(self.estimate_matched(previous, current, x, y, prior, timings),
+                       timings=timings)
+
+    def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
+                         prior: RelativePose | None = None,
+                         timings: dict[str, float] | None = None) -> RelativePose:
+        """Estimate from given matches x, y (N, 2) in pixels of the two views."""
+        timings = {} if timings is None else timings
+        config, K = self.config, current.K
+        if len(x) < config.min_matches:
+            return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+
+        # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
+        with _timed(timings, 'starts'):
+            wide = config.starts == 'several' and config.method != 'five_point'
+            found = five_point(K, x, y, config.ransac_threshold, robust=wide)
+            if found is None and not wide:
+                return RelativePose(Status.DEGENERATE, x=x, y=y)
+            starts = several(found[0] if found else None, _pose(prior)) if wide else [found[0]]
+            if not wide:
+                x, y = x[found[1]], y[found[1]]
+
+        # Joint epipolar tracking on the residual surfaces.
+        with _timed(timings, 'jet'):
+            surface = self._surface(previous, current, x, y)
+            track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
+                     else track_jointly(surface, K, y, starts, config))
+        if track is None:
+            return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+        with _timed(timings, 'result'):
+            return self._result(previous, current, surface, y, track)
+
+    def _surface(self, previous: View, current: View, x: Array, y: Array) -> ResidualSurface:
+        if self.config.method == 'djet':
+            return DescriptorSurface(previous, current, x, self.config)
+        if self.config.method == 'pjet':
+            return PhotometricSurface(previous, current, x, self.config)
+        return ReprojectionSurface(x, y)
+
+    def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
+                track: Track) -> RelativePose:
+        """Settle the direction of t, the covariance, and whether there was parallax at all."""
+        x, K, R = surface.x, current.K, track.pose.R
+        inliers = track.inliers()
+        # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
+        rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
+        ahead, behind = (int(in_front(R, t, rays_x, rays_y).sum())
+                         for t in (track.pose.t, -track.pose.t))
+        t = track.pose.t if ahead >= behind else -track.pose.t
+
+        covariance_5, covariance_6 = pose_covariance(track.residuals, track.loss)
+        status = Status.OK
+        if inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all():
+            status = Status.DEGENERATE
+        elif _parallax(K, R, x, track.minima, inliers) < self.config.min_parallax:
+            status, t = Status.NO_PARALLAX, np.zeros(3)
+        lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
+        return RelativePose(
+            status, R, t, covariance_5, covariance_6, x=x, y=y, y_opt=track.y_opt,
+            inliers=inliers, residuals=line_distances(lines, y),
+            hamming=match_distances(previous.smoothed, x, current.smoothed, track.y_opt),
+            losses=track.losses, culled=int((~track.voting).sum()), indefinite=track.indefinite,
+            iterations=track.iterations)
+
+
+def _pose(prior: RelativePose | None) -> Pose | None:
+    """Take a previous motion as a start, if its direction is known."""
+    return Pose(prior.R, prior.t) if prior is not None and prior.t.any() else None
+
+
+def _parallax(K: Array, R: Array, x: Array, y: Array, chosen: NDArray[np.bool_]) -> float:
+    """Median distance in pixels of y from where rotation alone would bring x."""
+    rotated = rays(K, x[chosen]) @ (K @ R).T
+    return float(np.median(np.linalg.norm(y[chosen] - rotated[:, :2] / rotated[:, 2:], axis=1)))
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    start = perf_counter()
+    try:
+        yield
+    finally:
+        timings[stage] = perf_counter() - start

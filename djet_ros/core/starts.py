@@ -1,0 +1,56 @@
+"""Starting poses for the joint optimisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.geometry import in_front, rays
+from djet_ros.core.types import Array
+
+# Translation X_B = X_A + t of a camera that drives straight ahead.
+FORWARD = np.array([0.0, 0.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A relative pose: R (3, 3), and t (3,) of unit length."""
+
+    R: Array
+    t: Array
+
+
+def five_point(K: Array, x: Array, y: Array, threshold: float,
+               robust: bool) -> tuple[Pose, NDArray[np.bool_]] | None:
+    """
+    Start from the 5-point algorithm inside RANSAC (paper, Algorithm 1's p_0), with its inliers.
+
+    x, y: (N, 2) pixels; threshold in pixels. `robust` takes MAGSAC++ instead of plain RANSAC.
+    None where no essential matrix was found.
+    """
+    method = cv2.USAC_MAGSAC if robust else cv2.RANSAC
+    E, mask = cv2.findEssentialMat(x, y, K, method=method, prob=0.999, threshold=threshold)
+    if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
+        return None
+    inliers = mask.ravel() > 0
+    R1, R2, direction = cv2.decomposeEssentialMat(E[:3])
+    t = direction.ravel()
+    candidates = [Pose(R, sign * t) for R in (R1, R2) for sign in (1.0, -1.0)]
+    rays_x, rays_y = rays(K, x[inliers]), rays(K, y[inliers])
+    best = max(candidates, key=lambda p: int(in_front(p.R, p.t, rays_x, rays_y).sum()))
+    return best, inliers
+
+
+def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:
+    """
+    Starting poses that between them reach the right basin.
+
+    RANSAC alone can land in a wrong one (sideways for forward translation); the previous motion
+    and driving straight ahead are the likely alternatives.
+    """
+    known = [pose for pose in (robust, prior) if pose is not None]
+    straight = [Pose(R, FORWARD) for R in [*(pose.R for pose in known), np.eye(3)]]
+    return known + straight

@@ -1,0 +1,157 @@
+"""Algorithm 1 of the paper: surfaces and pose in turn, until the pose rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.geometry import epipolar_lines, fundamental, homogeneous
+from djet_ros.core.jet import (
+    JetProblem,
+    Loss,
+    Residuals,
+    Solution,
+    epipolar_residuals,
+    jet_problem,
+    minimise,
+    robust_scale,
+)
+from djet_ros.core.paraboloid import Paraboloids, constrained_minimum
+from djet_ros.core.starts import Pose
+from djet_ros.core.surfaces import ResidualSurface, with_minimum
+from djet_ros.core.types import Array
+
+# Residuals of perfect data must not shrink the loss to nothing, in pixels.
+_LEAST_SCALE = 0.02
+
+# A match agrees with a pose within this many robust standard deviations.
+_INLIER = 3.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """
+    Where Algorithm 1 ended.
+
+    pose; loss: the robust loss in force; residuals: those of the voting matches at the pose;
+    voting: (N,) bool, matches that took part; minima: (N, 2) the surfaces' own minima y*;
+    y_opt: (N, 2) the final step onto the epipolar line; losses: (N,) last known surface values.
+    """
+
+    pose: Pose
+    loss: Loss
+    residuals: Residuals
+    voting: NDArray[np.bool_]
+    minima: Array
+    y_opt: Array
+    losses: Array
+    indefinite: int
+    iterations: int
+
+    def inliers(self) -> NDArray[np.bool_]:
+        """Tell, (N,) bool, which matches voted and agree with the pose."""
+        agree = np.abs(self.residuals.r) < _INLIER * _scale(self.residuals)
+        inliers = self.voting.copy()
+        inliers[inliers] = agree
+        return inliers
+
+
+def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
+                  config: EstimatorConfig) -> Track | None:
+    """
+    Optimise the pose and the keypoints' places on their epipolar lines jointly.
+
+    y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
+    on. None where too few matches have a usable surface.
+    """
+    keypoints, losses = y.copy(), np.full(len(y), np.nan)
+    alive = np.ones(len(y), bool)
+    poses = starts
+    for iteration in range(1, config.max_iterations + 1):
+        # Step 1: update the local residuals around the keypoints and fit A', b, c.
+        paraboloids, no_minimum = with_minimum(surface.around(keypoints), config.indefinite)
+        # Match culling: a keypoint without a surface is out, and keeps its last loss.
+        alive &= paraboloids.usable
+        voting = alive & (_minimum_inside(paraboloids, config) | (not config.cull_outside))
+        if voting.sum() < config.min_matches:
+            return None
+        # Step 2: global pose optimisation.
+        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting))
+        solution, loss = _cheapest(problem, poses, config)
+        pose = Pose(solution.R, solution.t)
+        # Keypoints go towards their optimum on the epipolar line of the new pose.
+        optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
+        losses[alive] = paraboloids.values(optimum)[alive]
+        converged = len(poses) == 1 and _change(poses[0], pose) < config.epsilon
+        poses = [pose]
+        if converged:
+            break
+        keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
+    return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
+                 no_minimum, iteration)
+
+
+def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
+    """Take a pose as it is, and look at the surfaces there: the 5-point method's last word."""
+    paraboloids = surface.around(y)
+    voting = paraboloids.usable
+    residuals = epipolar_residuals(jet_problem(K, surface.x, paraboloids), pose.R, pose.t)
+    optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
+    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), optimum,
+                 paraboloids.values(optimum), 0, 0)
+
+
+def _cheapest(problem: JetProblem, starts: list[Pose],
+              config: EstimatorConfig) -> tuple[Solution, Loss]:
+    """Refine every start under one loss, whose scale the best start's residuals give."""
+    scale = min(_scale(epipolar_residuals(problem, s.R, s.t)) for s in starts)
+    loss = Loss(config.loss, config.loss_scale * scale)
+    best = min((minimise(problem, s.R, s.t, loss) for s in starts), key=lambda s: s.cost)
+    if config.loss == 'none':
+        return best, loss
+    # The scale came from an unrefined pose; take it again from the refined one.
+    loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
+    return minimise(problem, best.R, best.t, loss), loss
+
+
+def _scale(residuals: Residuals) -> float:
+    return max(robust_scale(residuals.r), _LEAST_SCALE)
+
+
+def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:
+    """A minimum outside the sampled window is extrapolation, not to be believed."""
+    reach = np.abs(paraboloids.minima() - paraboloids.centres).max(1)
+    return np.asarray(reach <= config.window // 2)
+
+
+def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
+    """Places y + v_opt (N, 2) for the paraboloids around their centres."""
+    lines = epipolar_lines(F, x)
+    h = -(homogeneous(paraboloids.centres) * lines).sum(1)
+    v = constrained_minimum(paraboloids.A, paraboloids.b, lines[:, :2], h)
+    return np.asarray(paraboloids.centres + v)
+
+
+def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array:
+    """Move keypoints towards their optimum by the chosen strategy ("Keypoint iterations")."""
+    way = optimum - keypoints
+    if config.step == 'share':
+        return keypoints + config.step_share * way
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    # Beyond the sampled window a paraboloid says nothing, so no step is longer than that.
+    longest = 1.0 if config.step == 'pixel' else config.window / 2
+    return np.asarray(keypoints + way * np.minimum(1.0, longest / np.maximum(length, 1e-12)))
+
+
+def _change(before: Pose, after: Pose) -> float:
+    """||p - p_prev||: rotation and direction together, in rad to first order."""
+    return float(np.linalg.norm(np.concatenate([(after.R - before.R).ravel() / np.sqrt(2),
+                                                after.t - before.t])))
+
+
+def _take(paraboloids: Paraboloids, chosen: NDArray[np.bool_]) -> Paraboloids:
+    p = paraboloids
+    return Paraboloids(p.centres[chosen], p.A[chosen], p.b[chosen], p.c[chosen], p.usable[chosen])
