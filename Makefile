@@ -1,0 +1,53 @@
+# Each target does all of its own set-up, once, in a virtual environment of its own.
+
+VENV := .venv
+LOWEST := .venv-lowest
+SEQUENCE ?=
+PYTEST := python -m pytest -n auto
+
+# the first that is there, works (a pyenv shim may not) and is new enough
+PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
+	$$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
+	2>/dev/null && echo $$python && break; done)
+
+# one thread a process: small matrices gain nothing by more, and tests run side by side
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: demo test lint lowest clean
+
+demo: $(VENV)/.installed
+	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
+
+test: $(VENV)/.installed-test
+	$(VENV)/bin/$(PYTEST)
+
+lint: $(VENV)/.installed-lint
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/flake8
+	$(VENV)/bin/mypy
+
+# the tests on the oldest versions that setup.py allows
+lowest: $(LOWEST)/.installed-test
+	$(LOWEST)/bin/$(PYTEST)
+
+clean:
+	rm -rf $(VENV) $(LOWEST) build demo *.egg-info
+
+$(VENV)/.installed: setup.py | $(VENV)/bin/pip
+	$(VENV)/bin/pip install --quiet --editable .
+	touch $@
+
+$(VENV)/.installed-%: setup.py | $(VENV)/bin/pip
+	$(VENV)/bin/pip install --quiet --editable '.[$*]'
+	touch $@
+
+$(LOWEST)/.installed-test: setup.py test/lowest.txt | $(LOWEST)/bin/pip
+	$(LOWEST)/bin/pip install --quiet --editable '.[test]' --constraint test/lowest.txt
+	touch $@
+
+%/bin/pip:
+	@test -n '$(PYTHON)' || { echo 'make: error: Python 3.11 or newer with venv is needed' \
+		'(Ubuntu: sudo apt install python3-venv)' >&2; exit 1; }
+	@echo 'Setting up $* (once) ...'
+	$(PYTHON) -m venv $*

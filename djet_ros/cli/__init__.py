@@ -1,0 +1,1 @@
+"""The ``djet`` command: one module per subcommand."""

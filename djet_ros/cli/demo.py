@@ -1,0 +1,78 @@
+"""``djet demo``: from images to trajectories, with the commands that a user would type."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import shlex
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from djet_ros.cli import main
+from djet_ros.errors import DjetError
+
+METHODS = ('djet', 'rpe')
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser(
+        'demo', description='Render a road with known camera poses (or take a KITTI sequence), '
+        'convert it to a bag, replay the bag with D-JET and with re-projection error (RP-E), and '
+        'compare the two.')
+    parser.add_argument('sequence', nargs='?', type=Path, metavar='SEQUENCE_DIR',
+                        help='folder such as sequences/00 (default: render a road)')
+    parser.add_argument('--output', type=Path, default=Path('demo'), metavar='DIR',
+                        help='folder of everything that is written (default: %(default)s)')
+    parser.add_argument('--overwrite', action='store_true',
+                        help='replace what an earlier demo left in the output folder')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the commands one after another, then print what they found side by side."""
+    overwrite = ['--overwrite'] if args.overwrite else []
+    sequence = args.sequence
+    if sequence is None:
+        sequence = args.output / 'rendered' / 'sequences' / '00'
+        _djet('render', 'road', args.output / 'rendered', *overwrite)
+    bag = args.output / 'bag'
+    _djet('kitti-to-bag', sequence, bag, *overwrite)
+    results = {method: args.output / method for method in METHODS}
+    for method, folder in results.items():
+        _djet('replay', bag, '--output', folder, '--method', method, *overwrite)
+
+    console = Console()
+    console.print(_comparison({method: json.loads((folder / 'summary.json').read_text())
+                               for method, folder in results.items()}))
+    for folder in results.values():
+        for plot in sorted(folder.glob('*.png')):
+            console.print(f'plot: {plot}', soft_wrap=True)
+    return 0
+
+
+def _djet(*arguments: str | Path) -> None:
+    words = [str(argument) for argument in arguments]
+    print(f'\n$ djet {shlex.join(words)}', flush=True)
+    code = main.run(words)
+    if code:
+        raise DjetError(f"the demo ends here: 'djet {arguments[0]}' gave exit code {code}")
+
+
+def _comparison(summaries: dict[str, dict[str, Any]]) -> Table:
+    table = Table(title='errors against ground truth, in degrees: mean / median / largest')
+    for heading in ('method', 'pairs', 'pairs/s', 'rotation', 'direction of translation'):
+        table.add_column(heading, justify='left' if heading == 'method' else 'right')
+    for method, summary in summaries.items():
+        table.add_row(method, str(summary['pairs']), f"{summary['pairs'] / summary['seconds']:.1f}",
+                      _errors(summary.get('rotation_error_deg')),
+                      _errors(summary.get('translation_error_deg')))
+    return table
+
+
+def _errors(statistics: dict[str, float] | None) -> str:
+    if statistics is None:
+        return 'no ground truth'
+    return ' / '.join(f'{statistics[name]:.3f}' for name in ('mean', 'median', 'max'))

@@ -1,0 +1,1 @@
+"""What needs a ROS 2 installation."""

@@ -1,0 +1,73 @@
+"""Installs djet_ros, with pip as well as with colcon (build type ament_python)."""
+
+from glob import glob
+
+from setuptools import find_packages
+from setuptools import setup
+
+package_name = 'djet_ros'
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    description='Visual odometry by D-JET: pose optimisation on descriptor surfaces',
+    maintainer='The djet_ros maintainers',
+    maintainer_email='maintainers@djet-ros.invalid',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+        (f'share/{package_name}', ['package.xml']),
+        (f'share/{package_name}/config', glob('config/*')),
+        (f'share/{package_name}/launch', glob('launch/*.py')),
+    ],
+    zip_safe=True,
+    python_requires='>=3.11',
+    # The lower bounds are what Ubuntu 24.04 (ROS Jazzy) ships, where the registry has it for
+    # Python 3.12; `make lowest` runs the tests on them.
+    install_requires=[
+        'backports.zstd>=1,<2; python_version < "3.14"',
+        'lz4>=4.3,<5',
+        'matplotlib>=3.8,<4',
+        'numpy>=1.26,<3',
+        'opencv-python-headless>=4.6,<6',
+        'PyYAML>=6.0.1,<7',
+        'rich>=13.7,<16',
+        'rosbags>=0.11,<0.12',
+        'scipy>=1.11,<2',
+    ],
+    extras_require={
+        'peers': [
+            'evo>=1.31,<2',
+            'poselib>=2.0.4,<3',
+        ],
+        'test': [
+            'colcon-common-extensions>=0.3,<0.4',
+            'hypothesis>=6.98,<7',
+            'pytest>=7.4,<10',
+            'pytest-xdist>=3.4,<4',
+            # the oldest that builds wheels by itself, the newest that colcon accepts
+            'setuptools>=70.1,<80',
+        ],
+        'lint': [
+            # the plugins are those of ament_flake8
+            'flake8>=7,<8',
+            'flake8-blind-except>=0.2,<1',
+            'flake8-builtins>=2.1,<4',
+            'flake8-class-newline>=1.6,<2',
+            'flake8-comprehensions>=3.14,<4',
+            'flake8-deprecated>=2.2,<3',
+            'flake8-docstrings>=1.6,<2',
+            'flake8-import-order>=0.19,<1',
+            'flake8-quotes>=3.3,<4',
+            'mypy>=1.18,<3',
+            'ruff>=0.14,<0.18',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'djet = djet_ros.cli.main:main',
+            'vo_node = djet_ros.ros.vo_node:main',
+        ],
+    },
+)

@@ -1,0 +1,124 @@
+"""The frame of the ``djet`` command, in real processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import djet_ros
+from djet_ros.cli.main import COMMANDS
+import pytest
+
+# The command as pip's script calls it, and the same with one more subcommand.
+DJET = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
+PROBE = """\
+import sys
+import types
+from djet_ros.cli.main import COMMANDS, main
+from djet_ros.errors import DjetError
+
+def run(args):
+    {body}
+
+COMMANDS['probe'] = 'what one test needs'
+probe = types.ModuleType('djet_ros.cli.probe')
+probe.add_parser = lambda subparsers: subparsers.add_parser('probe')
+probe.run = run
+sys.modules[probe.__name__] = probe
+sys.exit(main(['probe']))
+"""
+
+
+def djet(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    return subprocess.run([sys.executable, '-c', DJET, *arguments], capture_output=True,
+                          text=True, timeout=60, check=False)
+
+
+def start_probe(body: str) -> subprocess.Popen[str]:
+    """Start a subcommand with this body."""
+    return subprocess.Popen([sys.executable, '-c', PROBE.format(body=body)], text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def test_the_list_of_commands_is_the_list_of_their_modules() -> None:
+    modules = {path.stem.replace('_', '-') for path in Path(djet_ros.__file__).parent.glob('cli/*')
+               if 'def add_parser(' in path.read_text()}
+    assert set(COMMANDS) == modules
+
+
+def test_help_names_every_command_without_importing_any() -> None:
+    listing = subprocess.run([sys.executable, '-X', 'importtime', '-c', DJET, '--help'],
+                             capture_output=True, text=True, timeout=60, check=False)
+    assert listing.returncode == 0
+    assert set(COMMANDS) <= set(listing.stdout.split())
+    for library in ('numpy', 'cv2', 'rosbags', 'rich', 'matplotlib'):
+        assert f'| {library}\n' not in listing.stderr
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_every_command_has_help(command: str) -> None:
+    answer = djet(command, '--help')
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stdout.startswith(f'usage: djet {command} ')
+
+
+def test_the_version_is_the_packages() -> None:
+    assert djet('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
+
+
+@pytest.mark.parametrize('arguments', [
+    (), ('reply',), ('--fast',), ('--', 'demo', '--fast'), ('demo', '--fast'), ('-', 'demo')])
+def test_a_wrong_command_line_gives_one_line_and_exit_code_2(arguments: tuple[str, ...]) -> None:
+    answer = djet(*arguments)
+    assert answer.returncode == 2
+    assert answer.stdout == ''
+    assert answer.stderr.startswith('djet: error: ')
+    assert answer.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(('body', 'code', 'line'), [
+    ('return 3', 3, ''),
+    ("raise DjetError('calib.txt has no P0')", 2, 'djet: error: calib.txt has no P0\n'),
+    ("open('/no/such/file')", 2, 'djet: error: /no/such/file: No such file or directory\n'),
+    ('import no_such_library.part', 2,
+     "djet: error: this command needs the Python module 'no_such_library', which is not "
+     'installed: pip install no_such_library\n'),
+])
+def test_what_the_user_can_mend_gives_one_line_and_exit_code_2(
+        body: str, code: int, line: str) -> None:
+    probe = start_probe(body)
+    assert probe.communicate(timeout=60) == ('', line)
+    assert probe.returncode == code
+
+
+@pytest.mark.parametrize('body', ["raise ValueError('a bug')", 'import djet_ros.no_such_module'])
+def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
+    probe = start_probe(body)
+    assert probe.communicate(timeout=60)[1].startswith('Traceback')
+    assert probe.returncode == 1
+
+
+def test_an_interrupt_gives_one_line_and_exit_code_130() -> None:
+    probe = start_probe("import time; print('ready', flush=True); time.sleep(60)")
+    assert probe.stdout is not None
+    assert probe.stdout.readline() == 'ready\n'
+    probe.send_signal(signal.SIGINT)
+    assert probe.communicate(timeout=60) == ('', 'djet: interrupted\n')
+    assert probe.returncode == 130
+
+
+@pytest.mark.parametrize('body', ["print('x' * 1_000_000)", "sys.stdin.read(); print('x')"])
+def test_a_reader_that_leaves_early_is_no_error(body: str) -> None:
+    probe = subprocess.Popen([sys.executable, '-c', PROBE.format(body=body)],
+                             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                             stderr=subprocess.PIPE)
+    assert probe.stdin is not None
+    assert probe.stdout is not None
+    assert probe.stderr is not None
+    probe.stdout.close()
+    probe.stdin.close()
+    assert probe.stderr.read() == b''
+    assert probe.wait(timeout=60) == 141
