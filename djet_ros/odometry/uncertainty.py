@@ -1,0 +1,84 @@
+"""
+Covariances of poses in ROS order (x, y, z, rotation about x, y, z).
+
+A pose (R, p) is perturbed as geometry_msgs/PoseWithCovariance has it: p + dp and exp(dtheta) R,
+both along the axes of the frame in which the pose is given.
+"""
+
+from __future__ import annotations
+
+from djet_ros.core.geometry import skew
+from djet_ros.core.types import Array, RelativePose
+from djet_ros.odometry.scale import Length, UNKNOWN_LENGTH_SIGMA
+import numpy as np
+
+# A rotation about which nothing is known: standard deviation of half a turn.
+_UNKNOWN_ANGLE = np.pi
+
+# Covariance (6, 6) of a motion about which nothing is known.
+UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
+
+
+def motion_covariance(relative: RelativePose, length: Length) -> Array:
+    """
+    Covariance (6, 6) of the current camera in the previous one, (R^T, -s R^T t).
+
+    To the covariance of (rotation, direction) comes the length's own, along the direction. A
+    translation without a direction (no parallax) may have gone its length along any axis.
+    """
+    if not np.isfinite(relative.covariance_6).all():
+        return UNKNOWN_MOTION.copy()
+    back, t = relative.R.T, relative.t
+    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt.
+    J = np.zeros((6, 6))
+    J[:3, :3], J[:3, 3:] = -length.value * back @ skew(t), -length.value * back
+    J[3:, :3] = -back
+    covariance = J @ relative.covariance_6 @ J.T
+    direction = back @ t
+    if t.any():
+        covariance[:3, :3] += length.sigma**2 * np.outer(direction, direction)
+    else:
+        covariance[:3] = covariance[:, :3] = 0.0
+        reach = max(length.value, 1e-3) if length.known else UNKNOWN_LENGTH_SIGMA
+        covariance[:3, :3] = np.eye(3) * reach**2
+    return _symmetric(covariance)
+
+
+def standstill_covariance(relative: RelativePose, length: Length) -> Array:
+    """
+    Covariance (6, 6) of no motion: the rotation's own, and a tenth of a usual way.
+
+    A way of unknown length is unknown also where it was short.
+    """
+    sigma = 0.1 * length.value if length.known else UNKNOWN_LENGTH_SIGMA
+    rotation = relative.covariance_6[:3, :3]
+    if not np.isfinite(rotation).all():
+        # Standing still tells the rotation about as well as a displacement of a pixel would.
+        rotation = np.eye(3) * 1e-6
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.eye(3) * max(sigma, 1e-3)**2
+    covariance[3:, 3:] = rotation
+    return _symmetric(covariance)
+
+
+def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Array) -> Array:
+    """
+    Covariance (6, 6) of ``pose @ motion``, both (4, 4) and with independent errors.
+
+    First order: the motion's error is turned into the outer frame, and an error of the
+    pose's rotation swings the motion like a lever.
+    """
+    R = pose[:3, :3]
+    lever = np.eye(6)
+    lever[:3, 3:] = -skew(R @ motion[:3, 3])
+    return _symmetric(lever @ pose_covariance @ lever.T + rotated(R, covariance))
+
+
+def rotated(R: Array, covariance: Array) -> Array:
+    """Express a covariance (6, 6) along the axes of another frame."""
+    turn = np.kron(np.eye(2), R)
+    return np.asarray(turn @ covariance @ turn.T)
+
+
+def _symmetric(covariance: Array) -> Array:
+    return np.asarray((covariance + covariance.T) / 2)

@@ -1,0 +1,170 @@
+"""From frames to a trajectory: the whole odometry on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from djet_ros.config import OdometryConfig
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.odometry.frame import continuity, Frame
+from djet_ros.odometry.scale import Length, scale_source, ScaleSource
+from djet_ros.odometry.uncertainty import (
+    compose,
+    motion_covariance,
+    standstill_covariance,
+    UNKNOWN_MOTION,
+)
+import numpy as np
+
+# Statuses under which the motion of a pair was told.
+TRACKED = (Status.OK, Status.NO_PARALLAX)
+
+# Statuses of a frame that begins anew, without a pair.
+STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
+
+
+@dataclass(frozen=True)
+class OdometryResult:
+    """
+    What became of a frame.
+
+    stamp_ns, frame_id: of the frame; status; previous_stamp_ns: of the reference frame that it
+    was related to, None where it began anew; relative: the estimator's answer for that pair;
+    motion: (4, 4) the current camera in the reference camera; pose: (4, 4) the current camera in
+    the first camera (the last known one where the motion could not be told); motion_covariance,
+    pose_covariance: (6, 6) in ROS order; scale: length that a unit translation was given;
+    scale_known: whether that is metres; standing: whether the camera stood still.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    status: Status
+    previous_stamp_ns: int | None
+    relative: RelativePose | None
+    motion: Array
+    pose: Array
+    motion_covariance: Array
+    pose_covariance: Array
+    scale: float
+    scale_known: bool
+    standing: bool = False
+
+
+class VisualOdometry:
+    """
+    Relates each frame to a reference frame and integrates the motions.
+
+    The reference frame is the newest frame that was tracked, by three rules:
+    * a bad pair keeps it, so that one bad frame is bridged by the next good one; after max_lost
+      bad pairs in a row each newest frame becomes the reference, until one pair is good again.
+      The motion in between is missing then, and the pose's covariance says so;
+    * while the camera stands still it stays, so that noise does not add up;
+    * a gap of more than max_gap, another image size or another camera begin a new reference at
+      the last pose; a step back in time begins everything anew.
+    """
+
+    def __init__(self, estimator: EstimatorConfig | None = None,
+                 odometry: OdometryConfig | None = None,
+                 scale: ScaleSource | None = None) -> None:
+        self._config = odometry or OdometryConfig()
+        self._estimator = TwoViewEstimator(estimator)
+        self._scale = scale or scale_source(self._config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the next frame is the first."""
+        self._last: Frame | None = None
+        self._prior: RelativePose | None = None
+        self._bad_pairs = 0
+        self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
+
+    def process(self, frame: Frame) -> OdometryResult:
+        """Take the next frame; ValueError where its stamp is that of the last one."""
+        # Can this frame be related to the past at all?
+        last, self._last = self._last, frame
+        status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
+        if last and frame.stamp_ns == last.stamp_ns:
+            raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
+        # Features are found once: now for the current frame, next time for the reference.
+        view = self._estimator.view(frame.gray, frame.K)
+        if status is not Status.OK:
+            return self._start(frame, view, status, backwards=bool(
+                last and frame.stamp_ns < last.stamp_ns))
+
+        # The pair: the motion before it is one of its starting poses.
+        relative = self._estimator.estimate(self._view, view, self._prior)
+        length = self._scale.between(self._reference.stamp_ns, frame.stamp_ns)
+        if self._stands_still(relative):
+            return self._stay(frame, relative, length)
+        if relative.status not in TRACKED:
+            return self._lose(frame, view, relative, length)
+
+        # Integrate the motion and its uncertainty; this frame is the next reference.
+        motion, covariance = camera_motion(relative, length), motion_covariance(relative, length)
+        result = self._result(frame, relative.status, relative, length, motion, covariance)
+        self._pose, self._pose_covariance = result.pose, result.pose_covariance
+        self._refer_to(frame, view)
+        self._prior, self._bad_pairs = relative, 0
+        return result
+
+    def _stands_still(self, relative: RelativePose) -> bool:
+        # Two equal images are DEGENERATE to most estimators, for want of any residual.
+        if relative.status not in (*TRACKED, Status.DEGENERATE) or not len(relative.x):
+            return False
+        refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
+        y = relative.y_opt if refined else relative.y
+        shift = np.linalg.norm(y - relative.x, axis=1)
+        return float(np.median(shift)) < self._config.standstill
+
+    def _start(self, frame: Frame, view: View, status: Status,
+               backwards: bool) -> OdometryResult:
+        """Begin a new reference: from nothing, or at the last pose with its motion unknown."""
+        if backwards:
+            self.reset()
+            self._scale.reset()
+            self._last = frame
+        elif status is not Status.FIRST_FRAME:
+            self._pose_covariance = compose(self._pose, self._pose_covariance, np.eye(4),
+                                            UNKNOWN_MOTION)
+        self._refer_to(frame, view)
+        self._prior, self._bad_pairs = None, 0
+        return OdometryResult(
+            frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
+            UNKNOWN_MOTION, self._pose_covariance, 0.0, False)
+
+    def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
+        """Stand still: no motion, and the reference frame stays."""
+        self._bad_pairs = 0
+        return self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
+                            standstill_covariance(relative, length), standing=True)
+
+    def _lose(self, frame: Frame, view: View, relative: RelativePose,
+              length: Length) -> OdometryResult:
+        """Take a bad pair: hold the pose, and give up the reference after too many of them."""
+        result = self._result(frame, relative.status, relative, length, np.eye(4), UNKNOWN_MOTION)
+        self._bad_pairs += 1
+        if self._bad_pairs >= self._config.max_lost:
+            self._refer_to(frame, view)
+            self._prior, self._pose_covariance = None, result.pose_covariance
+        return result
+
+    def _refer_to(self, frame: Frame, view: View) -> None:
+        self._reference, self._view = frame, view
+
+    def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
+                motion: Array, covariance: Array, standing: bool = False) -> OdometryResult:
+        return OdometryResult(
+            frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
+            self._pose @ motion, covariance,
+            compose(self._pose, self._pose_covariance, motion, covariance), length.value,
+            length.known, standing)
+
+
+def camera_motion(relative: RelativePose, length: Length) -> Array:
+    """Pose (4, 4) of the current camera in the previous one, (R^T, -s R^T t)."""
+    motion = np.eye(4)
+    motion[:3, :3] = relative.R.T
+    motion[:3, 3] = -length.value * relative.R.T @ relative.t
+    return motion

@@ -1,0 +1,322 @@
+"""The odometry: what it does with good, bad, still and missing frames, and how sure it is."""
+
+from cards import Cards, K, pose
+from djet_ros.config import OdometryConfig
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.errors import DjetError
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.scale import (
+    ConstantScale,
+    GroundTruthScale,
+    Length,
+    scale_source,
+    SpeedScale,
+    UnitScale,
+)
+from djet_ros.odometry.uncertainty import compose, motion_covariance
+from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+ESTIMATOR = EstimatorConfig(max_features=800)
+STEP = pose(x=0.25, z=0.15, yaw=0.01)
+
+
+@pytest.fixture(scope='module')
+def cards():
+    return Cards()
+
+
+def odometry(scale=None, **config):
+    return VisualOdometry(ESTIMATOR, OdometryConfig(**config), scale)
+
+
+def drive(vo, cards, steps, start=0.0):
+    """Process the frames of a drive; a step is a pose (4, 4), or the image itself."""
+    results, here = [], np.eye(4)
+    for i, step in enumerate(steps):
+        black = step is None
+        here = here if black else here @ step
+        frame = cards.frame(start + 0.1 * i, here)
+        if black:
+            frame = Frame(np.zeros_like(frame.gray), frame.K, frame.stamp_ns, frame.frame_id)
+        results.append(vo.process(frame))
+    return results
+
+
+def test_poses_are_the_current_camera_in_the_first_and_in_the_previous_one(cards):
+    length = float(np.linalg.norm(STEP[:3, 3]))
+    results = drive(odometry(ConstantScale(length)), cards, [np.eye(4), STEP, STEP, STEP])
+    assert [r.status for r in results] == [Status.FIRST_FRAME, *[Status.OK] * 3]
+    for result in results[1:]:
+        assert np.degrees(rotation_angle(result.motion[:3, :3], STEP[:3, :3])) < 0.3
+        assert np.degrees(direction_angle(result.motion[:3, 3], STEP[:3, 3])) < 8
+        assert np.linalg.norm(result.motion[:3, 3]) == pytest.approx(length)
+    truth = STEP @ STEP @ STEP
+    assert np.linalg.norm(results[-1].pose[:3, 3] - truth[:3, 3]) < 0.15 * 3 * length
+    assert results[3].previous_stamp_ns == results[2].stamp_ns
+
+
+def test_without_a_scale_a_translation_has_length_one_and_says_that_it_is_no_metre(cards):
+    result = drive(odometry(), cards, [np.eye(4), STEP])[-1]
+    assert np.linalg.norm(result.motion[:3, 3]) == pytest.approx(1)
+    assert not result.scale_known
+    along = unit(result.motion[:3, 3])
+    assert along @ result.motion_covariance[:3, :3] @ along == pytest.approx(1e6, rel=1e-3)
+
+
+def test_one_bad_frame_is_bridged_by_the_next_good_one(cards):
+    results = drive(odometry(), cards, [np.eye(4), STEP, None, STEP])
+    assert [r.status for r in results[2:]] == [Status.TOO_FEW_MATCHES, Status.OK]
+    bad, bridged = results[2:]
+    assert bad.previous_stamp_ns == bridged.previous_stamp_ns == results[1].stamp_ns
+    assert np.array_equal(bad.pose, results[1].pose)
+    assert np.diag(bad.motion_covariance).min() > 1
+    assert np.degrees(rotation_angle(bridged.motion[:3, :3], STEP[:3, :3])) < 0.3
+
+
+def test_after_too_many_bad_pairs_the_reference_is_given_up_and_the_pose_says_so(cards):
+    results = drive(odometry(max_lost=2), cards,
+                    [np.eye(4), STEP, None, None, STEP, STEP])
+    assert [r.status.value for r in results[2:]] == [
+        'TOO_FEW_MATCHES', 'TOO_FEW_MATCHES', 'TOO_FEW_MATCHES', 'OK']
+    # The frame after the black ones could only be compared with a black one.
+    assert results[5].previous_stamp_ns == results[4].stamp_ns
+    angles = [np.sqrt(r.pose_covariance[3, 3]) for r in results]
+    assert angles[1] < 0.01
+    assert angles[5] > 1
+
+
+def test_a_camera_that_stands_still_has_no_motion_and_keeps_its_reference(cards):
+    vo = odometry()
+    first, *still = (vo.process(cards.frame(0.1 * i, noise=i)) for i in range(4))
+    for result in still:
+        assert result.status is Status.NO_PARALLAX
+        assert result.standing
+        assert np.array_equal(result.pose, np.eye(4))
+        assert result.previous_stamp_ns == first.stamp_ns
+    moved = vo.process(cards.frame(0.4, STEP))
+    assert moved.status is Status.OK
+    assert moved.previous_stamp_ns == first.stamp_ns
+
+
+@pytest.mark.parametrize('method', ['djet', 'pjet', 'rpe', 'five_point'])
+def test_the_same_image_twice_is_a_standstill_for_every_method(cards, method):
+    vo = VisualOdometry(EstimatorConfig(method=method, max_features=500))
+    vo.process(cards.frame(0.0))
+    assert vo.process(cards.frame(0.1)).standing
+
+
+def test_pure_rotation_turns_the_pose_and_does_not_move_it(cards):
+    turn = pose(yaw=0.02)
+    results = drive(odometry(), cards, [np.eye(4), turn, turn])
+    for result in results[1:]:
+        assert result.status is Status.NO_PARALLAX
+        assert not result.standing
+        assert np.degrees(rotation_angle(result.motion[:3, :3], turn[:3, :3])) < 0.1
+        assert not result.motion[:3, 3].any()
+        assert result.motion_covariance[0, 0] == pytest.approx(1e6)
+
+
+def test_a_step_back_in_time_begins_everything_anew(cards):
+    vo = odometry()
+    drive(vo, cards, [np.eye(4), STEP], start=100.0)
+    again = vo.process(cards.frame(1.0))
+    assert again.status is Status.TIME_JUMP
+    assert np.array_equal(again.pose, np.eye(4))
+    assert not again.pose_covariance.any()
+    assert vo.process(cards.frame(1.1, STEP)).status is Status.OK
+
+
+def test_a_gap_begins_a_new_reference_at_the_last_pose(cards):
+    vo = odometry(max_gap=0.5)
+    before = drive(vo, cards, [np.eye(4), STEP])[-1]
+    after = vo.process(cards.frame(2.0, STEP))
+    assert after.status is Status.TIME_JUMP
+    assert after.relative is None
+    assert np.array_equal(after.pose, before.pose)
+    assert np.diag(after.pose_covariance).min() > 1
+
+
+def test_standing_still_for_long_is_no_gap(cards):
+    vo = odometry(max_gap=0.5)
+    statuses = [vo.process(cards.frame(0.4 * i, noise=i)).status for i in range(5)]
+    assert statuses[1:] == [Status.NO_PARALLAX] * 4
+
+
+def test_another_size_or_another_camera_begins_a_new_reference(cards):
+    vo = odometry()
+    frame = cards.frame(0.0)
+    vo.process(frame)
+    smaller = Frame(frame.gray[:200, :300], K, 100, 'camera')
+    assert vo.process(smaller).status is Status.SIZE_CHANGED
+    zoomed = Frame(smaller.gray, K * [[1.1], [1.1], [1]], 200, 'camera')
+    assert vo.process(zoomed).status is Status.SIZE_CHANGED
+
+
+def test_two_frames_with_one_stamp_are_refused(cards):
+    vo = odometry()
+    vo.process(cards.frame(0.0))
+    with pytest.raises(ValueError, match='stamp 0 ns'):
+        vo.process(cards.frame(0.0))
+
+
+def test_after_a_reset_the_same_frames_give_the_same_bits(cards):
+    vo = odometry()
+    first = drive(vo, cards, [np.eye(4), STEP, STEP])
+    vo.reset()
+    second = drive(vo, cards, [np.eye(4), STEP, STEP])
+    assert [r.pose.tobytes() for r in first] == [r.pose.tobytes() for r in second]
+    assert [r.pose_covariance.tobytes() for r in first] == \
+        [r.pose_covariance.tobytes() for r in second]
+
+
+@pytest.mark.parametrize('image', [
+    np.zeros((48, 64)), np.full((48, 64), 255), np.full((3, 3), 7), np.zeros((2, 2)),
+    np.random.default_rng(0).integers(0, 256, (240, 320))])
+def test_no_image_is_too_bad_to_survive(cards, image):
+    vo = odometry()
+    for i in range(3):
+        result = vo.process(Frame(image.astype(np.uint8), K, i, 'camera'))
+        assert np.isfinite(result.pose).all()
+        assert np.isfinite(result.pose_covariance).all()
+
+
+def test_real_frames_are_followed(kitti):
+    sequence = KittiSequence(kitti / 'sequences' / '06', end=6)
+    truth = GroundTruthScale(sequence.stamps_ns, sequence.poses[:, :3, 3])
+    vo = VisualOdometry(scale=truth)
+    results = [vo.process(Frame(sequence.image(i), sequence.K, int(stamp), 'camera'))
+               for i, stamp in enumerate(sequence.stamps_ns)]
+    assert [r.status for r in results[1:]] == [Status.OK] * 5
+    assert np.linalg.norm(results[-1].pose[:3, 3] - sequence.poses[-1, :3, 3]) < 0.1
+
+
+# Covariances
+
+def some_relative(rng):
+    t = unit(rng.normal(size=3))
+    L = np.zeros((6, 5))
+    L[:3, :3], L[3:, 3:] = np.eye(3), np.linalg.svd(t[None])[2][1:].T
+    S = rng.normal(size=(5, 5)) * 0.004
+    return RelativePose(Status.OK, rotation_exp(rng.normal(size=3) * 0.5), t,
+                        covariance_6=L @ S @ S.T @ L.T)
+
+
+def error(pose_with_error, exact):
+    """ROS's perturbation: difference of positions, rotation vector in the fixed axes."""
+    return np.concatenate([
+        pose_with_error[:3, 3] - exact[:3, 3],
+        Rotation.from_matrix(pose_with_error[:3, :3] @ exact[:3, :3].T).as_rotvec()])
+
+
+def sampled(covariance, rng, count=20000):
+    values, vectors = np.linalg.eigh(covariance)
+    return rng.normal(size=(count, 6)) * np.sqrt(np.maximum(values, 0)) @ vectors.T
+
+
+def assert_covariance(errors, covariance):
+    measured = np.cov(np.array(errors).T)
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    assert np.abs(measured - covariance).max() < 0.05 * scale.max()
+    assert np.allclose(measured / scale, covariance / scale, atol=0.06)
+
+
+def test_the_covariance_of_a_motion_is_that_of_sampled_motions():
+    rng = np.random.default_rng(1)
+    relative, length = some_relative(rng), Length(2.0, 0.03, True)
+    exact = camera_motion(relative, length)
+    errors = []
+    for delta, longer in zip(sampled(relative.covariance_6, rng),
+                             rng.normal(0, length.sigma, 20000), strict=True):
+        disturbed = RelativePose(Status.OK, rotation_exp(delta[:3]) @ relative.R,
+                                 relative.t + delta[3:])
+        errors.append(error(camera_motion(disturbed, Length(2.0 + longer, 0, True)), exact))
+    assert_covariance(errors, motion_covariance(relative, length))
+
+
+def disturbed(exact, delta):
+    result = exact.copy()
+    result[:3, :3] = rotation_exp(delta[3:]) @ exact[:3, :3]
+    result[:3, 3] += delta[:3]
+    return result
+
+
+def test_the_covariance_of_a_composed_pose_is_that_of_sampled_poses():
+    rng = np.random.default_rng(2)
+    covariances = [S @ S.T for S in rng.normal(size=(2, 6, 6)) * 0.006]
+    poses = [pose(1, 2, 3, 0.7), pose(-1, 0.3, 2, -0.4)]
+    exact = poses[0] @ poses[1]
+    errors = [error(disturbed(poses[0], a) @ disturbed(poses[1], b), exact)
+              for a, b in zip(*(sampled(c, rng) for c in covariances), strict=True)]
+    assert_covariance(errors, compose(poses[0], covariances[0], poses[1], covariances[1]))
+
+
+def test_covariances_stay_finite_symmetric_and_positive(cards):
+    vo = odometry(max_lost=1, max_gap=0.5)
+    for i in range(30):
+        gray = cards.gray(pose(x=0.2 * i)) if i % 4 else np.zeros((240, 320), np.uint8)
+        result = vo.process(Frame(gray, K, i * 10**8 + (i // 10) * 10**9))
+    for covariance in (result.pose_covariance, result.motion_covariance):
+        assert np.isfinite(covariance).all()
+        assert np.array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() > -1e-6 * np.abs(covariance).max()
+        assert covariance.max() < 1e12
+
+
+# Scale
+
+def test_unit_scale_knows_nothing():
+    assert UnitScale().between(0, 5) == Length(1.0, 1e3, False)
+
+
+def test_speed_times_time_is_the_length():
+    scale = SpeedScale(uncertainty=0.1)
+    assert not scale.between(0, 10**9).known
+    for tenth in range(11):
+        scale.add(tenth * 10**8, float(tenth))
+    length = scale.between(250_000_000, 750_000_000)
+    assert length.value == pytest.approx(5.0 * 0.5)
+    assert length.sigma == pytest.approx(0.25)
+    assert length.known
+
+
+def test_a_speed_is_held_for_half_a_second_and_then_only_guessed():
+    scale = SpeedScale()
+    scale.add(0, -2.0)
+    assert scale.between(100_000_000, 400_000_000) == Length(
+        pytest.approx(0.6), pytest.approx(0.03), True)
+    late = scale.between(900_000_000, 10**9)
+    assert not late.known
+    assert late.value == pytest.approx(0.2)
+
+
+def test_senseless_speeds_are_ignored():
+    scale = SpeedScale()
+    for stamp, speed in ((0, 1.0), (1, np.nan), (2, np.inf), (0, 9.0), (-5, 9.0)):
+        scale.add(stamp, speed)
+    assert scale.between(0, 10**8).value == pytest.approx(0.1)
+    scale.reset()
+    assert not scale.between(0, 10**8).known
+
+
+def test_ground_truth_is_interpolated_and_not_believed_across_holes():
+    stamps = np.array([0, 1, 2, 30, 31]) * 10**8
+    positions = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [np.nan] * 3, [9, 9, 9.0]])
+    scale = GroundTruthScale(stamps, positions)
+    assert scale.between(0, 200_000_000).value == pytest.approx(np.sqrt(2))
+    assert scale.between(0, 50_000_000).value == pytest.approx(0.5)
+    assert not scale.between(0, 10**9).known
+    assert not scale.between(-1, 10**8).known
+
+
+def test_the_configuration_names_the_scale():
+    assert isinstance(scale_source(OdometryConfig()), UnitScale)
+    assert scale_source(OdometryConfig(scale='constant', scale_value=2)).between(0, 1).value == 2
+    assert isinstance(scale_source(OdometryConfig(scale='speed')), SpeedScale)
+    with pytest.raises(DjetError, match='no ground truth'):
+        scale_source(OdometryConfig(scale='ground_truth'))
