@@ -3,7 +3,7 @@
 VENV := .venv
 LOWEST := .venv-lowest
 SEQUENCE ?=
-PYTEST := python -m pytest -n auto
+PYTEST := python -m pytest -n auto --dist loadfile
 
 # the first that is there, works (a pyenv shim may not) and is new enough
 PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \

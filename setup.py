@@ -26,15 +26,15 @@ setup(
     # The lower bounds are what Ubuntu 24.04 (ROS Jazzy) ships, where the registry has it for
     # Python 3.12; `make lowest` runs the tests on them.
     install_requires=[
-        'backports.zstd>=1,<2; python_version < "3.14"',
-        'lz4>=4.3,<5',
+        'backports.zstd>=1.0,<2; python_version < "3.14"',
+        'lz4>=4.3.2,<5',
         'matplotlib>=3.8,<4',
         'numpy>=1.26,<3',
-        'opencv-python-headless>=4.6,<6',
+        'opencv-python-headless>=4.6.0.66,<6',
         'PyYAML>=6.0.1,<7',
         'rich>=13.7,<16',
         'rosbags>=0.11,<0.12',
-        'scipy>=1.11,<2',
+        'scipy>=1.11.2,<2',
     ],
     extras_require={
         'peers': [

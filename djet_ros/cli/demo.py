@@ -8,11 +8,10 @@ from pathlib import Path
 import shlex
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from djet_ros.cli import main
 from djet_ros.errors import DjetError
+from rich.console import Console
+from rich.table import Table
 
 METHODS = ('djet', 'rpe')
 
@@ -66,7 +65,8 @@ def _comparison(summaries: dict[str, dict[str, Any]]) -> Table:
     for heading in ('method', 'pairs', 'pairs/s', 'rotation', 'direction of translation'):
         table.add_column(heading, justify='left' if heading == 'method' else 'right')
     for method, summary in summaries.items():
-        table.add_row(method, str(summary['pairs']), f"{summary['pairs'] / summary['seconds']:.1f}",
+        rate = summary['pairs'] / summary['seconds']
+        table.add_row(method, str(summary['pairs']), f'{rate:.1f}',
                       _errors(summary.get('rotation_error_deg')),
                       _errors(summary.get('translation_error_deg')))
     return table

@@ -1,0 +1,148 @@
+"""Pip and colcon install the package, each putting everything where it is looked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import Distribution, distributions, version
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import djet_ros
+from packaging.requirements import Requirement
+from packaging.version import Version
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.egg-info', 'build', 'demo', 'install',
+                                    'log')
+COLCON = Path(sys.executable).with_name('colcon')
+
+needs_colcon = pytest.mark.skipif(not COLCON.exists(), reason=f'no {COLCON}')
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Run a command that has to succeed; return what it printed."""
+    done = subprocess.run([str(word) for word in command], cwd=cwd, text=True, timeout=300,
+                          capture_output=True, check=False)
+    assert done.returncode == 0, f'{command}\n{done.stdout}\n{done.stderr}'
+    return done.stdout
+
+
+@pytest.fixture(scope='module')
+def copied(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Copy the source tree, because builds write into it, under a new folder of this name."""
+    def copy(name: str) -> Path:
+        return shutil.copytree(ROOT, tmp_path_factory.mktemp(name) / 'src' / 'djet_ros',
+                               ignore=NOT_SOURCE)
+    return copy
+
+
+@pytest.fixture(scope='module')
+def environment(copied: Callable[[str], Path]) -> Path:
+    """Install, without dependencies, the wheel built from the source distribution."""
+    pytest.importorskip('pip')
+    if Version(version('setuptools')) < Version('70.1'):
+        pytest.skip('setuptools before 70.1 builds no wheels by itself')
+    source = copied('pip')
+    folder = source.parents[1]
+    run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', folder, cwd=source)
+    archive, = folder.glob('*.tar.gz')
+    run(sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation',
+        '--wheel-dir', folder, archive, cwd=folder)
+    wheel, = folder.glob('*.whl')
+    run(sys.executable, '-m', 'venv', '--without-pip', 'venv', cwd=folder)
+    run(sys.executable, '-m', 'pip', '--python', folder / 'venv', 'install', '--no-deps', wheel,
+        cwd=folder)
+    return folder / 'venv'
+
+
+@pytest.fixture(scope='module')
+def distribution(environment: Path) -> Distribution:
+    """Read what the installed package says of itself."""
+    packages, = environment.glob('lib/*/site-packages')
+    found, = distributions(name='djet_ros', path=[str(packages)])
+    return found
+
+
+@pytest.fixture(scope='module', params=[[], ['--symlink-install']], ids=['copied', 'linked'])
+def workspace(request: pytest.FixtureRequest, copied: Callable[[str], Path]) -> Path:
+    """Build the package in a colcon workspace of its own."""
+    folder = copied('colcon').parents[1]
+    run(COLCON, 'build', *request.param, cwd=folder)
+    return folder
+
+
+def shares_its_files(prefix: Path) -> bool:
+    """Whether all that ROS looks for is below the prefix."""
+    share = prefix / 'share' / 'djet_ros'
+    wanted = [ROOT / 'package.xml', *ROOT.glob('config/*'), *ROOT.glob('launch/*.py')]
+    return (prefix / 'share/ament_index/resource_index/packages/djet_ros').exists() and all(
+        (share / path.relative_to(ROOT)).read_bytes() == path.read_bytes() for path in wanted)
+
+
+def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
+    assert run(environment / 'bin' / 'djet', '--version', cwd=environment) == (
+        f'djet_ros {djet_ros.__version__}\n')
+    assert (environment / 'bin' / 'vo_node').exists()
+    assert not (environment / 'lib' / 'djet_ros').exists()
+    assert shares_its_files(environment)
+
+
+@needs_colcon
+def test_colcon_puts_the_commands_where_ros2_run_looks(workspace: Path) -> None:
+    prefix = workspace / 'install' / 'djet_ros'
+    assert {path.name for path in (prefix / 'lib' / 'djet_ros').iterdir()} == {'djet', 'vo_node'}
+    assert not (prefix / 'bin').exists()
+    assert shares_its_files(prefix)
+
+
+@needs_colcon
+def test_colcons_commands_do_not_ask_for_pips_names_of_the_dependencies(
+        workspace: Path, tmp_path: Path) -> None:
+    # Ubuntu's python3-opencv is no distribution 'opencv-python-headless'.
+    run(sys.executable, '-m', 'venv', '--without-pip', 'bare', cwd=tmp_path)
+    answer = run('bash', '-c', '. install/setup.bash; '
+                 f'{tmp_path}/bare/bin/python install/djet_ros/lib/djet_ros/djet --version',
+                 cwd=workspace)
+    assert answer == f'djet_ros {djet_ros.__version__}\n'
+
+
+@needs_colcon
+def test_colcon_runs_the_tests(workspace: Path) -> None:
+    run(COLCON, 'test', '--return-code-on-test-failure', '--pytest-args', 'test/test_layers.py',
+        cwd=workspace)
+    suite = ElementTree.parse(workspace / 'build' / 'djet_ros' / 'pytest.xml').getroot()[0]
+    assert int(suite.attrib['tests']) > 0
+    assert int(suite.attrib['failures']) == int(suite.attrib['errors']) == 0
+
+
+def test_the_manifest_is_valid_and_agrees_with_setup_py(distribution: Distribution) -> None:
+    catkin_pkg = pytest.importorskip('catkin_pkg.package')
+    warnings: list[str] = []
+    manifest = catkin_pkg.parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    manifest.validate(warnings=warnings)
+    assert not warnings
+    assert manifest.package_format == 3
+    assert manifest.get_build_type() == 'ament_python'
+    metadata = distribution.metadata
+    assert (manifest.name, manifest.version) == (metadata['Name'], metadata['Version'])
+    assert manifest.licenses == [metadata['License']]
+    person, = manifest.maintainers
+    assert (person.name, person.email) == (metadata['Maintainer'], metadata['Maintainer-email'])
+
+
+def test_every_dependency_is_bounded_and_the_lower_bounds_are_tested(
+        distribution: Distribution) -> None:
+    requirements = [Requirement(line) for line in distribution.requires or []]
+    lower = {}
+    for requirement in requirements:
+        bounds = {bound.operator: bound.version for bound in requirement.specifier}
+        assert bounds.keys() == {'>=', '<'}, requirement
+        if 'extra' not in str(requirement.marker):
+            lower[requirement.name] = Version(bounds['>='])
+    pins = re.findall('^(.+)==(.+)$', (ROOT / 'test' / 'lowest.txt').read_text(), re.MULTILINE)
+    assert {name: Version(version) for name, version in pins} == lower
