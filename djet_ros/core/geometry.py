@@ -8,6 +8,7 @@ Constrained Tracking").
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -21,8 +22,8 @@ def skew(v: Array) -> Array:
 
 
 def rotation_exp(omega: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
-    return np.asarray(Rotation.from_rotvec(omega).as_matrix())
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
+    return np.asarray(cv2.Rodrigues(omega)[0])
 
 
 def unit(v: Array) -> Array:
@@ -32,10 +33,16 @@ def unit(v: Array) -> Array:
 
 
 def sphere_tangents(t: Array) -> Array:
-    """Two orthonormal directions (3, 2) perpendicular to the unit vector t (3,)."""
-    axis = np.eye(3)[np.argmin(np.abs(t))]
-    first = unit(np.cross(t, axis))
-    return np.stack([first, np.cross(t, first)], axis=1)
+    """
+    Two orthonormal directions (3, 2) perpendicular to the unit vector t (3,).
+
+    Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017): no division by zero.
+    """
+    x, y, z = t.tolist()
+    sign = 1.0 if z >= 0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
 def homogeneous(points: Array) -> Array:

@@ -23,7 +23,8 @@ from djet_ros.core.paraboloid import Paraboloids, inverse_2x2
 from djet_ros.core.types import Array
 
 _MAX_STEPS = 30
-_STEP_TOLERANCE = 1e-8
+_STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good for
+_GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
 
 
@@ -121,11 +122,11 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     size = np.maximum(np.abs(variance), 1e-24)
     root, pull = np.sqrt(size), e * np.sign(variance) / size
     # dr = w^T dl, with dl = t x (omega x m) for the rotation and dt x m for the translation.
-    w1, w2, w3 = (y1 - pull * Ml1) / root, (y2 - pull * Ml2) / root, y3 / root
-    w = np.stack([w1, w2, w3])
+    w = np.array([y1 - pull * Ml1, y2 - pull * Ml2, y3]) / root
+    w1, w2, w3 = w
     by_rotation = (t @ m) * w - (w * m).sum(0) * t[:, None]
     m1, m2, m3 = m
-    moment = np.stack([m2 * w3 - m3 * w2, m3 * w1 - m1 * w3, m1 * w2 - m2 * w1])
+    moment = np.array([m2 * w3 - m3 * w2, m3 * w1 - m1 * w3, m1 * w2 - m2 * w1])
     tangents = sphere_tangents(t)
     return Residuals(e / root, np.where(variance < 0, -1.0, 1.0),
                      np.concatenate([by_rotation, tangents.T @ moment]), tangents)
@@ -150,7 +151,7 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
             gain = cost - trial_cost
             R, t, residuals, cost, weights = R_new, t_new, trial, trial_cost, trial_weights
             damping = max(damping / 10, 1e-9)
-            if np.linalg.norm(step) < _STEP_TOLERANCE or gain < 1e-9 * abs(cost):
+            if np.linalg.norm(step) < _STEP_TOLERANCE or gain < _GAIN_TOLERANCE * abs(cost):
                 break
         else:
             damping *= 10

@@ -27,6 +27,9 @@ from djet_ros.core.types import Array
 # Residuals of perfect data must not shrink the loss to nothing, in pixels.
 _LEAST_SCALE = 0.02
 
+# Steps after which the costs of several starts tell their basins apart.
+_STEPS_TO_COMPARE = 10
+
 # A match agrees with a pose within this many robust standard deviations.
 _INLIER = 3.0
 
@@ -109,9 +112,8 @@ def _cheapest(problem: JetProblem, starts: list[Pose],
     """Refine every start under one loss, whose scale the best start's residuals give."""
     scale = min(_scale(epipolar_residuals(problem, s.R, s.t)) for s in starts)
     loss = Loss(config.loss, config.loss_scale * scale)
-    best = min((minimise(problem, s.R, s.t, loss) for s in starts), key=lambda s: s.cost)
-    if config.loss == 'none':
-        return best, loss
+    best = min((minimise(problem, s.R, s.t, loss, _STEPS_TO_COMPARE) for s in starts),
+               key=lambda solution: solution.cost)
     # The scale came from an unrefined pose; take it again from the refined one.
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
