@@ -1,0 +1,161 @@
+"""
+sensor_msgs CameraInfo to the camera matrix of an undistorted image, and the undistortion itself.
+
+Which part of a CameraInfo holds depends on whether the images come rectified: P for rectified
+ones, K and D for raw ones. Nothing in a message tells; the parameter ``odometry.rectified`` does,
+and its value ``auto`` goes by the name of the image topic, as image_proc names them: image_rect,
+image_rect_color.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+from djet_ros.core.types import Array
+from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS
+from djet_ros.odometry.images import BadMessage, Gray
+import numpy as np
+
+# Numbers of coefficients that OpenCV knows for the polynomial models.
+_POLYNOMIAL = (4, 5, 8, 12, 14)
+_MODELS = {'plumb_bob': _POLYNOMIAL, 'rational_polynomial': _POLYNOMIAL, 'equidistant': (4,)}
+
+
+class Camera:
+    """
+    The camera that a CameraInfo describes.
+
+    K: (3, 3) camera matrix of the images that ``undistort`` gives; size: (width, height) of the
+    images that it takes, or None where the CameraInfo leaves it open. Raises BadMessage.
+    """
+
+    def __init__(self, info: Any, rectified: bool) -> None:
+        """Take what holds for rectified or for raw images out of a CameraInfo."""
+        K = _numbers(info, 'k', 9).reshape(3, 3)
+        projection = _numbers(info, 'p', 12).reshape(3, 4)[:, :3]
+        D = _numbers(info, 'd', None)
+        self.size = _image_size(info)
+        self._distortion = None if rectified or not D.any() else _distortion(info, D)
+        self._maps: tuple[Any, Any] | None = None
+
+        # Drivers without a calibration leave zeros; some rectifiers fill in P alone, or K alone.
+        wanted = projection if rectified and projection.any() else K
+        _check_camera(wanted)
+        self._raw_K = self.K = _of_image(wanted, info)
+        if self._distortion is not None and projection.any() and not _turned(info):
+            _check_camera(projection)
+            self.K = _of_image(projection, info)
+
+    def undistort(self, gray: Gray) -> Gray:
+        """Image (H, W) without its distortion; BadMessage where its size is not the camera's."""
+        height, width = gray.shape
+        if self.size is not None and self.size != (width, height):
+            raise BadMessage('size_mismatch', f'image is {width}x{height} pixels, CameraInfo '
+                             f'(with its binning and ROI) is for {self.size[0]}x{self.size[1]}')
+        if self._distortion is None:
+            return gray
+        if self._maps is None or self._maps[0].shape[:2] != gray.shape:
+            self._maps = self._undistortion(width, height)
+        # A black rim would be an edge that moves with the camera.
+        return np.asarray(cv2.remap(gray, *self._maps, cv2.INTER_LINEAR,
+                                    borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+
+    def _undistortion(self, width: int, height: int) -> tuple[Any, Any]:
+        model, D = self._distortion or ('', np.empty(0))
+        module = cv2.fisheye if model == 'equidistant' else cv2
+        first, second = module.initUndistortRectifyMap(
+            self._raw_K, D, np.eye(3), self.K, (width, height), cv2.CV_16SC2)
+        return first, second
+
+
+def means_rectified(rectified: str, image_topic: str) -> bool:
+    """
+    Tell whether images come rectified, by the parameter or, with 'auto', by the topic's name.
+
+    A transport's suffix (image_rect/compressed) does not count as the name.
+    """
+    if rectified != 'auto':
+        return rectified == 'true'
+    names = [name for name in image_topic.split('/') if name not in ('', 'compressed', 'raw')]
+    return bool(names) and 'rect' in names[-1] and 'unrect' not in names[-1]
+
+
+def same_camera(a: Any, b: Any) -> bool:
+    """Tell whether two CameraInfo say the same about the camera; their headers don't matter."""
+    return _identity(a) == _identity(b)
+
+
+def _identity(info: Any) -> tuple[object, ...]:
+    roi = info.roi
+    return (info.width, info.height, info.distortion_model, *map(tuple, (info.k, info.d, info.r,
+            info.p)), info.binning_x, info.binning_y, roi.x_offset, roi.y_offset, roi.width,
+            roi.height)
+
+
+def _numbers(info: Any, name: str, count: int | None) -> Array:
+    values = np.asarray(getattr(info, name), dtype=np.float64).ravel()
+    if count is not None and len(values) != count:
+        raise BadMessage('bad_calibration',
+                         f'CameraInfo {name} has {len(values)} numbers, {count} belong there')
+    if not np.isfinite(values).all():
+        raise BadMessage('bad_calibration', f'CameraInfo {name} has a number that is not finite')
+    return values
+
+
+def _turned(info: Any) -> bool:
+    """Tell of a rectifying rotation: to follow it would turn the poses off the camera's axes."""
+    R = _numbers(info, 'r', 9).reshape(3, 3)
+    return bool(R.any()) and not np.allclose(R, np.eye(3), atol=1e-6)
+
+
+def _check_camera(K: Array) -> None:
+    if not K.any():
+        raise BadMessage('uncalibrated', 'CameraInfo k is all zeros: the camera is not '
+                         'calibrated; calibrate it, or set its camera_info_url')
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
+        raise BadMessage('bad_calibration', 'CameraInfo holds no camera matrix: focal lengths '
+                         f'{K[0, 0]:g} and {K[1, 1]:g}, last row {K[2].tolist()}')
+
+
+def _distortion(info: Any, D: Array) -> tuple[str, Array]:
+    model = info.distortion_model or 'plumb_bob'
+    counts: Sequence[int] = _MODELS.get(model, ())
+    if len(D) not in counts:
+        raise BadMessage('unknown_distortion', f"distortion model '{model:.40}' with {len(D)} "
+                         f'numbers is not known; {", ".join(_MODELS)} are')
+    return model, D
+
+
+def _binning(info: Any) -> tuple[int, int]:
+    """Zero means one, as the message has it."""
+    return max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+
+
+def _image_size(info: Any) -> tuple[int, int] | None:
+    """Size of the images: that of the ROI (all zeros: everything), divided by the binning."""
+    binning_x, binning_y = _binning(info)
+    whole = not (info.roi.width and info.roi.height)
+    width, height = ((info.width, info.height) if whole
+                     else (info.roi.width, info.roi.height))
+    size = int(width) // binning_x, int(height) // binning_y
+    if size[0] * size[1] > LARGEST_IMAGE_PIXELS:
+        raise BadMessage('too_large', f'CameraInfo is for {size[0]}x{size[1]} pixels, at most '
+                         f'{LARGEST_IMAGE_PIXELS} are taken')
+    return size if all(size) else None
+
+
+def _of_image(K: Array, info: Any) -> Array:
+    """
+    Camera matrix of the image at hand, from that of the full resolution.
+
+    The ROI is in full pixels and comes first, then the binning divides, as in image_geometry.
+    """
+    result = K.copy()
+    result[0, 2] -= info.roi.x_offset
+    result[1, 2] -= info.roi.y_offset
+    binning_x, binning_y = _binning(info)
+    result[0] /= binning_x
+    result[1] /= binning_y
+    return result

@@ -1,0 +1,185 @@
+"""
+sensor_msgs Image and CompressedImage to gray images, whatever the camera calls its pixels.
+
+Sizes are compared with the data before anything is allocated or decoded. Whatever cannot become
+an image is a BadMessage with a reason that is counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import struct
+from typing import Any
+
+import cv2
+from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS
+from djet_ros.errors import DjetError
+import numpy as np
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+
+
+class BadMessage(DjetError):
+    """A message that can't be used: ``reason`` is a word to count by, the text is for people."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        """Keep the reason beside the text."""
+        super().__init__(text)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Layout of one pixel, and what makes it gray: uint8 arrays (H, W, bytes) to (H, W)."""
+
+    bytes: int
+    to_gray: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
+    wide: bool = False
+
+
+def _one_byte(index: int) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
+    return lambda pixels: pixels[..., index]
+
+
+def _converted(code: int) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
+    return lambda pixels: np.asarray(
+        cv2.cvtColor(np.ascontiguousarray(pixels), code), dtype=np.uint8)
+
+
+def _mosaic(code: int) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
+    return lambda pixels: np.asarray(
+        cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), code), dtype=np.uint8)
+
+
+_COLOURS = {
+    'bgr': (3, cv2.COLOR_BGR2GRAY), 'rgb': (3, cv2.COLOR_RGB2GRAY),
+    'bgra': (4, cv2.COLOR_BGRA2GRAY), 'rgba': (4, cv2.COLOR_RGBA2GRAY),
+}
+
+# OpenCV names a mosaic by its second row, ROS by its first.
+_MOSAICS = {
+    'rggb': cv2.COLOR_BayerBG2GRAY, 'bggr': cv2.COLOR_BayerRG2GRAY,
+    'gbrg': cv2.COLOR_BayerGR2GRAY, 'grbg': cv2.COLOR_BayerGB2GRAY,
+}
+
+_ENCODINGS = {
+    'mono8': _Pixels(1, _one_byte(0)),
+    '8UC1': _Pixels(1, _one_byte(0)),
+    'mono16': _Pixels(1, _one_byte(0), wide=True),
+    '16UC1': _Pixels(1, _one_byte(0), wide=True),
+    '8UC3': _Pixels(3, _converted(cv2.COLOR_BGR2GRAY)),
+    '8UC4': _Pixels(4, _converted(cv2.COLOR_BGRA2GRAY)),
+    # Interleaved: U Y V Y, and Y U Y V.
+    **dict.fromkeys(('yuv422', 'uyvy'), _Pixels(2, _one_byte(1))),
+    **dict.fromkeys(('yuv422_yuy2', 'yuyv'), _Pixels(2, _one_byte(0))),
+    # A plane of Y comes first, those of the colours follow it.
+    **dict.fromkeys(('nv12', 'nv21', 'nv24'), _Pixels(1, _one_byte(0))),
+    **{f'{name}{bits}': _Pixels(channels, _converted(code), wide=bits == 16)
+       for name, (channels, code) in _COLOURS.items() for bits in (8, 16)},
+    **{f'bayer_{name}{bits}': _Pixels(1, _mosaic(code), wide=bits == 16)
+       for name, code in _MOSAICS.items() for bits in (8, 16)},
+}
+
+ENCODINGS = tuple(_ENCODINGS)
+
+
+def gray_image(message: Any) -> Gray:
+    """
+    Gray image (H, W) uint8 of an Image or a CompressedImage.
+
+    Of 16 bits the upper 8 are taken. The result may share memory with the message. Raises
+    BadMessage.
+    """
+    return _raw(message) if hasattr(message, 'encoding') else _compressed(message)
+
+
+def _raw(message: Any) -> Gray:
+    pixels = _ENCODINGS.get(message.encoding)
+    if pixels is None:
+        raise BadMessage('unknown_encoding', f"image encoding '{message.encoding:.40}' is not "
+                         f'known; publish one of {", ".join(ENCODINGS)}')
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    _check_size(width, height)
+    depth = 2 if pixels.wide else 1
+    row = width * pixels.bytes * depth
+    data = _bytes(message.data)
+    if step < row:
+        raise BadMessage('short_step', f'image step is {step} bytes, a row of {width} pixels '
+                         f'{message.encoding} has {row}')
+    if len(data) < height * step:
+        raise BadMessage('short_data', f'image data has {len(data)} bytes, {height} rows of '
+                         f'{step} have {height * step}')
+    rows = data[:height * step].reshape(height, step)[:, :row]
+    if pixels.wide:
+        # The upper byte of each number.
+        rows = rows[:, 0 if message.is_bigendian else 1::2]
+    # Most cameras send no padding: then a gray image is the message's own memory.
+    return np.ascontiguousarray(pixels.to_gray(rows.reshape(height, width, pixels.bytes)))
+
+
+def _compressed(message: Any) -> Gray:
+    if 'compressedDepth' in message.format:
+        raise BadMessage('unknown_encoding', f"image format '{message.format:.40}' holds depths, "
+                         'not brightness')
+    data = _bytes(message.data)
+    width, height = _declared_size(data.tobytes())
+    _check_size(width, height)
+    try:
+        # A camera's geometry must not be turned by what the file says of its orientation.
+        gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        gray = None
+    if gray is None or gray.shape != (height, width):
+        raise BadMessage('undecodable', f'compressed image of {len(data)} bytes is damaged')
+    return np.asarray(gray, dtype=np.uint8)
+
+
+def _bytes(data: Any) -> NDArray[np.uint8]:
+    """View message data (array.array, bytes, or array) as bytes, without a copy."""
+    try:
+        return np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
+    except (TypeError, ValueError, BufferError) as error:
+        raise BadMessage('short_data', f'image data is no row of bytes: {error}') from None
+
+
+def _check_size(width: int, height: int) -> None:
+    if width <= 0 or height <= 0:
+        raise BadMessage('empty', f'image is {width}x{height} pixels')
+    if width * height > LARGEST_IMAGE_PIXELS:
+        raise BadMessage('too_large', f'image is {width}x{height} pixels, at most '
+                         f'{LARGEST_IMAGE_PIXELS} are taken')
+
+
+def _declared_size(raw: bytes) -> tuple[int, int]:
+    """Give (width, height) that a PNG or JPEG declares, before anything is decoded."""
+    if raw[:8] == b'\x89PNG\r\n\x1a\n' and raw[12:16] == b'IHDR' and len(raw) >= 24:
+        if b'IEND' not in raw[-64:]:
+            raise BadMessage('undecodable', f'PNG image of {len(raw)} bytes is cut short')
+        width, height = struct.unpack('>II', raw[16:24])
+        return width, height
+    if raw[:2] == b'\xff\xd8':
+        # Decoders fill what is missing with gray. Cameras pad the end with zeros.
+        if b'\xff\xd9' not in raw[-4096:]:
+            raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')
+        return _jpeg_size(raw)
+    raise BadMessage('unknown_encoding', 'compressed image is neither JPEG nor PNG')
+
+
+# Markers of a JPEG that start a frame, and so carry its size.
+_START_OF_FRAME = set(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
+
+
+def _jpeg_size(raw: bytes) -> tuple[int, int]:
+    at = 2
+    while at + 9 <= len(raw) and raw[at] == 0xff:
+        marker = raw[at + 1]
+        if marker == 0xff:
+            at += 1
+            continue
+        if marker in _START_OF_FRAME:
+            height, width = struct.unpack('>HH', raw[at + 5:at + 9])
+            return width, height
+        at += 2 + max(int.from_bytes(raw[at + 2:at + 4], 'big'), 2)
+    raise BadMessage('undecodable', 'JPEG image has no header with its size')

@@ -1,0 +1,134 @@
+"""CameraInfo: what holds for raw and for rectified images, and what is refused."""
+
+import cv2
+from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.images import BadMessage
+import numpy as np
+import pytest
+from ros_messages import camera_info, roi
+
+SIZE = (160, 120)
+K = np.array([[130.0, 0, 80.5], [0, 131.0, 58.0], [0, 0, 1]])
+P = np.array([[120.0, 0, 79, 0], [0, 120.0, 60, 0], [0, 0, 1, 0]])
+DISTORTIONS = {
+    'plumb_bob': np.array([-0.28, 0.09, 1e-3, -5e-4, 0.0]),
+    'rational_polynomial': np.array([0.4, -0.3, 1e-4, 2e-4, 0.02, 0.7, -0.3, 0.01]),
+    'equidistant': np.array([-0.02, 0.01, -0.003, 0.001]),
+}
+
+
+def reason(*args, **changes):
+    with pytest.raises(BadMessage) as caught:
+        Camera(camera_info(K, SIZE, **changes), *(args or (False,)))
+    return caught.value.reason
+
+
+@pytest.mark.parametrize('parameter, topic, expected', [
+    ('true', '/camera/image_raw', True), ('false', '/camera/image_rect', False),
+    ('auto', '/camera/image_rect', True), ('auto', '/camera/image_rect_color', True),
+    ('auto', '/camera/image_rect/compressed', True), ('auto', '/camera/image_raw', False),
+    ('auto', '/rectory/image_raw', False), ('auto', '/camera/image_unrectified', False),
+    ('auto', '', False)])
+def test_the_parameter_or_the_topic_says_whether_images_are_rectified(parameter, topic, expected):
+    assert means_rectified(parameter, topic) is expected
+
+
+def test_rectified_images_have_the_camera_p_and_stay_as_they_are():
+    camera = Camera(camera_info(K, SIZE, p=P.ravel(), d=DISTORTIONS['plumb_bob']), True)
+    gray = np.zeros(SIZE[::-1], np.uint8)
+    assert np.array_equal(camera.K, P[:, :3])
+    assert camera.undistort(gray) is gray
+
+
+def test_where_p_is_missing_rectified_images_have_the_camera_k():
+    assert np.array_equal(Camera(camera_info(K, SIZE, p=np.zeros(12)), True).K, K)
+
+
+def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
+    camera = Camera(camera_info(K, SIZE, p=P.ravel()), False)
+    gray = np.zeros(SIZE[::-1], np.uint8)
+    assert np.array_equal(camera.K, K)
+    assert camera.undistort(gray) is gray
+
+
+@pytest.mark.parametrize('model', DISTORTIONS)
+def test_undistortion_brings_points_where_the_pinhole_camera_sees_them(model):
+    D = DISTORTIONS[model]
+    camera = Camera(camera_info(K, SIZE, p=P.ravel(), d=D, distortion_model=model), False)
+    assert np.array_equal(camera.K, P[:, :3])
+    rays = np.array([[0.2, 0.1, 1], [-0.3, 0.2, 1], [0.1, -0.25, 1]])
+    project = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
+    seen = project(rays[:, None], np.zeros(3), np.zeros(3), K, D)[0].reshape(-1, 2)
+    raw = np.zeros(SIZE[::-1], np.uint8)
+    for x, y in seen:
+        raw += draw_blob(x, y)
+    pinhole = (rays @ camera.K.T)[:, :2]
+    undistorted = camera.undistort(raw)
+    for x, y in pinhole:
+        assert np.allclose(blob_near(undistorted, x, y), (x, y), atol=0.15)
+
+
+def draw_blob(x, y):
+    columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    return (200 * np.exp(-((columns - x)**2 + (rows - y)**2) / 4.5)).astype(np.uint8)
+
+
+def blob_near(image, x, y, reach=8):
+    left, top = int(x) - reach, int(y) - reach
+    patch = image[top:top + 2 * reach, left:left + 2 * reach].astype(float)
+    rows, columns = np.mgrid[:2 * reach, :2 * reach]
+    return left + (patch * columns).sum() / patch.sum(), top + (patch * rows).sum() / patch.sum()
+
+
+def test_a_stereo_rectification_does_not_turn_the_camera():
+    turned = cv2.Rodrigues(np.array([0, 0.05, 0]))[0].ravel()
+    camera = Camera(camera_info(K, SIZE, p=P.ravel(), r=turned,
+                                d=DISTORTIONS['plumb_bob']), False)
+    assert np.array_equal(camera.K, K)
+
+
+def test_roi_shifts_and_binning_divides():
+    info = camera_info(K, SIZE, roi=roi(20, 10, 100, 80), binning_x=2, binning_y=4)
+    camera = Camera(info, False)
+    assert camera.size == (50, 20)
+    assert np.allclose(camera.K, [[65, 0, (80.5 - 20) / 2], [0, 131 / 4, (58 - 10) / 4],
+                                  [0, 0, 1]])
+
+
+def test_an_image_of_another_size_is_refused():
+    with pytest.raises(BadMessage, match='image is 100x120') as caught:
+        Camera(camera_info(K, SIZE), False).undistort(np.zeros((120, 100), np.uint8))
+    assert caught.value.reason == 'size_mismatch'
+
+
+def test_a_camera_info_without_a_size_takes_any_image():
+    camera = Camera(camera_info(K, (0, 0), d=DISTORTIONS['plumb_bob']), False)
+    for shape in ((120, 100), (60, 50)):
+        assert camera.undistort(np.zeros(shape, np.uint8)).shape == shape
+
+
+@pytest.mark.parametrize('changes, expected', [
+    ({'k': np.zeros(9), 'p': np.zeros(12)}, 'uncalibrated'),
+    ({'k': np.zeros(9)}, 'uncalibrated'),
+    ({'k': np.full(9, np.nan)}, 'bad_calibration'),
+    ({'k': -K.ravel()}, 'bad_calibration'),
+    ({'p': np.full(12, np.inf)}, 'bad_calibration'),
+    ({'d': np.array([np.nan])}, 'bad_calibration'),
+    ({'k': np.ones(4)}, 'bad_calibration'),
+    ({'d': np.ones(3)}, 'unknown_distortion'),
+    ({'d': np.ones(5), 'distortion_model': 'thin_prism'}, 'unknown_distortion'),
+    ({'d': np.ones(5), 'distortion_model': 'equidistant'}, 'unknown_distortion'),
+    ({'width': 2**31, 'height': 2**31}, 'too_large'),
+])
+def test_a_broken_calibration_has_a_reason(changes, expected):
+    assert reason(**changes) == expected
+
+
+def test_an_all_zero_camera_info_is_uncalibrated_also_for_rectified_images():
+    assert reason(True, k=np.zeros(9), p=np.zeros(12), r=np.zeros(9)) == 'uncalibrated'
+
+
+def test_two_camera_infos_are_the_same_whatever_their_headers():
+    assert same_camera(camera_info(K, SIZE, 1), camera_info(K, SIZE, 2))
+    assert not same_camera(camera_info(K, SIZE), camera_info(K * [[1.1], [1], [1]], SIZE))
+    assert not same_camera(camera_info(K, SIZE), camera_info(K, SIZE, binning_x=2))

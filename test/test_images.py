@@ -1,0 +1,223 @@
+"""Images of every encoding become the same gray; broken ones become a reason."""
+
+from array import array
+import contextlib
+import struct
+import zlib
+
+import cv2
+from djet_ros.odometry.images import BadMessage, ENCODINGS, gray_image
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from ros_messages import compressed, image
+
+rng = np.random.default_rng(3)
+SCENE = cv2.GaussianBlur(rng.integers(0, 256, (36, 52, 3), dtype=np.uint8), (0, 0), 2)
+GRAY = cv2.cvtColor(SCENE, cv2.COLOR_BGR2GRAY)
+
+
+def wide(pixels, big_endian=False):
+    """Sixteen bits whose upper byte is the pixel and whose lower byte is anything."""
+    noise = rng.integers(0, 256, pixels.shape).astype(np.uint16)
+    return (pixels.astype(np.uint16) * 256 + noise).astype('>u2' if big_endian else '<u2')
+
+
+def mosaic(pattern):
+    """See the scene (BGR) through a colour filter array, named by its first row's begin."""
+    channel = {'b': 0, 'g': 1, 'r': 2}
+    result = np.empty(SCENE.shape[:2], np.uint8)
+    for k, colour in enumerate(pattern):
+        result[k // 2::2, k % 2::2] = SCENE[k // 2::2, k % 2::2, channel[colour]]
+    return result
+
+
+def with_alpha(pixels):
+    return np.dstack([pixels, rng.integers(0, 256, pixels.shape[:2], dtype=np.uint8)])
+
+
+def yuv(luma_first):
+    chroma = rng.integers(0, 256, GRAY.shape, dtype=np.uint8)
+    return np.dstack([GRAY, chroma] if luma_first else [chroma, GRAY])
+
+
+def planes(extra_rows):
+    chroma = rng.integers(0, 256, (extra_rows, GRAY.shape[1]), dtype=np.uint8)
+    return np.vstack([GRAY, chroma])
+
+
+RGB = SCENE[..., ::-1]
+EXACT = {
+    'mono8': GRAY, '8UC1': GRAY, 'mono16': wide(GRAY), '16UC1': wide(GRAY),
+    'bgr8': SCENE, '8UC3': SCENE, 'rgb8': RGB, 'bgra8': with_alpha(SCENE),
+    '8UC4': with_alpha(SCENE), 'rgba8': with_alpha(RGB),
+    'bgr16': wide(SCENE), 'rgb16': wide(RGB), 'bgra16': wide(with_alpha(SCENE)),
+    'rgba16': wide(with_alpha(RGB)),
+    'yuv422': yuv(False), 'uyvy': yuv(False), 'yuv422_yuy2': yuv(True), 'yuyv': yuv(True),
+}
+MOSAICS = ('rggb', 'bggr', 'gbrg', 'grbg')
+
+
+def reason(message):
+    with pytest.raises(BadMessage) as caught:
+        gray_image(message)
+    assert '\n' not in str(caught.value)
+    return caught.value.reason
+
+
+@pytest.mark.parametrize('padding', [0, 5])
+@pytest.mark.parametrize('encoding', EXACT)
+def test_every_encoding_gives_the_same_gray(encoding, padding):
+    assert np.array_equal(gray_image(image(EXACT[encoding], encoding, padding=padding)), GRAY)
+
+
+@pytest.mark.parametrize('bits', [8, 16])
+@pytest.mark.parametrize('pattern', MOSAICS)
+def test_a_mosaic_gives_nearly_the_same_gray_and_its_neighbours_do_not(pattern, bits):
+    # Blue and red far apart, so that a wrong pattern shows.
+    pixels = mosaic(pattern)
+    pixels = pixels if bits == 8 else wide(pixels)
+    errors = {name: np.abs(gray_image(image(pixels, f'bayer_{name}{bits}')).astype(float)
+                           - GRAY)[2:-2, 2:-2].mean() for name in MOSAICS}
+    assert min(errors, key=errors.get) == pattern
+    assert errors[pattern] < 3
+
+
+@pytest.mark.parametrize('encoding, chroma_rows', [('nv12', 18), ('nv21', 18), ('nv24', 72)])
+def test_of_planes_the_first_is_the_gray(encoding, chroma_rows):
+    message = image(planes(chroma_rows), encoding, height=GRAY.shape[0])
+    assert np.array_equal(gray_image(message), GRAY)
+
+
+def test_all_encodings_are_tested():
+    tested = {*EXACT, *(f'bayer_{p}{b}' for p in MOSAICS for b in (8, 16)),
+              'nv12', 'nv21', 'nv24'}
+    assert tested == set(ENCODINGS)
+
+
+@pytest.mark.parametrize('encoding', ['mono16', '16UC1', 'rgb16', 'bayer_rggb16'])
+def test_big_endian_numbers_are_read_as_such(encoding):
+    pixels = {'rgb16': RGB, 'bayer_rggb16': mosaic('rggb')}.get(encoding, GRAY)
+    little = gray_image(image(wide(pixels), encoding))
+    assert np.array_equal(
+        gray_image(image(wide(pixels, big_endian=True), encoding, is_bigendian=1)), little)
+
+
+@pytest.mark.parametrize('kind', [lambda d: array('B', d.tobytes()), lambda d: d.tobytes(),
+                                  lambda d: memoryview(d.tobytes()), lambda d: d.copy()])
+def test_data_may_be_of_any_kind_that_middleware_gives(kind):
+    message = image(GRAY, padding=3)
+    message.data = kind(message.data)
+    assert np.array_equal(gray_image(message), GRAY)
+
+
+def test_an_unpadded_gray_image_is_not_copied():
+    message = image(GRAY)
+    assert np.shares_memory(gray_image(message), message.data)
+
+
+@pytest.mark.parametrize('changes, expected', [
+    ({'encoding': 'sepia'}, 'unknown_encoding'),
+    ({'encoding': ''}, 'unknown_encoding'),
+    ({'encoding': '32FC1'}, 'unknown_encoding'),
+    ({'height': 37}, 'short_data'),
+    ({'data': np.empty(0, np.uint8)}, 'short_data'),
+    ({'data': [1, 2, 3]}, 'short_data'),
+    ({'step': 51}, 'short_step'),
+    ({'step': 0}, 'short_step'),
+    ({'encoding': 'bgr8'}, 'short_step'),
+    ({'height': 0}, 'empty'),
+    ({'width': 0}, 'empty'),
+    ({'height': 2**31}, 'too_large'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'too_large'),
+    ({'step': 2**32 - 1}, 'short_data'),
+])
+def test_a_broken_image_has_a_reason(changes, expected):
+    assert reason(image(GRAY, **changes)) == expected
+
+
+@settings(max_examples=200, deadline=None)
+@given(encoding=st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=5)),
+       size=st.tuples(*[st.integers(0, 40) | st.integers(0, 2**32 - 1)] * 3),
+       data=st.binary(max_size=2000), big=st.integers(0, 255))
+def test_no_image_raises_anything_but_a_reason(encoding, size, data, big):
+    message = image(GRAY, encoding, height=size[0], width=size[1], step=size[2],
+                    is_bigendian=big, data=np.frombuffer(data, np.uint8))
+    try:
+        gray = gray_image(message)
+    except BadMessage:
+        return
+    assert gray.dtype == np.uint8
+    assert gray.shape == size[:2]
+    assert gray.flags.c_contiguous
+
+
+def encoded(extension, pixels=GRAY):
+    return cv2.imencode(extension, pixels)[1].tobytes()
+
+
+def test_a_compressed_image_is_decoded():
+    assert np.array_equal(gray_image(compressed(encoded('.png'), 'png')), GRAY)
+    assert np.abs(gray_image(compressed(encoded('.jpg'))).astype(int) - GRAY).max() < 20
+    color = gray_image(compressed(encoded('.png', SCENE), 'bgr8; png compressed bgr8'))
+    assert np.abs(color.astype(int) - GRAY).max() <= 1
+    sixteen = gray_image(compressed(encoded('.png', wide(GRAY).astype(np.uint16)), 'png'))
+    assert np.abs(sixteen.astype(int) - GRAY).max() <= 1
+
+
+def test_trailing_zeros_after_a_jpeg_are_usual():
+    assert gray_image(compressed(encoded('.jpg') + bytes(900))).shape == GRAY.shape
+
+
+def test_an_orientation_tag_does_not_turn_the_camera():
+    data = encoded('.jpg')
+    # EXIF with one entry: orientation 6, a quarter turn.
+    exif = (b'Exif\0\0MM\0*\0\0\0\x08\0\x01' + struct.pack('>HHIHH', 0x112, 3, 1, 6, 0)
+            + bytes(4))
+    tagged = data[:2] + b'\xff\xe1' + struct.pack('>H', len(exif) + 2) + exif + data[2:]
+    assert gray_image(compressed(tagged)).shape == GRAY.shape
+
+
+def huge_png():
+    header = struct.pack('>IIBBBBB', 60000, 60000, 8, 0, 0, 0, 0)
+    chunks = b''.join(struct.pack('>I', len(body)) + kind + body
+                      + struct.pack('>I', zlib.crc32(kind + body))
+                      for kind, body in ((b'IHDR', header), (b'IDAT', b''), (b'IEND', b'')))
+    return b'\x89PNG\r\n\x1a\n' + chunks
+
+
+def huge_jpeg():
+    data = encoded('.jpg')
+    at = data.index(b'\xff\xc0')
+    return data[:at + 5] + struct.pack('>HH', 65500, 65500) + data[at + 9:]
+
+
+@pytest.mark.parametrize('data, expected', [
+    (b'', 'unknown_encoding'),
+    (b'GIF89a' + bytes(40), 'unknown_encoding'),
+    (encoded('.bmp'), 'unknown_encoding'),
+    (encoded('.png')[:-300], 'undecodable'),
+    (encoded('.jpg')[:-300], 'undecodable'),
+    (b'\xff\xd8\xff\xd9', 'undecodable'),
+    (huge_png(), 'too_large'),
+    (huge_jpeg(), 'too_large'),
+    (encoded('.png')[:60] + bytes(300) + encoded('.png')[360:], 'undecodable'),
+])
+def test_a_broken_compressed_image_has_a_reason(data, expected):
+    assert reason(compressed(data)) == expected
+
+
+def test_compressed_depth_is_no_image():
+    message = compressed(bytes(12) + encoded('.png'), '16UC1; compressedDepth png')
+    assert reason(message) == 'unknown_encoding'
+
+
+@settings(max_examples=150, deadline=None)
+@given(extension=st.sampled_from(['.jpg', '.png']), at=st.integers(0, 2000),
+       put=st.binary(min_size=1, max_size=4))
+def test_flipped_bytes_raise_nothing_but_a_reason(extension, at, put):
+    data = bytearray(encoded(extension))
+    at %= len(data)
+    data[at:at + len(put)] = put
+    with contextlib.suppress(BadMessage):
+        gray_image(compressed(bytes(data)))
