@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Self
 from djet_ros.data.decoding import Decoder, decoder
 from djet_ros.data.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.data.storages.compression import decompress_file, ZSTD_MAGIC
-from djet_ros.data.text import read_yaml
+from djet_ros.data.text import one_line, read_yaml
 from djet_ros.errors import DjetError
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
@@ -59,7 +59,9 @@ class Bag:
         self.path = path
         self._stack = ExitStack()
         try:
-            self._storages = [(file, self._opened(file)) for file in _files(path)]
+            with _blaming(path):
+                files = _files(path)
+            self._storages = [(file, self._opened(file)) for file in files]
         except BaseException:
             self.close()
             raise
@@ -78,9 +80,8 @@ class Bag:
         for file, storage in self._storages:
             chosen = {connection.id: connection for connection in storage.connections
                       if topics is None or connection.topic in topics}
-            if chosen:
-                with _blaming(file):
-                    yield from _decoded(storage, chosen)
+            with _blaming(file):
+                yield from _decoded(storage, chosen)
 
     def close(self) -> None:
         """Remove what was unpacked."""
@@ -122,6 +123,8 @@ class BagSource:
         try:
             self._topics = [topic for topic in self.bag.topics if topic.message_count]
             if not self._topics:
+                # If a break is the reason, this tells it.
+                next(self.bag.messages(), None)
                 raise DjetError(f'{path} holds no message; record it again')
             image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
             self.image_topic = image.name
@@ -167,8 +170,10 @@ class BagSource:
             return chosen[0]
         if not fitting:
             others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
-            raise DjetError(f'{self.bag.path} has no {what} topic, but {others}; record it too')
-        choices = ', '.join(f'{topic.name} ({topic.message_count})' for topic in fitting)
+            raise DjetError(f'{self.bag.path} has no {what} topic, but {one_line(others)}; '
+                            'record it too')
+        choices = one_line(', '.join(
+            f'{topic.name} ({topic.message_count})' for topic in fitting))
         if name is not None:
             raise DjetError(f"{self.bag.path} has no {what} topic '{name}'; choose from {choices}")
         raise DjetError(f'{self.bag.path} has {len(chosen)} {what} topics: {choices}; '
@@ -209,7 +214,7 @@ def _blaming(path: Path) -> Iterator[None]:
     try:
         yield
     except BrokenFile as error:
-        raise DjetError(f'{path} is damaged or no bag: {error}') from error
+        raise DjetError(f'{path} is damaged or no bag: {one_line(error)}') from error
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror or error}') from error
 
@@ -261,12 +266,13 @@ def _listed(folder: Path) -> list[Path]:
         raise DjetError(f"{metadata} has no list 'relative_file_paths' of file names; remove it "
                         'to read the storage files themselves') from error
     for path in paths:
+        listed = f"{metadata} lists '{one_line(path)}'"
         if path.is_absolute() or '..' in path.parts:
-            raise DjetError(f"{metadata} lists '{path}', which lies outside the bag; correct the "
-                            'list or get the bag from somebody you trust')
+            raise DjetError(f'{listed}, which lies outside the bag; correct the list or get the '
+                            'bag from somebody you trust')
         # Before version 4 the folder's own name came first.
         if not (folder / path.name).is_file():
-            raise DjetError(f"{metadata} lists '{path}', which does not exist; copy it there")
+            raise DjetError(f'{listed}, which does not exist; copy it there')
     if not paths:
         raise DjetError(f'{metadata} lists no file; remove it to read the storage files')
     return [folder / path.name for path in paths]

@@ -109,8 +109,8 @@ def open_sequence(path: Path) -> FrameSequence | BagSource:
         return tum_rgbd(path)
     if (path / 'mav0').is_dir() or (path / 'cam0').is_dir():
         return euroc(path)
-    if path.is_dir() and not (path / 'image_0').exists() and not any(path.glob('*/image_0')) \
-            and not any(path.glob('sequences/*/image_0')):
+    like_kitti = any(any(path.glob(f'{depth}image_0')) for depth in ('', '*/', 'sequences/*/'))
+    if path.is_dir() and not like_kitti:
         raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0), TUM RGB-D '
                         '(rgb.txt) or EuRoC (mav0)')
     return KittiSequence(path)

@@ -23,9 +23,10 @@ LARGEST_YAML = 2 << 20
 LATEST_SECOND = 2**31 - 2000
 
 
-def one_line(error: BaseException) -> str:
-    """Say in one short line what an exception of another library said."""
-    return ' '.join(str(error).split())[:300] or type(error).__name__
+def one_line(said: object) -> str:
+    """Make what another library said, or a file has in it, one short line for a terminal."""
+    line = ' '.join(str(said).split())[:600] or type(said).__name__
+    return ''.join(letter if letter.isprintable() else '?' for letter in line)
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:

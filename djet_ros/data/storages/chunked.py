@@ -39,6 +39,13 @@ class Chunk(NamedTuple):
     loose: bool = False
 
 
+class Records(NamedTuple):
+    """The unpacked records of a chunk, and how it is torn if some are missing at its end."""
+
+    data: memoryview
+    torn: str | None = None
+
+
 class Place(NamedTuple):
     """Where a message lies: connection id, stamp in ns, first byte and end in its chunk."""
 
@@ -71,12 +78,12 @@ class ChunkedFile(ABC):
         """Fill in connections and chunks by walking the file up to its end or break."""
 
     @abstractmethod
-    def _unpack(self, file: BinaryIO, chunk: Chunk) -> tuple[memoryview, str | None]:
-        """Records of a chunk, and how it is broken if it is; BrokenFile where all is lost."""
+    def _unpack(self, file: BinaryIO, chunk: Chunk) -> Records:
+        """Unpack as much of a chunk as there is; BrokenFile where there is nothing."""
 
     @abstractmethod
-    def _places(self, records: memoryview) -> Iterator[Place]:
-        """Find the messages among records; BrokenFile where they end in the middle of one."""
+    def _places(self, records: Records) -> Iterator[Place]:
+        """Find the messages among records; BrokenFile after the last if some are missing."""
 
     def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """
@@ -94,13 +101,10 @@ class ChunkedFile(ABC):
                 while loaded < len(chunks) and (
                         not waiting or chunks[loaded].start <= waiting[0][0]):
                     try:
-                        records, torn = unpacked(loaded)
-                        for place in self._places(records):
+                        for place in self._places(unpacked(loaded)):
                             if place.connection in wanted:
                                 heappush(waiting, (place.stamp, loaded, place.begin, place.end,
                                                    place.connection))
-                        if torn:
-                            raise BrokenFile(torn)
                     except BrokenFile as error:
                         broken = broken or str(error)
                         del chunks[loaded + 1:]
@@ -108,7 +112,7 @@ class ChunkedFile(ABC):
                 if not waiting:
                     break
                 stamp, number, begin, end, connection = heappop(waiting)
-                yield connection, stamp, unpacked(number)[0][begin:end]
+                yield connection, stamp, unpacked(number).data[begin:end]
         if broken:
             raise BrokenFile(f'{broken}; everything before that was read')
 

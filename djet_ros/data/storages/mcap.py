@@ -10,7 +10,8 @@ import struct
 from typing import BinaryIO
 
 from djet_ros.data.storages.base import BrokenFile, Connection, ros2_name
-from djet_ros.data.storages.chunked import Chunk, ChunkedFile, Place, read_exactly, STRETCH
+from djet_ros.data.storages.chunked import (
+    Chunk, ChunkedFile, Place, read_exactly, Records, STRETCH)
 from djet_ros.data.storages.compression import decompress
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -61,7 +62,7 @@ class McapFile(ChunkedFile):
     def _read_summary(self, summary: bytes) -> bool:
         """Take over the summary; False where it doesn't account for every message."""
         total, schemas, channels, indexed = -1, -1, -1, 0
-        for code, begin, end in split_records(memoryview(summary)):
+        for code, begin, end in split_records(Records(memoryview(summary))):
             fields = Fields(summary[begin:end])
             if code in (SCHEMA, CHANNEL):
                 self._learn(code, fields)
@@ -109,22 +110,20 @@ class McapFile(ChunkedFile):
                                       begin - RECORD.size, position))
 
     def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
-        records, torn = self._unpack(file, chunk)
+        records = self._unpack(file, chunk)
         start = None
         # The chunk is kept even if the loop meets its break: what lies before that is good.
         try:
             for code, begin, end in split_records(records):
                 if code in (SCHEMA, CHANNEL):
-                    self._learn(code, Fields(bytes(records[begin:end])))
+                    self._learn(code, Fields(bytes(records.data[begin:end])))
                 elif code == MESSAGE:
-                    number, stamp = _message(records, begin)
+                    number, stamp = _message(records.data, begin)
                     self._counts[number] += 1
                     start = stamp if start is None else min(start, stamp)
         finally:
             if start is not None:
                 self._chunks.append(chunk._replace(start=start))
-        if torn:
-            raise BrokenFile(torn)
 
     def _add_loose(self, place: Place) -> None:
         """Let a message outside chunks extend the last stretch, or begin one."""
@@ -148,25 +147,25 @@ class McapFile(ChunkedFile):
             number, schema = fields.unpack('<HH')
             self._channels[number] = (schema, fields.text(), fields.text())
 
-    def _unpack(self, file: BinaryIO, chunk: Chunk) -> tuple[memoryview, str | None]:
+    def _unpack(self, file: BinaryIO, chunk: Chunk) -> Records:
         data = read_exactly(file, chunk.offset, chunk.length)
         if chunk.loose:
-            return memoryview(data), None
+            return Records(memoryview(data))
         fields = Fields(data)
         _, _, size, crc = fields.unpack('<QQQI')
         compression = fields.text()
         fields.unpack('<Q')
         records = decompress(fields.rest(), compression, size)
         if len(records) < size:
-            return records, f'the chunk at byte {chunk.offset} is cut short'
+            return Records(records, f'the chunk at byte {chunk.offset} is cut short')
         if crc and crc32(records) != crc:
             raise BrokenFile(f'the chunk at byte {chunk.offset} does not match its checksum')
-        return records, None
+        return Records(records)
 
-    def _places(self, records: memoryview) -> Iterator[Place]:
+    def _places(self, records: Records) -> Iterator[Place]:
         for code, begin, end in split_records(records):
             if code == MESSAGE:
-                yield Place(*_message(records, begin), begin + MESSAGE_HEAD.size, end)
+                yield Place(*_message(records.data, begin), begin + MESSAGE_HEAD.size, end)
 
 
 class Fields:
@@ -205,17 +204,19 @@ class Fields:
         return self._data[begin:self._position]
 
 
-def split_records(data: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Yield (code, first byte, end) of the records in a piece; BrokenFile at a torn one."""
+def split_records(records: Records) -> Iterator[tuple[int, int, int]]:
+    """Yield (code, first byte, end) of each record; BrokenFile after the last one if torn."""
+    data, torn = records
     position = 0
-    while position < len(data):
-        if position + RECORD.size > len(data):
-            raise BrokenFile('a chunk ends within a record')
+    while position + RECORD.size <= len(data):
         code, length = RECORD.unpack_from(data, position)
-        begin, position = position + RECORD.size, position + RECORD.size + length
-        if position > len(data):
-            raise BrokenFile('a chunk ends within a record')
-        yield code, begin, position
+        end = position + RECORD.size + length
+        if end > len(data):
+            break
+        yield code, position + RECORD.size, end
+        position = end
+    if torn or position < len(data):
+        raise BrokenFile(torn or 'a chunk ends within a record')
 
 
 def _message(records: bytes | memoryview, begin: int) -> tuple[int, int]:

@@ -9,7 +9,8 @@ import struct
 from typing import BinaryIO
 
 from djet_ros.data.storages.base import BrokenFile, Connection, ros2_name
-from djet_ros.data.storages.chunked import Chunk, ChunkedFile, Place, read_exactly
+from djet_ros.data.storages.chunked import (
+    Chunk, ChunkedFile, Place, read_exactly, Records)
 from djet_ros.data.storages.compression import decompress
 
 MAGIC = b'#ROSBAG V2.0\n'
@@ -71,32 +72,26 @@ class Ros1File(ChunkedFile):
 
     def _scan_records(self, file: BinaryIO) -> None:
         position = len(MAGIC)
-        closed = False
-        while position < self.size:
+        while True:
             header, begin, length = _read_record(file, position)
-            code = _code(header)
-            end = min(begin + length, self.size)
+            code, end = _code(header), begin + length
             if code == CHUNK:
-                self._scan_chunk(file, Chunk(0, position, end - position))
-            elif code == CONNECTION:
-                self._learn(header, memoryview(read_exactly(file, begin, length)))
-            elif code == MESSAGE:
-                raise BrokenFile(f'there is a message outside a chunk at byte {position}')
-            closed = closed or code == CHUNK_INFO
-            if begin + length > self.size:
-                break
-            position = begin + length
-        if not closed:
-            raise BrokenFile(f'it was not closed, or is cut short at byte {self.size}')
+                self._scan_chunk(file, Chunk(0, position, min(end, self.size) - position))
+            elif code in (CONNECTION, CHUNK_INFO):
+                # The index repeats what was in the chunks.
+                return
+            elif code not in (BAG_HEADER, INDEX):
+                raise BrokenFile(f'there is a record of kind {code} at byte {position}')
+            position = end
 
     def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
-        records, torn = self._unpack(file, chunk)
+        records = self._unpack(file, chunk)
         start = None
         # The chunk is kept even if the loop meets its break: what lies before that is good.
         try:
             for header, begin, end in _split_records(records):
                 if _code(header) == CONNECTION:
-                    self._learn(header, records[begin:end])
+                    self._learn(header, records.data[begin:end])
                 elif _code(header) == MESSAGE:
                     stamp = _time(header, 'time')
                     self._counts[_field(header, 'conn', '<I')[0]] += 1
@@ -104,8 +99,6 @@ class Ros1File(ChunkedFile):
         finally:
             if start is not None:
                 self._chunks.append(chunk._replace(start=start))
-        if torn:
-            raise BrokenFile(torn)
 
     def _learn(self, header: dict[str, bytes], data: memoryview) -> None:
         number, = _field(header, 'conn', '<I')
@@ -113,7 +106,7 @@ class Ros1File(ChunkedFile):
         self._topics[number] = (_text(header, 'topic'), _text(details, 'type'),
                                 _text(details, 'message_definition'))
 
-    def _unpack(self, file: BinaryIO, chunk: Chunk) -> tuple[memoryview, str | None]:
+    def _unpack(self, file: BinaryIO, chunk: Chunk) -> Records:
         header, begin, _ = _read_record(file, chunk.offset)
         if _code(header) != CHUNK:
             raise BrokenFile(f'there is no chunk at byte {chunk.offset}')
@@ -121,10 +114,10 @@ class Ros1File(ChunkedFile):
         data = read_exactly(file, begin, chunk.offset + chunk.length - begin)
         records = decompress(data, _text(header, 'compression'), size)
         if len(records) < size:
-            return records, f'the chunk at byte {chunk.offset} is cut short'
-        return records, None
+            return Records(records, f'the chunk at byte {chunk.offset} is cut short')
+        return Records(records)
 
-    def _places(self, records: memoryview) -> Iterator[Place]:
+    def _places(self, records: Records) -> Iterator[Place]:
         for header, begin, end in _split_records(records):
             if _code(header) == MESSAGE:
                 yield Place(_field(header, 'conn', '<I')[0], _time(header, 'time'), begin, end)
@@ -139,13 +132,20 @@ def _read_record(file: BinaryIO, position: int) -> tuple[dict[str, bytes], int, 
     return header, begin + UINT32.size, length
 
 
-def _split_records(data: memoryview) -> Iterator[tuple[dict[str, bytes], int, int]]:
-    """Yield (header, first byte, end) of the records in a chunk; BrokenFile at a torn one."""
+def _split_records(records: Records) -> Iterator[tuple[dict[str, bytes], int, int]]:
+    """Yield (header, first byte, end) of each record; BrokenFile after the last one if torn."""
+    data, torn = records
     position = 0
     while position < len(data):
-        header_begin, header_end = _counted(data, position)
-        begin, position = _counted(data, header_end)
-        yield _fields(data[header_begin:header_end]), begin, position
+        try:
+            header_begin, header_end = _counted(data, position)
+            begin, position = _counted(data, header_end)
+            header = _fields(data[header_begin:header_end])
+        except BrokenFile as error:
+            raise BrokenFile(torn or str(error)) from error
+        yield header, begin, position
+    if torn:
+        raise BrokenFile(torn)
 
 
 def _fields(data: memoryview) -> dict[str, bytes]:

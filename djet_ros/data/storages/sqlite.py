@@ -6,12 +6,15 @@ from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
 import sqlite3
-from typing import Any
+import struct
+from typing import Any, TypeAlias
 from urllib.parse import quote
 
 from djet_ros.data.storages.base import BrokenFile, Connection, LARGEST_PIECE, ros2_name
 
 MAGIC = b'SQLite format 3\x00'
+
+Message: TypeAlias = tuple[int, int, memoryview]
 
 
 class SqliteFile:
@@ -30,7 +33,8 @@ class SqliteFile:
         tables = {name for name, in database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table'")}
         if missing := {'topics', 'messages'} - tables:
-            raise BrokenFile(f"it has no table '{min(missing)}', so rosbag2 did not write it")
+            raise BrokenFile(f"it has no table '{min(missing)}': it was cut short, or not written "
+                             'by rosbag2')
         # Databases older than ROS 2 Iron hold no definitions.
         definitions = dict(database.execute(
             'SELECT topic_type, encoded_message_definition FROM message_definitions '
@@ -45,12 +49,16 @@ class SqliteFile:
                            str(definitions.get(msgtype, '')), counts.get(number, 0))
                 for number, topic, msgtype, encoding in rows]
 
-    def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
+    def messages(self, wanted: Collection[int]) -> Iterator[Message]:
         """
         Yield (connection id, stamp in ns, serialised message) in the order of stamps.
 
         After the last message before a break in the file, raises BrokenFile.
         """
+        messages = self._in_order(wanted)
+        return _but_last_before_break(messages) if _ends_within_page(self.path) else messages
+
+    def _in_order(self, wanted: Collection[int]) -> Iterator[Message]:
         query = ('SELECT topic_id, timestamp, data FROM messages '
                  f'WHERE topic_id IN ({", ".join("?" * len(wanted))}) ORDER BY ')
         delivered = False
@@ -67,7 +75,25 @@ class SqliteFile:
                         raise BrokenFile(f'{error}; everything before that was read') from error
 
 
-def _checked(row: tuple[Any, Any, Any]) -> tuple[int, int, memoryview]:
+def _ends_within_page(path: Path) -> bool:
+    with path.open('rb') as file:
+        size, = struct.unpack_from('>H', file.read(18), 16)
+    # The format writes 65536 as 1.
+    return path.stat().st_size % (65536 if size == 1 else max(size, 1)) != 0
+
+
+def _but_last_before_break(messages: Iterator[Message]) -> Iterator[Message]:
+    """Leave out the message that a break lies in: sqlite fills a page cut in two with zeros."""
+    held = next(messages, None)
+    for message in messages:
+        if held is not None:
+            yield held
+        held = message
+    if held is not None:
+        yield held
+
+
+def _checked(row: tuple[Any, Any, Any]) -> Message:
     number, stamp, data = row
     if not isinstance(stamp, int) or not isinstance(data, bytes):
         raise BrokenFile(f"its table 'messages' holds the stamp {stamp!r:.40} with the data "

@@ -1,0 +1,775 @@
+"""Bags: what is written reads back, and what is broken is read as far as it goes."""
+
+import argparse
+from collections import Counter
+import os
+from pathlib import Path
+import resource
+import shutil
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import (
+    CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer)
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from scipy.spatial.transform import Rotation
+
+from djet_ros.cli import kitti_to_bag
+from djet_ros.data.bag_writers import (
+    camera_info, mono8, OPTICAL, pose_stamped, ResultBag, STORAGES, write_kitti_bag)
+from djet_ros.data.bags import Bag, BagSource
+from djet_ros.data.decoding import jazzy, message_type
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.data.storages.base import LARGEST_PIECE
+from djet_ros.data.storages.compression import zstd
+from djet_ros.errors import DjetError
+
+K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+SECOND = 10**9
+
+
+def header(stamp, frame_id='camera'):
+    return message_type('std_msgs/msg/Header')(
+        stamp=message_type('builtin_interfaces/msg/Time')(
+            sec=stamp // SECOND, nanosec=stamp % SECOND), frame_id=frame_id)
+
+
+def image(stamp, size=(64, 48)):
+    # Noise: it does not compress, so that every cut and flip hits data.
+    pixels = np.random.default_rng(stamp).integers(0, 256, size[::-1], dtype=np.uint8)
+    return mono8(pixels, header(stamp))
+
+
+def compressed(stamp):
+    _, data = cv2.imencode('.png', np.full((48, 64), 9, np.uint8))
+    return message_type('sensor_msgs/msg/CompressedImage')(
+        header=header(stamp), format='png', data=data.ravel())
+
+
+def info(stamp):
+    return camera_info(K, (64, 48), header(stamp))
+
+
+def pose(stamp):
+    return pose_stamped(np.eye(4), header(stamp))
+
+
+def record(path, messages, storage='mcap', mode=CompressionMode.NONE, store=None):
+    """Write (topic, message, stamp) with rosbags; mode FILE, MESSAGE or STORAGE compresses."""
+    store = store or jazzy()
+    writer = Ros2Writer(path, version=9, storage_plugin=STORAGES[storage])
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    connections = {}
+    with writer:
+        for topic, message, stamp in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], stamp, store.serialize_cdr(message, kind))
+    return path
+
+
+def camera_messages(count=30):
+    for stamp in range(SECOND, SECOND * (count + 1), SECOND):
+        yield '/cam/camera_info', info(stamp), stamp
+        yield '/cam/image_raw', image(stamp), stamp
+
+
+def ros1_bag(path, count=30, compression=None):
+    """Write the camera of a ROS 1 robot: upper-case K, header.seq."""
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    types = noetic.types
+
+    def old(message):
+        fields = {name: getattr(message, name.lower() if len(name) == 1 else name)
+                  for name, _ in noetic.fielddefs[message.__msgtype__][1] if name != 'header'}
+        stamp = message.header.stamp
+        fields['header'] = types['std_msgs/msg/Header'](
+            seq=7, stamp=types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec),
+            frame_id=message.header.frame_id)
+        return types[message.__msgtype__](**fields)
+
+    writer = Ros1Writer(path)
+    writer.chunk_threshold = 20_000
+    if compression:
+        writer.set_compression(compression)
+    with writer:
+        connections = {}
+        for topic, message, stamp in camera_messages(count):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=noetic)
+            writer.write(connections[topic], stamp, noetic.serialize_ros1(old(message), kind))
+    return path
+
+
+def read_until_broken(path):
+    """Messages that a bag delivers, and what it says then (None if it is whole)."""
+    delivered = []
+    try:
+        with Bag(path) as bag:
+            for message in bag.messages():
+                delivered.append(message)
+    except DjetError as error:
+        assert '\n' not in str(error)
+        assert len(str(error)) < 1000
+        return delivered, str(error)
+    return delivered, None
+
+
+def keys(messages):
+    return [(m.topic, m.stamp_ns, bytes(getattr(m.message, 'data', b''))) for m in messages]
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """One recording of 30 images in every storage, as single files."""
+    folder = tmp_path_factory.mktemp('whole')
+    files = {'bag': ros1_bag(folder / 'whole.bag')}
+    for storage, suffix in (('mcap', 'mcap'), ('sqlite3', 'db3')):
+        record(folder / storage, camera_messages(), storage)
+        files[suffix] = folder / storage / f'{storage}.{suffix}'
+    # Chunks of a few messages, as a real recording has many.
+    chunked = folder / 'chunked'
+    with ResultBag(chunked) as bag:
+        for topic, message, stamp in camera_messages():
+            bag.write(topic, message, stamp)
+    files['mcap'] = chunked / 'chunked.mcap'
+    return files
+
+
+# What is written
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_converted_sequence_reads_back(small_kitti, tmp_path, storage):
+    sequence = KittiSequence(small_kitti(frames=5))
+    write_kitti_bag(sequence, tmp_path / 'out', storage)
+    with BagSource(tmp_path / 'out') as source:
+        assert len(source) == 5
+        assert source.image_topic == '/camera/image_rect'
+        assert source.info_topic == '/camera/camera_info'
+        assert source.ground_truth_topic == '/ground_truth/pose'
+        messages = list(source)
+    frames = [messages[i:i + 3] for i in range(0, 15, 3)]
+    for i, (truth, camera, picture) in enumerate(frames):
+        stamp = sequence.stamps_ns[i]
+        for item in (truth, camera, picture):
+            assert item.stamp_ns == stamp
+            time = item.message.header.stamp
+            assert time.sec * SECOND + time.nanosec == stamp
+        picture = picture.message
+        assert (picture.encoding, picture.step) == ('mono8', 64)
+        assert (picture.data.reshape(48, 64) == sequence.image(i)).all()
+        assert camera.message.k.tolist() == sequence.K.ravel().tolist()
+        assert (camera.message.width, camera.message.height) == (64, 48)
+        assert truth.message.pose.position.z == sequence.poses[i][2, 3]
+
+
+def test_real_frames_survive_the_conversion(kitti, tmp_path):
+    sequence = KittiSequence(kitti / 'sequences' / '06', start=3, end=9)
+    write_kitti_bag(sequence, tmp_path / 'bag')
+    with BagSource(tmp_path / 'bag') as source:
+        images = [m for m in source if m.topic == source.image_topic]
+    assert [m.stamp_ns for m in images] == sequence.stamps_ns.tolist()
+    for i, item in enumerate(images):
+        assert (item.message.data.reshape(370, 1226) == sequence.image(i)).all()
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_other_readers_understand_the_bag(small_kitti, tmp_path, storage):
+    write_kitti_bag(KittiSequence(small_kitti(frames=4)), tmp_path / 'out', storage)
+    with AnyReader([tmp_path / 'out']) as reader:
+        assert reader.message_count == 13
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert counts == {'/tf_static': 1, '/camera/image_rect': 4, '/camera/camera_info': 4,
+                          '/ground_truth/pose': 4}
+        static = next(c for c in reader.connections if c.topic == '/tf_static')
+        assert static.ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
+        _, _, data = next(reader.messages([static]))
+        transform = reader.deserialize(data, static.msgtype).transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'camera_first')
+
+
+def test_the_map_has_x_ahead_and_z_up():
+    ahead, right, down = np.eye(3)[2], np.eye(3)[0], np.eye(3)[1]
+    in_map = Rotation.from_quat(OPTICAL).apply([ahead, right, down])
+    assert np.allclose(in_map, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_the_same_sequence_gives_the_same_bytes(small_kitti, tmp_path, storage):
+    sequence = KittiSequence(small_kitti())
+    for parent in ('a', 'b'):
+        write_kitti_bag(sequence, tmp_path / parent / 'bag', storage)
+    files = [{path.name: path.read_bytes() for path in (tmp_path / parent / 'bag').iterdir()}
+             for parent in ('a', 'b')]
+    assert len(files[0]) == 2
+    assert files[0] == files[1]
+
+
+def test_an_existing_bag_is_replaced_only_on_demand(small_kitti, tmp_path):
+    sequence = KittiSequence(small_kitti(frames=3))
+    write_kitti_bag(sequence, tmp_path / 'out')
+    with pytest.raises(DjetError, match=r'out exists; choose another name or pass --overwrite'):
+        write_kitti_bag(sequence, tmp_path / 'out')
+    write_kitti_bag(KittiSequence(sequence.folder, end=2), tmp_path / 'out', overwrite=True)
+    with BagSource(tmp_path / 'out') as source:
+        assert len(source) == 2
+
+
+def test_a_folder_that_is_no_bag_is_never_overwritten(small_kitti, tmp_path):
+    (tmp_path / 'home').mkdir()
+    (tmp_path / 'home' / 'thesis.txt').write_text('mine')
+    with pytest.raises(DjetError, match='exists and is no bag folder'):
+        write_kitti_bag(KittiSequence(small_kitti()), tmp_path / 'home', overwrite=True)
+    assert (tmp_path / 'home' / 'thesis.txt').read_text() == 'mine'
+
+
+def interrupt(written):
+    if written == 3:
+        raise KeyboardInterrupt
+
+
+def test_a_conversion_that_fails_leaves_nothing_or_the_old_bag(small_kitti, tmp_path):
+    folder = small_kitti(frames=6)
+    out = tmp_path / 'place' / 'out'
+    write_kitti_bag(KittiSequence(folder, end=2), out)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(KeyboardInterrupt):
+        write_kitti_bag(KittiSequence(folder), out, progress=interrupt, overwrite=True)
+    damaged = folder / 'image_0' / '000004.png'
+    damaged.write_bytes(damaged.read_bytes()[:500])
+    with pytest.raises(DjetError, match='000004.png is a damaged PNG'):
+        write_kitti_bag(KittiSequence(folder), out, overwrite=True)
+    with pytest.raises(DjetError, match='damaged PNG'):
+        write_kitti_bag(KittiSequence(folder), out.parent / 'other')
+    assert [path.name for path in out.parent.iterdir()] == ['out']
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+@pytest.fixture
+def small_disk():
+    """Let this process write no file beyond 200 kB, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_full_disk_is_reported_and_leaves_no_bag(small_kitti, tmp_path, storage, small_disk):
+    sequence = KittiSequence(small_kitti(frames=80))
+    with pytest.raises(DjetError, match='out could not be written: .*; nothing was left behind'):
+        write_kitti_bag(sequence, tmp_path / 'place' / 'out', storage)
+    assert list((tmp_path / 'place').iterdir()) == []
+
+
+def test_results_on_a_full_disk_stay_readable(tmp_path, small_disk):
+    with pytest.raises(DjetError, match='what was written before is readable'):
+        with ResultBag(tmp_path / 'bag') as bag:
+            for stamp in range(1, 200):
+                bag.write('/image', image(stamp), stamp)
+    delivered, _ = read_until_broken(tmp_path / 'bag')
+    assert len(delivered) > 55
+    assert [m.stamp_ns for m in delivered] == list(range(1, len(delivered) + 1))
+
+
+def test_results_are_complete_after_an_error(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        with ResultBag(tmp_path / 'bag') as bag:
+            bag.write('odometry', pose(1), 1)
+            bag.write('/diagnostics', pose(1), 1)
+            raise ZeroDivisionError
+    with AnyReader([tmp_path / 'bag']) as reader:
+        assert reader.message_count == 2
+    with pytest.raises(DjetError, match='exists; choose another name'):
+        ResultBag(tmp_path / 'bag')
+
+
+def test_results_of_a_killed_process_are_readable(tmp_path):
+    script = ('import sys, pathlib, numpy\n'
+              'from test_bags import *\n'
+              'bag = ResultBag(pathlib.Path(sys.argv[1]))\n'
+              'for stamp in range(1, 10**6):\n'
+              '    bag.write("pose", pose(stamp), stamp)\n'
+              '    bag.write("path", pose(stamp), stamp)\n'
+              '    print(stamp, flush=True)\n')
+    process = subprocess.Popen([sys.executable, '-c', script, str(tmp_path / 'bag')],
+                               stdout=subprocess.PIPE, text=True,
+                               cwd=Path(__file__).parent,
+                               env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
+    for _ in range(300):
+        process.stdout.readline()
+    os.kill(process.pid, signal.SIGKILL)
+    rest, _ = process.communicate()
+    printed = int(rest.split('\n')[-2]) if '\n' in rest else 300
+    assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
+    delivered, said = read_until_broken(tmp_path / 'bag')
+    assert 'everything before that was read' in said
+    assert len(delivered) >= 2 * (printed - 1)
+    assert [m.stamp_ns for m in delivered] == [i // 2 + 1 for i in range(len(delivered))]
+
+
+def test_the_command_converts(small_kitti, tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    kitti_to_bag.add_parser(parser.add_subparsers())
+    folder = small_kitti(frames=6)
+    args = parser.parse_args(['kitti-to-bag', str(folder), str(tmp_path / 'out'), '--storage',
+                              'sqlite3', '--start', '1', '--end', '4'])
+    assert kitti_to_bag.run(args) == 0
+    assert capsys.readouterr().out == (
+        f'{tmp_path / "out"}: 3 frames of 64x48, 0.2 s, with ground truth\n')
+    assert (tmp_path / 'out' / 'out.db3').exists()
+    with pytest.raises(DjetError, match='pass --overwrite'):
+        kitti_to_bag.run(args)
+
+
+# What is read
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE,
+                                  CompressionMode.STORAGE])
+def test_compressed_bags_are_read(tmp_path, storage, mode):
+    if (storage, mode) == ('sqlite3', CompressionMode.STORAGE):
+        pytest.skip('sqlite3 has no compression of its own')
+    path = record(tmp_path / 'bag', camera_messages(5), storage, mode)
+    delivered, said = read_until_broken(path)
+    assert said is None
+    expected, _ = read_until_broken(record(tmp_path / 'plain', camera_messages(5)))
+    assert keys(delivered) == keys(expected)
+
+
+@pytest.mark.parametrize('compression', [None, *Ros1Writer.CompressionFormat])
+def test_ros1_bags_give_the_messages_of_jazzy(tmp_path, compression):
+    with BagSource(ros1_bag(tmp_path / 'old.bag', 5, compression)) as source:
+        assert len(source) == 5
+        messages = list(source)
+    for camera, picture in zip(messages[::2], messages[1::2], strict=True):
+        stamp = camera.stamp_ns
+        assert type(camera.message) is message_type('sensor_msgs/msg/CameraInfo')
+        assert camera.message.k.tolist() == K.ravel().tolist()
+        assert camera.message.header == header(stamp)
+        assert (picture.message.data == image(stamp).data).all()
+
+
+@pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
+def test_a_single_file_is_a_bag_whatever_its_name(whole, tmp_path, suffix):
+    path = shutil.copy(whole[suffix], tmp_path / 'run #1?.data')
+    delivered, said = read_until_broken(path)
+    assert said is None
+    assert len(delivered) == 60
+    assert Counter(m.topic for m in delivered) == {'/cam/camera_info': 30, '/cam/image_raw': 30}
+
+
+def test_split_bags_are_read_in_order_with_and_without_metadata(tmp_path):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    for part in range(11):
+        stamps = range(part * 3 + 1, part * 3 + 4)
+        record(tmp_path / 'x', ((f'/part{part % 2}', pose(s), s) for s in stamps))
+        shutil.move(tmp_path / 'x' / 'x.mcap', bag / f'bag_{part}.mcap')
+        shutil.rmtree(tmp_path / 'x')
+    for metadata in (None, [f'bag_{part}.mcap' for part in range(11)],
+                     [f'bag/bag_{part}.mcap' for part in range(11)]):
+        if metadata:
+            (bag / 'metadata.yaml').write_text(
+                f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}')
+        delivered, said = read_until_broken(bag)
+        assert said is None
+        assert [m.stamp_ns for m in delivered] == list(range(1, 34))
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_messages_come_in_the_order_of_time_not_of_writing(tmp_path, storage):
+    stamps = np.random.default_rng(3).permutation(np.arange(1, 900)).tolist()
+    path = record(tmp_path / 'bag', (('/image', image(s), s) for s in stamps), storage)
+    with Bag(path) as bag:
+        assert [m.stamp_ns for m in bag.messages()] == sorted(stamps)
+
+
+def test_an_mcap_without_chunks_or_index_is_read(whole, tmp_path):
+    loose = tmp_path / 'loose.mcap'
+    loose.write_bytes(without_chunks(whole['mcap'].read_bytes()))
+    delivered, said = read_until_broken(loose)
+    assert said is None
+    assert keys(delivered) == keys(read_until_broken(whole['mcap'])[0])
+
+
+def without_chunks(data):
+    """Records of an MCAP file with its chunks dissolved, and no summary."""
+    output, position = [data[:8]], 8
+    while True:
+        code, length = struct.unpack_from('<BQ', data, position)
+        end = position + 9 + length
+        if code == 6:
+            # After the times, sizes and checksum comes an empty compression name.
+            output.append(data[position + 9 + 40:end])
+        elif code == 15:
+            footer = struct.pack('<BQQQI', 2, 20, 0, 0, 0)
+            return b''.join([*output, data[position:end], footer, data[:8]])
+        elif code not in (7,):
+            output.append(data[position:end])
+        position = end
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_bag_is_never_whole_in_memory(tmp_path, storage):
+    path = record(tmp_path / 'bag', (('/image', image(s, (1000, 800)), s) for s in range(1, 61)),
+                  storage)
+    with Bag(path) as bag:
+        tracemalloc.start()
+        count = sum(1 for _ in bag.messages())
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert count == 60
+    assert peak < 20e6, 'of 48 MB'
+
+
+def test_bags_older_than_iron_have_no_definitions(whole, tmp_path):
+    path = shutil.copy(whole['db3'], tmp_path / 'humble.db3')
+    with sqlite3.connect(path) as database:
+        database.execute('DROP TABLE message_definitions')
+        database.execute('DROP TABLE schema')
+    delivered, said = read_until_broken(path)
+    assert said is None
+    assert keys(delivered) == keys(read_until_broken(whole['db3'])[0])
+
+
+def changed_types(change):
+    """Types of Jazzy with the definition of Image changed."""
+    store = get_typestore(Stores.EMPTY)
+    text, _ = jazzy().generate_msgdef('sensor_msgs/msg/Image', ros_version=2)
+    store.register(get_types_from_msg(change(text), 'sensor_msgs/msg/Image'))
+    return store
+
+
+def changed_image(store, **fields):
+    plain = image(5)
+    names = [name for name, _ in store.fielddefs['sensor_msgs/msg/Image'][1]]
+    return store.types['sensor_msgs/msg/Image'](
+        **{name: fields[name] if name in fields else getattr(plain, name) for name in names})
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_type_that_differs_is_read_by_the_recorded_definition(tmp_path, storage):
+    store = changed_types(lambda text: text.replace('uint32 height', 'float64 gain\nint64 height'))
+    path = record(tmp_path / 'bag', [('/image', changed_image(store, gain=2.0), 5)], storage,
+                  store=store)
+    with Bag(path) as bag:
+        item, = bag.messages()
+    assert type(item.message) is message_type('sensor_msgs/msg/Image')
+    assert item.message.height == 48
+    assert (item.message.data == image(5).data).all()
+
+
+@pytest.mark.parametrize(('old', 'new', 'value'), [
+    ('uint32 height', 'string height', 'high'), ('uint32 height', 'uint32 tallness', 48)])
+def test_a_type_that_lacks_what_jazzy_has_is_refused(tmp_path, old, new, value):
+    store = changed_types(lambda text: text.replace(old, new))
+    message = changed_image(store, **{new.split()[1]: value})
+    delivered, said = read_until_broken(
+        record(tmp_path / 'bag', [('/image', message, 5)], store=store))
+    assert delivered == []
+    assert "recorded without a field 'height'" in said
+
+
+# Which topics are the camera
+
+
+def source_error(path, **topics):
+    with pytest.raises(DjetError) as caught:
+        BagSource(path, **topics)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+def test_two_cameras_are_listed_with_their_counts(tmp_path):
+    messages = [(f'/{side}/{name}', make(stamp), stamp) for side in ('left', 'right')
+                for name, make in (('camera_info', info), ('image_raw', image))
+                for stamp in range(1, 4)]
+    path = record(tmp_path / 'bag', [*messages, ('/left/image_raw', image(9), 9)])
+    said = source_error(path)
+    assert '/left/image_raw (4), /right/image_raw (3); choose one with --image-topic' in said
+    with BagSource(path, image_topic='/right/image_raw') as source:
+        assert (source.info_topic, len(source)) == ('/right/camera_info', 3)
+        assert {m.topic for m in source} == {'/right/camera_info', '/right/image_raw'}
+    assert "no image topic '/top/image'; choose from /left" in source_error(
+        path, image_topic='/top/image')
+    assert "no CameraInfo topic '/tf'; choose from /left" in source_error(
+        path, image_topic='/left/image_raw', info_topic='/tf')
+
+
+def test_a_compressed_image_has_the_camera_of_its_raw_topic(tmp_path):
+    path = record(tmp_path / 'bag', [
+        ('/other/camera_info', info(1), 1), ('/cam/camera_info', info(1), 1),
+        ('/cam/image_raw/compressed', compressed(1), 1)])
+    with BagSource(path) as source:
+        assert source.info_topic == '/cam/camera_info'
+        assert source.image_topic == '/cam/image_raw/compressed'
+
+
+def test_an_only_camera_info_serves_an_only_camera(tmp_path):
+    path = record(tmp_path / 'one', [('/calibration', info(1), 1), ('/cam/image', image(1), 1)])
+    with BagSource(path) as source:
+        assert source.info_topic == '/calibration'
+    path = record(tmp_path / 'two', [('/a/image', image(1), 1), ('/b/image', image(1), 1),
+                                     ('/a/camera_info', info(1), 1)])
+    said = source_error(path, image_topic='/b/image')
+    assert 'no CameraInfo beside /b/image; if /a/camera_info is meant' in said
+
+
+def test_ground_truth_is_found_by_its_name_or_given(tmp_path):
+    path = record(tmp_path / 'bag', [*camera_messages(2), ('/groundtruth', pose(1), SECOND),
+                                     ('/estimate', pose(1), SECOND)])
+    with BagSource(path) as source:
+        assert source.ground_truth_topic == '/groundtruth'
+    with BagSource(path, ground_truth_topic='/estimate') as source:
+        assert source.ground_truth_topic == '/estimate'
+        assert len(list(source)) == 5
+
+
+def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):
+    path = record(tmp_path / 'bag', [('/image\n\x1b[2J1', image(1), 1), ('/image2', image(1), 1)])
+    assert 'has 2 image topics: /image ?[2J1 (1), /image2 (1)' in source_error(path)
+
+
+@pytest.mark.parametrize(('messages', 'said'), [
+    ([], 'holds no message'),
+    ([('/pose', pose(1), 1)], 'has no image topic, but /pose (geometry_msgs/msg/PoseStamped)'),
+    ([('/image', image(1), 1)], 'has no CameraInfo topic, but /image (sensor_msgs/msg/Image)'),
+])
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_bag_without_a_camera_is_refused(tmp_path, storage, messages, said):
+    assert said in source_error(record(tmp_path / 'bag', messages, storage))
+
+
+# What is broken
+
+
+@pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
+def test_a_bag_cut_short_is_read_up_to_the_cut(whole, tmp_path, suffix):
+    data = whole[suffix].read_bytes()
+    expected = keys(read_until_broken(whole[suffix])[0])
+    path = tmp_path / f'cut.{suffix}'
+    counts = []
+    for part in (0.01, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8):
+        path.write_bytes(data[:int(len(data) * part)])
+        delivered, said = read_until_broken(path)
+        assert str(path) in said
+        if suffix == 'db3':
+            # The index by stamps may be cut too; then they come as recorded.
+            assert set(keys(delivered)) <= set(expected)
+        else:
+            assert keys(delivered) == expected[:len(delivered)]
+        counts.append(len(delivered))
+    assert counts == sorted(counts)
+    assert counts[3] >= len(expected) / 3
+
+
+@pytest.mark.parametrize('suffix', ['mcap', 'bag'])
+def test_a_bag_that_lost_only_its_index_has_lost_nothing(whole, tmp_path, suffix):
+    path = tmp_path / f'cut.{suffix}'
+    path.write_bytes(whole[suffix].read_bytes()[:-50])
+    delivered, said = read_until_broken(path)
+    assert said is None
+    assert keys(delivered) == keys(read_until_broken(whole[suffix])[0])
+
+
+def test_a_compressed_chunk_cut_short_gives_its_first_messages(tmp_path):
+    path = record(tmp_path / 'bag', camera_messages(200), mode=CompressionMode.STORAGE)
+    data = (path / 'bag.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(data[:len(data) // 2])
+    delivered, said = read_until_broken(tmp_path / 'cut.mcap')
+    assert len(delivered) > 100
+    assert 'is cut short' in said
+
+
+def test_a_compressed_file_cut_short_gives_its_first_messages(tmp_path):
+    path = record(tmp_path / 'bag', camera_messages(60), mode=CompressionMode.FILE)
+    file = path / 'bag.mcap.zstd'
+    file.write_bytes(file.read_bytes()[:int(file.stat().st_size * 0.8)])
+    delivered, said = read_until_broken(path)
+    assert len(delivered) > 30
+    assert str(file) in said
+    assert not list(Path(os.environ.get('TMPDIR', '/tmp')).glob('djet-*/bag.mcap'))
+
+
+@pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
+def test_flipped_bits_end_in_messages_or_one_line(whole, tmp_path, suffix):
+    data = whole[suffix].read_bytes()
+    rng = np.random.default_rng(5)
+    path = tmp_path / f'flipped.{suffix}'
+    for _ in range(60):
+        flipped = np.frombuffer(data, np.uint8).copy()
+        # Half of them in the structures at the ends, where they hurt most.
+        where = rng.integers(0, len(data), 20)
+        where[:10] = np.minimum(rng.integers(0, 3000, 10), len(data) - 1)
+        where[5:10] = len(data) - 1 - where[5:10]
+        chosen = where[rng.integers(0, 20, rng.integers(1, 4))]
+        flipped[chosen] ^= np.uint8(1) << rng.integers(0, 8, len(chosen)).astype(np.uint8)
+        path.write_bytes(flipped.tobytes())
+        delivered, said = read_until_broken(path)
+        assert said or delivered
+
+
+def test_a_damaged_chunk_is_noticed_by_its_checksum(whole, tmp_path):
+    data = bytearray(whole['mcap'].read_bytes())
+    # The second chunk gets a checksum that is wrong.
+    second = [i for i in range(8, len(data) - 9) if data[i] == 6
+              and data[i + 1:i + 9] == data[i + 1:i + 3] + bytes(6)
+              and data[i + 37:i + 41] == bytes(4)][1]
+    data[second + 33:second + 37] = b'\x01\x02\x03\x04'
+    (tmp_path / 'bad.mcap').write_bytes(data)
+    delivered, said = read_until_broken(tmp_path / 'bad.mcap')
+    assert 'does not match its checksum' in said
+    assert len(delivered) >= 2
+
+
+@pytest.mark.parametrize(('content', 'said'), [
+    (b'', 'is empty (0 bytes)'),
+    (b'hello, this is no bag', "begins with b'hello, t'"),
+    (b'#ROSBAG V1.2\n', 'ROS 1 bag (format 2.0)'),
+    (b'#ROSBAG V2.0\n', 'cut short at byte'),
+    (b'\x89MCAP0\r\n', 'cut short at byte 8'),
+    (b'\x89MCAP0\r\n' + bytes(5000), 'there is no record at byte 8'),
+    (b'SQLite format 3\x00', 'not a database'),
+    (b'SQLite format 3\x00' + bytes(5000), 'not a database'),
+    (b'\x28\xb5\x2f\xfdhello', 'zstd data is damaged'),
+])
+def test_a_file_that_is_no_bag_is_refused(tmp_path, content, said):
+    (tmp_path / 'file.mcap').write_bytes(content)
+    delivered, heard = read_until_broken(tmp_path / 'file.mcap')
+    assert delivered == []
+    assert said in heard
+
+
+def test_a_path_that_is_no_bag_is_refused(tmp_path):
+    assert 'nothing does not exist' in source_error(tmp_path / 'nothing')
+    assert 'it has neither metadata.yaml nor .mcap or .db3' in source_error(tmp_path)
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    assert 'is no regular file' in source_error(tmp_path / 'pipe.mcap')
+
+
+@pytest.mark.parametrize(('statement', 'said'), [
+    ('DROP TABLE messages', "no table 'messages'"),
+    ('DROP TABLE topics', "no table 'topics'"),
+    ('ALTER TABLE topics DROP COLUMN type', 'no such column: type'),
+    ('ALTER TABLE messages DROP COLUMN data', 'no such column: data'),
+    ("UPDATE topics SET name = x'00ff'", "table 'topics' holds the row"),
+    ("UPDATE topics SET serialization_format = 'json'", "encoding 'json' is neither cdr nor"),
+    ("UPDATE topics SET type = 'a/msg/B'; DROP TABLE message_definitions", "type 'a/msg/B'"),
+    ("UPDATE messages SET timestamp = 'now' WHERE id = 7", "holds the stamp 'now'"),
+    ("UPDATE messages SET data = 'text' WHERE id = 7", "with the data 'text'"),
+    ("UPDATE messages SET data = x'00' WHERE id = 7", 'at 4000000000 ns: it is no sensor_msgs'),
+    ("UPDATE messages SET data = x'28b52ffd00' WHERE id = 7", 'a zstd message is'),
+    ("UPDATE message_definitions SET encoded_message_definition = 'x'", "can't be read"),
+    ("UPDATE message_definitions SET encoded_message_definition = 'Image[9] again'",
+     "can't be read"),
+    ("UPDATE message_definitions SET encoded_message_definition = 'string[2000000000] a'",
+     'is an array of 2000000000'),
+])
+def test_a_wrong_database_is_refused(whole, tmp_path, statement, said):
+    path = shutil.copy(whole['db3'], tmp_path / 'wrong.db3')
+    with sqlite3.connect(path) as database:
+        database.execute('DROP INDEX timestamp_idx')
+        database.executescript(statement)
+    _, heard = read_until_broken(path)
+    assert heard is not None
+    assert said in heard
+
+
+@pytest.mark.parametrize(('metadata', 'said'), [
+    ('[../secret.db3]', "'../secret.db3', which lies outside the bag"),
+    ('[/etc/passwd]', "'/etc/passwd', which lies outside the bag"),
+    ('[bag.mcap, gone.mcap]', "'gone.mcap', which does not exist"),
+    ('[]', 'lists no file'),
+    ('7', "no list 'relative_file_paths'"),
+    ('[{a: b}]', "no list 'relative_file_paths'"),
+    ('[', 'is not valid YAML'),
+    ('[' * 5000, 'is not valid YAML'),
+    ('!!python/object/apply:os.system [exit]', 'is not valid YAML'),
+    ('bag.mcap' * 400_000, 'at most 2097152 are read'),
+])
+def test_wrong_metadata_is_refused(tmp_path, metadata, said):
+    path = record(tmp_path / 'bag', camera_messages(2))
+    (path / 'metadata.yaml').write_text(
+        f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}')
+    assert said in source_error(path)
+
+
+def chunk_bomb(data, declared):
+    """Build an MCAP file of one zstd chunk that claims to unpack to some size."""
+    body = struct.pack('<QQQI', 1, 1, declared, 0)
+    body += struct.pack('<I', 4) + b'zstd' + struct.pack('<Q', len(data)) + data
+    head = struct.pack('<II', 0, 0)
+    return (b'\x89MCAP0\r\n' + struct.pack('<BQ', 1, len(head)) + head
+            + struct.pack('<BQ', 6, len(body)) + body)
+
+
+def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
+    packer = zstd.ZstdCompressor()
+    bomb = b''.join([*(packer.compress(bytes(1 << 20)) for _ in range(600)), packer.flush()])
+    assert len(bomb) < 80_000
+    # Little more than the interpreter and its libraries need; unpacking would break it.
+    script = ('import resource, sys, pathlib\n'
+              'from test_bags import read_until_broken\n'
+              'import djet_ros.data.decoding\n'
+              'used = int(open("/proc/self/statm").read().split()[0]) * 4096\n'
+              'resource.setrlimit(resource.RLIMIT_AS, (used + (300 << 20),) * 2)\n'
+              'for path in sys.argv[1:]:\n'
+              '    print(read_until_broken(pathlib.Path(path))[1])\n')
+    message = whole_message(tmp_path, bomb)
+    for name, data in (('honest', chunk_bomb(bomb, 600 << 20)), ('liar', chunk_bomb(bomb, 1000)),
+                       ('absurd', chunk_bomb(bomb, 2**63))):
+        (tmp_path / name).write_bytes(data)
+    run = subprocess.run(
+        [sys.executable, '-c', script, *(tmp_path / name for name in ('honest', 'liar', 'absurd')),
+         message], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent, check=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
+    honest, liar, absurd, long = run.stdout.splitlines()
+    assert f'at most {LARGEST_PIECE} are unpacked' in honest
+    assert 'more than the 1000 bytes announced' in liar
+    assert f'announces {2**63} bytes' in absurd
+    assert 'a zstd message is cut short or too large' in long
+
+
+def whole_message(tmp_path, data):
+    """Database with one message of given bytes."""
+    path = record(tmp_path / 'message', [('/image', image(1), 1)], 'sqlite3') / 'message.db3'
+    with sqlite3.connect(path) as database:
+        database.execute('UPDATE messages SET data = ?', (data,))
+    return path
+
+
+def test_an_image_that_declares_more_than_it_has_is_delivered_as_it_is(tmp_path):
+    message = image(1)
+    message.height = message.width = message.step = 2**31
+    with Bag(record(tmp_path / 'bag', [('/image', message, 1)])) as bag:
+        item, = bag.messages()
+    assert item.message.height == 2**31
+    assert len(item.message.data) == 64 * 48
+
+
+def test_a_sequence_that_declares_more_than_the_message_holds_is_refused(tmp_path):
+    data = bytearray(jazzy().serialize_cdr(image(1), 'sensor_msgs/msg/Image'))
+    where = data.index(struct.pack('<I', 64 * 48), 20)
+    data[where:where + 4] = b'\xff\xff\xff\xff'
+    delivered, said = read_until_broken(whole_message(tmp_path, bytes(data)))
+    assert delivered == []
+    assert 'Invalid sequence length 4294967295' in said
+
+
+def test_storage_plugins_are_those_that_rosbags_has():
+    assert set(STORAGES.values()) == set(StoragePlugin)
