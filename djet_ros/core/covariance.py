@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from djet_ros.core.jet import Loss, Residuals
 from djet_ros.core.types import Array
+import numpy as np
 
 
 def pose_covariance(residuals: Residuals, loss: Loss) -> tuple[Array, Array]:

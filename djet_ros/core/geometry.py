@@ -9,15 +9,14 @@ Constrained Tracking").
 from __future__ import annotations
 
 import cv2
+from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from djet_ros.core.types import Array
-
 
 def skew(v: Array) -> Array:
-    """Cross-product matrix [v]_x of a (3,) vector: ``skew(v) @ w == cross(v, w)``."""
+    """Cross-product matrix [v]_x of a (3,) vector, so that [v]_x w is the product v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -34,7 +33,7 @@ def unit(v: Array) -> Array:
 
 def sphere_tangents(t: Array) -> Array:
     """
-    Two orthonormal directions (3, 2) perpendicular to the unit vector t (3,).
+    Give two orthonormal directions (3, 2) perpendicular to the unit vector t (3,).
 
     Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017): no division by zero.
     """
@@ -51,7 +50,7 @@ def homogeneous(points: Array) -> Array:
 
 
 def rays(K: Array, points: Array) -> Array:
-    """Viewing rays K^-1 x (N, 3), with z = 1, of pixels (N, 2)."""
+    """Take pixels (N, 2) to their viewing rays K^-1 x (N, 3), with z = 1."""
     return np.asarray(homogeneous(points) @ np.linalg.inv(K).T)
 
 

@@ -8,11 +8,10 @@ on whole pixels of the smoothed image, exactly as ``cv2.ORB.compute`` does with 
 from __future__ import annotations
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from djet_ros.core.orb_pattern import REACH, TESTS
 from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]

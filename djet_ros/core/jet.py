@@ -15,12 +15,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
+from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
+from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
-
-from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
-from djet_ros.core.paraboloid import Paraboloids, inverse_2x2
-from djet_ros.core.types import Array
 
 _MAX_STEPS = 30
 _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good for

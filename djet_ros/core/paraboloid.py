@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
-
-from djet_ros.core.types import Array
 
 # Least curvature of a projected paraboloid, as a share of the median curvature of all of them:
 # keeps a flat direction weak, and the algebra finite.
@@ -79,7 +78,7 @@ def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
 
 
 def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
-    """Raise the eigenvalues of A' to a small positive floor, so that every surface has a minimum."""
+    """Raise the eigenvalues of A' to a small positive floor: every surface gets a minimum."""
     eigenvalues, vectors = np.linalg.eigh(paraboloids.A)
     positive = eigenvalues[eigenvalues > 0]
     floor = _CURVATURE_FLOOR * (float(np.median(positive)) if len(positive) else 1.0)

@@ -46,10 +46,9 @@ def check(config: Any) -> None:
         value = getattr(config, name)
         if description.choices and value not in description.choices:
             raise ValueError(f"{name} is '{value}'; choose from {', '.join(description.choices)}")
-        for bound, outside in ((description.minimum, lambda b: not value >= b),
-                               (description.maximum, lambda b: not value <= b)):
-            if bound is not None and outside(bound):
-                raise ValueError(f'{name} is {value}; it must lie between '
-                                 f'{description.minimum} and {description.maximum}')
+        low, high = description.minimum, description.maximum
+        # a NaN is neither below nor above, so ask for what it must be
+        if not ((low is None or value >= low) and (high is None or value <= high)):
+            raise ValueError(f'{name} is {value}; it must lie between {low} and {high}')
         if description.odd and value % 2 == 0:
             raise ValueError(f'{name} is {value}; it must be odd')

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from djet_ros.core.geometry import in_front, rays
 from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
 
 # Translation X_B = X_A + t of a camera that drives straight ahead.
 FORWARD = np.array([0.0, 0.0, -1.0])
@@ -36,9 +35,8 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
         return None
     inliers = mask.ravel() > 0
-    R1, R2, direction = cv2.decomposeEssentialMat(E[:3])
-    t = direction.ravel()
-    candidates = [Pose(R, sign * t) for R in (R1, R2) for sign in (1.0, -1.0)]
+    R1, R2, t = (np.asarray(part, float) for part in cv2.decomposeEssentialMat(E[:3]))
+    candidates = [Pose(R, sign * t.ravel()) for R in (R1, R2) for sign in (1.0, -1.0)]
     rays_x, rays_y = rays(K, x[inliers]), rays(K, y[inliers])
     best = max(candidates, key=lambda p: int(in_front(p.R, p.t, rays_x, rays_y).sum()))
     return best, inliers
@@ -46,7 +44,7 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
 
 def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:
     """
-    Starting poses that between them reach the right basin.
+    Collect starting poses that between them reach the right basin.
 
     RANSAC alone can land in a wrong one (sideways for forward translation); the previous motion
     and driving straight ahead are the likely alternatives.

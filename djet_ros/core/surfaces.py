@@ -11,18 +11,17 @@ from dataclasses import replace
 from typing import Protocol
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.hamming import describable, descriptor_bits, hamming_surfaces
 from djet_ros.core.paraboloid import (
-    Paraboloids,
     fit_paraboloids,
     indefinite,
+    Paraboloids,
     project_to_positive,
 )
 from djet_ros.core.types import Array, View
+import numpy as np
+from numpy.typing import NDArray
 
 
 class ResidualSurface(Protocol):
@@ -73,8 +72,9 @@ class PhotometricSurface:
         self._radius = radius
         self._weights = _weight_window(self._offsets, config.window_sigma)
         self._image = current.smoothed.astype(np.float32)
-        self._gradient = [cv2.Scharr(self._image, cv2.CV_32F, *order, scale=1 / 32)
-                          for order in ((1, 0), (0, 1))]
+        self._gradient = [
+            np.asarray(cv2.Scharr(self._image, cv2.CV_32F, *order, scale=1 / 32), np.float32)
+            for order in ((1, 0), (0, 1))]
         self._reference = self._sample(previous.smoothed.astype(np.float32), x)
         self._has_reference = self._inside(x, previous.smoothed.shape)
         self.x = x
@@ -141,6 +141,7 @@ def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.flo
 def _spread(fitted: Paraboloids, usable: NDArray[np.bool_], y: Array) -> Paraboloids:
     """Put the fits of the usable points back among all N."""
     n = len(y)
-    centres, A, b, c = y.copy(), np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)), np.zeros(n)
+    centres, b, c = y.copy(), np.zeros((n, 2)), np.zeros(n)
+    A = np.repeat(np.eye(2)[None], n, axis=0)
     centres[usable], A[usable], b[usable], c[usable] = fitted.centres, fitted.A, fitted.b, fitted.c
     return Paraboloids(centres, A, b, c, usable)

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, homogeneous
 from djet_ros.core.jet import (
-    JetProblem,
-    Loss,
-    Residuals,
-    Solution,
     epipolar_residuals,
     jet_problem,
+    JetProblem,
+    Loss,
     minimise,
+    Residuals,
     robust_scale,
+    Solution,
 )
-from djet_ros.core.paraboloid import Paraboloids, constrained_minimum
+from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.starts import Pose
 from djet_ros.core.surfaces import ResidualSurface, with_minimum
 from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
 
 # Residuals of perfect data must not shrink the loss to nothing, in pixels.
 _LEAST_SCALE = 0.02
@@ -90,7 +89,7 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         losses[alive] = paraboloids.values(optimum)[alive]
         converged = len(poses) == 1 and _change(poses[0], pose) < config.epsilon
         poses = [pose]
-        if converged:
+        if converged or iteration == config.max_iterations:
             break
         keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
     return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
@@ -124,7 +123,7 @@ def _scale(residuals: Residuals) -> float:
 
 
 def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:
-    """A minimum outside the sampled window is extrapolation, not to be believed."""
+    """Believe only minima inside the sampled window, (N,) bool: the rest is extrapolation."""
     reach = np.abs(paraboloids.minima() - paraboloids.centres).max(1)
     return np.asarray(reach <= config.window // 2)
 
@@ -149,7 +148,7 @@ def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array
 
 
 def _change(before: Pose, after: Pose) -> float:
-    """||p - p_prev||: rotation and direction together, in rad to first order."""
+    """Measure ||p - p_prev||: rotation and direction together, in rad to first order."""
     return float(np.linalg.norm(np.concatenate([(after.R - before.R).ravel() / np.sqrt(2),
                                                 after.t - before.t])))
 
