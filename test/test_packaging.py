@@ -51,11 +51,12 @@ def environment(copied: Callable[[str], Path]) -> Path:
     folder = source.parents[1]
     run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', folder, cwd=source)
     archive, = folder.glob('*.tar.gz')
-    run(sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation',
-        '--wheel-dir', folder, archive, cwd=folder)
+    offline = ('--no-index', '--no-deps')
+    run(sys.executable, '-m', 'pip', 'wheel', *offline, '--no-build-isolation', '--wheel-dir',
+        folder, archive, cwd=folder)
     wheel, = folder.glob('*.whl')
     run(sys.executable, '-m', 'venv', '--without-pip', 'venv', cwd=folder)
-    run(sys.executable, '-m', 'pip', '--python', folder / 'venv', 'install', '--no-deps', wheel,
+    run(sys.executable, '-m', 'pip', '--python', folder / 'venv', 'install', *offline, wheel,
         cwd=folder)
     return folder / 'venv'
 
