@@ -7,23 +7,22 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-import numpy as np
-from numpy.typing import NDArray
-
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.features import detect_orb, match_features
 from djet_ros.core.geometry import epipolar_lines, fundamental, in_front, line_distances, rays
 from djet_ros.core.hamming import match_distances, smooth
-from djet_ros.core.starts import Pose, five_point, several
+from djet_ros.core.starts import five_point, Pose, several
 from djet_ros.core.surfaces import (
     DescriptorSurface,
     PhotometricSurface,
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.tracking import Track, hold, track_jointly
+from djet_ros.core.tracking import hold, Track, track_jointly
 from djet_ros.core.types import Array, Features, RelativePose, Status, View
+import numpy as np
+from numpy.typing import NDArray
 
 
 class TwoViewEstimator:
@@ -54,7 +53,8 @@ class TwoViewEstimator:
         """
         timings: dict[str, float] = {}
         with _timed(timings, 'matching'):
-            matches = match_features(previous.features, current.features)
+            radius = self.config.search_radius * max(current.gray.shape)
+            matches = match_features(previous.features, current.features, radius)
         x = previous.features.points[matches[:, 0]]
         y = current.features.points[matches[:, 1]]
         return replace(self.estimate_matched(previous, current, x, y, prior, timings),
@@ -73,11 +73,13 @@ class TwoViewEstimator:
         with _timed(timings, 'starts'):
             wide = config.starts == 'several' and config.method != 'five_point'
             found = five_point(K, x, y, config.ransac_threshold, robust=wide)
-            if found is None and not wide:
+            if wide:
+                starts = several(found[0] if found else None, _pose(prior))
+            elif found:
+                starts, inliers = [found[0]], found[1]
+                x, y = x[inliers], y[inliers]
+            else:
                 return RelativePose(Status.DEGENERATE, x=x, y=y)
-            starts = several(found[0] if found else None, _pose(prior)) if wide else [found[0]]
-            if not wide:
-                x, y = x[found[1]], y[found[1]]
 
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):

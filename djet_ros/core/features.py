@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import cv2
+from djet_ros.core.types import Features
 import numpy as np
 from numpy.typing import NDArray
 
-from djet_ros.core.types import Features
+# Features of the previous image that are compared at once; bounds the memory of a comparison.
+_STRIP = 128
+
+# Less than any similarity of two descriptors.
+_NONE = np.float32(-1000.0)
 
 
 def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20) -> Features:
@@ -16,7 +21,7 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
     The descriptors are the usual rotated ones: the initial matching needs their robustness, the
     residual surfaces use unrotated ones (`djet_ros.core.hamming`).
     """
-    orb = cv2.ORB_create(nfeatures=max_features, fastThreshold=fast_threshold)
+    orb = cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
@@ -28,14 +33,45 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
         descriptors=np.asarray(descriptors, np.uint8))
 
 
-def match_features(previous: Features, current: Features) -> NDArray[np.int64]:
+def match_features(previous: Features, current: Features,
+                   search_radius: float) -> NDArray[np.int64]:
     """
-    Match by Hamming distance, brute force with cross-check.
+    Match by Hamming distance with cross-check, among features at most search_radius pixels apart.
 
-    Gives (M, 2) indices into the previous and the current features, in the order of the former.
+    Both x and y may differ by that much. Gives (M, 2) indices into the previous and the current
+    features, in the order of the former. Distances are taken as matrix products of +-1
+    descriptors, exactly, in vertical strips: several times faster than brute force over all
+    pairs, and with fewer chances to be wrong.
     """
-    if not len(previous) or not len(current):
-        return np.empty((0, 2), np.int64)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-    matches = matcher.match(previous.descriptors, current.descriptors)
-    return np.array([(m.queryIdx, m.trainIdx) for m in matches], np.int64).reshape(-1, 2)
+    rows, columns = _from_left_to_right(previous), _from_left_to_right(current)
+    there, here = (previous.points[rows].astype(np.float32),
+                   current.points[columns].astype(np.float32))
+    signs_there, signs_here = previous.signs[rows], current.signs[columns]
+    forward = np.full(len(rows), -1, np.int64)
+    backward = np.full(len(columns), -1, np.int64)
+    best = np.full(len(columns), _NONE, np.float32)
+    for start in range(0, len(rows), _STRIP):
+        strip = slice(start, start + _STRIP)
+        reach = there[strip][[0, -1], 0] + np.float32([-search_radius, search_radius])
+        near = slice(*np.searchsorted(here[:, 0], reach))
+        if near.start == near.stop:
+            continue
+        similarity = signs_there[strip] @ signs_here[near].T
+        for axis in (0, 1):
+            apart = np.abs(np.subtract.outer(there[strip, axis], here[near, axis]))
+            np.copyto(similarity, _NONE, where=apart > search_radius)
+        nearest = similarity.argmax(1)
+        found = np.take_along_axis(similarity, nearest[:, None], 1)[:, 0] > _NONE
+        forward[strip] = np.where(found, nearest + near.start, -1)
+        # A current feature keeps the best claim of all strips.
+        claimant = similarity.argmax(0)
+        claim = np.take_along_axis(similarity, claimant[None], 0)[0]
+        backward[near] = np.where(claim > best[near], claimant + start, backward[near])
+        best[near] = np.maximum(claim, best[near])
+    mutual = np.flatnonzero((forward >= 0) & (backward[forward] == np.arange(len(forward))))
+    matches = np.stack([rows[mutual], columns[forward[mutual]]], axis=1)
+    return matches[np.argsort(matches[:, 0])]
+
+
+def _from_left_to_right(features: Features) -> NDArray[np.int64]:
+    return np.argsort(features.points[:, 0], kind='stable')

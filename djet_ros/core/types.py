@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum, unique
+from enum import StrEnum, unique
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 @unique
-class Status(str, Enum):
+class Status(StrEnum):
     """What became of a frame or of a pair of frames."""
 
     OK = 'OK'
@@ -42,6 +43,12 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def signs(self) -> NDArray[np.float32]:
+        """Descriptors as (N, 256) of +-1: their dot product is 256 - 2 Hamming distances."""
+        bits = np.unpackbits(self.descriptors, axis=1)
+        return bits.astype(np.float32) * 2 - 1
 
 
 @dataclass(frozen=True)
