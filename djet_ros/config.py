@@ -84,7 +84,8 @@ class NodeConfig:
         'latest', 'latest (under load old frames are dropped and counted) or every (none is '
         'dropped: for a bag played into the node)', choices=('latest', 'every'))
     queue_size: int = parameter(
-        2, 'frames that may wait under queue_policy latest', minimum=1, maximum=1000)
+        2, 'frames that may wait; beyond it latest drops the oldest, every lets the sender wait',
+        minimum=1, maximum=1000)
     publish_tf: bool = parameter(
         False, 'whether the integrated pose is also published as odom_frame -> camera frame on tf')
     publish_path: bool = parameter(

@@ -128,6 +128,7 @@ def test_an_unpadded_gray_image_is_not_copied():
     ({'encoding': 'bgr8'}, 'short_step'),
     ({'height': 0}, 'empty'),
     ({'width': 0}, 'empty'),
+    ({'width': 15}, 'too_small'),
     ({'height': 2**31}, 'too_large'),
     ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'too_large'),
     ({'step': 2**32 - 1}, 'short_data'),

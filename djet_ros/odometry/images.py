@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
 
+# Features need a neighbourhood; OpenCV fails on slivers.
+_SMALLEST_SIDE = 16
+
 
 class BadMessage(DjetError):
     """A message that can't be used: ``reason`` is a word to count by, the text is for people."""
@@ -147,6 +150,9 @@ def _bytes(data: Any) -> NDArray[np.uint8]:
 def _check_size(width: int, height: int) -> None:
     if width <= 0 or height <= 0:
         raise BadMessage('empty', f'image is {width}x{height} pixels')
+    if min(width, height) < _SMALLEST_SIDE:
+        raise BadMessage('too_small', f'image is {width}x{height} pixels, at least '
+                         f'{_SMALLEST_SIDE}x{_SMALLEST_SIDE} are needed')
     if width * height > LARGEST_IMAGE_PIXELS:
         raise BadMessage('too_large', f'image is {width}x{height} pixels, at most '
                          f'{LARGEST_IMAGE_PIXELS} are taken')

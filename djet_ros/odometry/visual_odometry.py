@@ -68,10 +68,16 @@ class VisualOdometry:
     def __init__(self, estimator: EstimatorConfig | None = None,
                  odometry: OdometryConfig | None = None,
                  scale: ScaleSource | None = None) -> None:
-        self._config = odometry or OdometryConfig()
-        self._estimator = TwoViewEstimator(estimator)
-        self._scale = scale or scale_source(self._config)
+        odometry = odometry or OdometryConfig()
+        self.configure(estimator or EstimatorConfig(), odometry, scale or scale_source(odometry))
         self.reset()
+
+    def configure(self, estimator: EstimatorConfig, odometry: OdometryConfig,
+                  scale: ScaleSource) -> None:
+        """Take other parameters from the next frame on; the trajectory goes on."""
+        self._config = odometry
+        self._estimator = TwoViewEstimator(estimator)
+        self._scale = scale
 
     def reset(self) -> None:
         """Forget everything; the next frame is the first."""

@@ -1,0 +1,119 @@
+"""What the odometry says about itself, as a pure function of counts and of the last result."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from enum import StrEnum, unique
+
+from djet_ros.core.types import RelativePose
+from djet_ros.odometry.visual_odometry import OdometryResult
+import numpy as np
+
+
+@unique
+class State(StrEnum):
+    """What the odometry is doing."""
+
+    WAITING_FOR_CAMERA_INFO = 'waiting for camera_info'
+    WAITING_FOR_IMAGE = 'waiting for an image'
+    STARTED = 'started'
+    RESTARTED = 'restarted'
+    TRACKING = 'tracking'
+    STANDING = 'standing still'
+    BAD_PAIR = 'bad pair'
+    LOST = 'lost'
+    REJECTING = 'message rejected'
+
+
+LEVELS = {
+    State.WAITING_FOR_CAMERA_INFO: 'WARN', State.WAITING_FOR_IMAGE: 'WARN', State.STARTED: 'OK',
+    State.RESTARTED: 'WARN', State.TRACKING: 'OK', State.STANDING: 'OK', State.BAD_PAIR: 'WARN',
+    State.LOST: 'ERROR', State.REJECTING: 'ERROR',
+}
+
+
+@dataclass
+class Counts:
+    """
+    Every image that came in is counted once more: processed, dropped or rejected.
+
+    dropped: by why nothing was wrong with it (equal_stamp, waiting_for_camera_info, queue_full …);
+    rejected: by what was wrong with an image; rejected_infos: the same for CameraInfo messages;
+    status: of the processed frames.
+    """
+
+    received: int = 0
+    processed: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+    rejected_infos: Counter[str] = field(default_factory=Counter)
+    status: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Content of a DiagnosticStatus: level OK, WARN or ERROR, one line, and details."""
+
+    level: str
+    summary: str
+    values: dict[str, str]
+
+
+def diagnose(state: State, detail: str, counts: Counts, last: OdometryResult | None,
+             rate: float | None) -> Diagnosis:
+    """
+    Say how the odometry is doing.
+
+    detail: what the state is about, such as a status or a reason; last: the last result; rate:
+    processed frames per second of their stamps.
+    """
+    values = {
+        'state': state.value,
+        'frames received': str(counts.received),
+        'frames processed': str(counts.processed),
+        'frames dropped': str(counts.dropped.total()),
+        'frames rejected': str(counts.rejected.total()),
+    }
+    for what, reasons in (('frames dropped', counts.dropped), ('frames rejected', counts.rejected),
+                          ('camera_info rejected', counts.rejected_infos),
+                          ('status', counts.status)):
+        values.update({f'{what}: {reason}': str(n) for reason, n in sorted(reasons.items())})
+    if rate is not None:
+        values['rate (Hz)'] = f'{rate:.2f}'
+    if last is not None:
+        values['scale'] = 'known' if last.scale_known else 'unknown'
+        if last.relative is not None:
+            values.update(_pair(last.relative))
+    summary = f'{state.value}: {detail}' if detail else state.value
+    return Diagnosis(LEVELS[state], summary, values)
+
+
+def _pair(relative: RelativePose) -> dict[str, str]:
+    values = {'matches': str(len(relative.x)), 'inliers': str(int(relative.inliers.sum()))}
+    residuals = np.abs(relative.residuals[relative.inliers])
+    if residuals.size:
+        values['median residual (px)'] = f'{np.median(residuals):.3f}'
+    values.update({f'time of {stage} (ms)': f'{seconds * 1e3:.1f}'
+                   for stage, seconds in relative.timings.items()})
+    return values
+
+
+class StampRate:
+    """Frames per second by their stamps, over the last few frames."""
+
+    def __init__(self, frames: int = 30) -> None:
+        self._stamps: deque[int] = deque(maxlen=frames)
+
+    def add(self, stamp_ns: int) -> None:
+        """Count a frame; a step back in time begins anew."""
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            self._stamps.clear()
+        self._stamps.append(stamp_ns)
+
+    @property
+    def hertz(self) -> float | None:
+        """Frames per second, None before the second frame."""
+        if len(self._stamps) < 2:
+            return None
+        return (len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0])

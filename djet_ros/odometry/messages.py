@@ -1,0 +1,197 @@
+"""
+Results to ROS messages: the one place where poses change their frame and their form.
+
+The classes are asked for by type name, so that rclpy's and rosbags' messages come out alike.
+rclpy's setters insist on plain float, int and str, on covariances as a float64 array of 36, and on
+``array.array`` for long sequences; rosbags' writers insist on NumPy arrays. The values here suit
+both.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from djet_ros.config import OdometryConfig
+from djet_ros.core.types import Array
+from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
+from djet_ros.odometry.uncertainty import rotated
+from djet_ros.odometry.visual_odometry import OdometryResult
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+MessageType = Callable[[str], Any]
+
+# The first pose is exact by definition, but filters divide by what they are told.
+_LEAST_COVARIANCE = np.eye(6) * 1e-9
+
+# The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
+OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+def stamp_ns(header: Any) -> int:
+    """Nanoseconds of a header's stamp."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def in_convention(result: OdometryResult, convention: str) -> OdometryResult:
+    """
+    Express a result along optical or body axes, ``convention`` being 'optical' or 'body'.
+
+    The body frame has its origin in the camera, with x forward, y left and z up (REP 103); both
+    ends of every pose are turned.
+    """
+    if convention == 'optical':
+        return result
+    C = np.eye(4)
+    C[:3, :3] = OPTICAL_TO_BODY
+    return replace(result, motion=C @ result.motion @ C.T, pose=C @ result.pose @ C.T,
+                   motion_covariance=rotated(OPTICAL_TO_BODY, result.motion_covariance),
+                   pose_covariance=rotated(OPTICAL_TO_BODY, result.pose_covariance))
+
+
+def camera_frame(config: OdometryConfig, image_frame: str) -> str:
+    """
+    Name the frame that poses are of: the configured one, or the image's own.
+
+    With the body convention the image's optical frame would be the wrong name:
+    camera_optical_frame becomes camera_frame, and any other name gets the ending _body.
+    """
+    if config.camera_frame or config.frame_convention == 'optical':
+        return config.camera_frame or image_frame
+    body = image_frame.replace('_optical', '', 1)
+    return body if body != image_frame else f'{image_frame}_body'
+
+
+class Messages:
+    """Makes the messages of results; message_type gives the class for a type name."""
+
+    def __init__(self, message_type: MessageType, config: OdometryConfig) -> None:
+        self._type = message_type
+        self._config = config
+
+    def header(self, stamp: int, frame_id: str) -> Any:
+        """Make a Header with a stamp in nanoseconds."""
+        seconds, rest = divmod(int(stamp), 10**9)
+        return self._type('std_msgs/msg/Header')(
+            stamp=self._type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest),
+            frame_id=frame_id)
+
+    def relative_pose(self, result: OdometryResult) -> Any:
+        """Make the PoseStamped of the current camera in the previous camera's frame."""
+        turned, frame = self._turned(result)
+        return self._type('geometry_msgs/msg/PoseStamped')(
+            header=self.header(result.stamp_ns, frame), pose=self._pose(turned.motion))
+
+    def relative_pose_cov(self, result: OdometryResult) -> Any:
+        """Make the PoseWithCovarianceStamped of the same."""
+        turned, frame = self._turned(result)
+        return self._type('geometry_msgs/msg/PoseWithCovarianceStamped')(
+            header=self.header(result.stamp_ns, frame),
+            pose=self._pose_with_covariance(turned.motion, turned.motion_covariance))
+
+    def odometry(self, result: OdometryResult) -> Any:
+        """
+        Make the Odometry: the integrated pose, and the twist of the last pair in the camera.
+
+        The odom frame is the first camera's, along optical or body axes as configured.
+        """
+        turned, frame = self._turned(result)
+        velocity, covariance = twist(turned)
+        return self._type('nav_msgs/msg/Odometry')(
+            header=self.header(result.stamp_ns, self._config.odom_frame), child_frame_id=frame,
+            pose=self._pose_with_covariance(turned.pose, turned.pose_covariance),
+            twist=self._type('geometry_msgs/msg/TwistWithCovariance')(
+                twist=self._type('geometry_msgs/msg/Twist')(
+                    linear=self._vector(velocity[:3]), angular=self._vector(velocity[3:])),
+                covariance=(covariance + _LEAST_COVARIANCE).ravel()))
+
+    def pose_stamped(self, result: OdometryResult) -> Any:
+        """Make the PoseStamped of the integrated pose in the odom frame."""
+        turned, _ = self._turned(result)
+        return self._type('geometry_msgs/msg/PoseStamped')(
+            header=self.header(result.stamp_ns, self._config.odom_frame),
+            pose=self._pose(turned.pose))
+
+    def path(self, poses: Sequence[Any]) -> Any:
+        """Make the Path of at least one PoseStamped."""
+        return self._type('nav_msgs/msg/Path')(header=poses[-1].header, poses=list(poses))
+
+    def transform(self, result: OdometryResult) -> Any:
+        """Make the TFMessage from the odom frame to the camera."""
+        turned, frame = self._turned(result)
+        pose = self._pose(turned.pose)
+        return self._type('tf2_msgs/msg/TFMessage')(transforms=[
+            self._type('geometry_msgs/msg/TransformStamped')(
+                header=self.header(result.stamp_ns, self._config.odom_frame),
+                child_frame_id=frame,
+                transform=self._type('geometry_msgs/msg/Transform')(
+                    translation=self._vector(turned.pose[:3, 3]), rotation=pose.orientation))])
+
+    def diagnostics(self, stamp: int, level: str, summary: str,
+                    values: dict[str, str]) -> Any:
+        """Make the DiagnosticArray of one status; level is 'OK', 'WARN' or 'ERROR'."""
+        status_type = self._type('diagnostic_msgs/msg/DiagnosticStatus')
+        pair = self._type('diagnostic_msgs/msg/KeyValue')
+        # The class's own constant is of the type that its field wants: bytes or int.
+        status = status_type(
+            level=getattr(status_type, level), name='djet_ros: visual odometry', message=summary,
+            hardware_id='', values=[pair(key=key, value=value) for key, value in values.items()])
+        return self._type('diagnostic_msgs/msg/DiagnosticArray')(
+            header=self.header(stamp, ''), status=[status])
+
+    def picture(self, stamp: int, frame_id: str, bgr: NDArray[np.uint8]) -> Any:
+        """Make the Image (bgr8) of an array (H, W, 3)."""
+        image_type = self._type('sensor_msgs/msg/Image')
+        height, width = bgr.shape[:2]
+        data: Any = np.ascontiguousarray(bgr).ravel()
+        if hasattr(image_type, 'get_fields_and_field_types'):
+            # rclpy would check an array byte by byte, but takes this one as it is.
+            data = array('B', data.tobytes())
+        return image_type(
+            header=self.header(stamp, frame_id), height=height, width=width, encoding='bgr8',
+            is_bigendian=0, step=3 * width, data=data)
+
+    def _turned(self, result: OdometryResult) -> tuple[OdometryResult, str]:
+        return (in_convention(result, self._config.frame_convention),
+                camera_frame(self._config, result.frame_id))
+
+    def _pose_with_covariance(self, pose: Array, covariance: Array) -> Any:
+        return self._type('geometry_msgs/msg/PoseWithCovariance')(
+            pose=self._pose(pose), covariance=(covariance + _LEAST_COVARIANCE).ravel())
+
+    def _pose(self, pose: Array) -> Any:
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
+        position = _plain(pose[:3, 3])
+        return self._type('geometry_msgs/msg/Pose')(
+            position=self._type('geometry_msgs/msg/Point')(
+                x=position[0], y=position[1], z=position[2]),
+            orientation=self._type('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w))
+
+    def _vector(self, values: Array) -> Any:
+        x, y, z = _plain(values)
+        return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
+
+
+def twist(result: OdometryResult) -> tuple[Array, Array]:
+    """
+    Mean velocity (6,) of a pair along the current camera's axes, and its covariance (6, 6).
+
+    Linear in metres (or units) per second, angular in radians per second. Without a pair the
+    velocity is zero and nothing is known about it: the covariance is huge.
+    """
+    if result.previous_stamp_ns is None:
+        return np.zeros(6), np.eye(6) * UNKNOWN_LENGTH_SIGMA**2
+    seconds = (result.stamp_ns - result.previous_stamp_ns) * 1e-9
+    R = result.motion[:3, :3]
+    velocity = np.concatenate([R.T @ result.motion[:3, 3],
+                               Rotation.from_matrix(R).as_rotvec()]) / seconds
+    return velocity, rotated(R.T, result.motion_covariance) / seconds**2
+
+
+def _plain(values: Array) -> list[float]:
+    # Adding zero turns -0.0 into 0.0.
+    return [float(value) + 0.0 for value in values]

@@ -1,0 +1,238 @@
+"""
+Messages in, messages out: everything of a live odometry that needs no clock, thread or socket.
+
+The live nodes and the offline replay are thin faces on this one object, so that the same messages
+in the same order give the same poses everywhere.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, NamedTuple
+
+from djet_ros.config import Config
+from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.debug_image import debug_image
+from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.images import BadMessage, gray_image
+from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
+from djet_ros.odometry.scale import scale_source, ScaleSource, SpeedScale
+from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
+import numpy as np
+
+_DIAGNOSTICS_PERIOD_NS = 10**9
+
+
+class Outgoing(NamedTuple):
+    """A message to publish; a topic without a leading slash is relative to the node's name."""
+
+    topic: str
+    message: Any
+
+
+class Tracker:
+    """
+    Pairs images with their CameraInfo, runs the odometry on them, and words what comes of it.
+
+    message_type gives the class for a type name such as 'sensor_msgs/msg/Image'; image_topic is
+    the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
+
+    Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was told), odometry
+    (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of state
+    and once per second of the images' stamps).
+    """
+
+    def __init__(self, config: Config, message_type: MessageType,
+                 scale: ScaleSource | None = None, image_topic: str = '') -> None:
+        self.config = config
+        # What a face adds to each diagnostics message, such as its latency.
+        self.face_values: dict[str, str] = {}
+        self._message_type = message_type
+        self._image_topic = image_topic
+        self._scale = scale or scale_source(config.odometry)
+        self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale)
+        self._messages = Messages(message_type, config.odometry)
+        self._info: Any = None
+        self._camera: Camera | None = None
+        self._forget()
+
+    def reset(self) -> None:
+        """
+        Forget all images, poses, speeds and counts; the next image is the first.
+
+        The CameraInfo stays, because a latched one is not sent twice.
+        """
+        self._odometry.reset()
+        self._scale.reset()
+        self._forget()
+
+    def _forget(self) -> None:
+        self.counts = Counts()
+        self.last: OdometryResult | None = None
+        # Why the newest message could not be used, for a log; None when it could.
+        self.problem: BadMessage | None = None
+        self._frame: Frame | None = None
+        self._path: deque[Any] = deque(maxlen=self.config.ros.path_length)
+        self._path_stamp: int | None = None
+        self._rate = StampRate()
+        self._bad_pairs = 0
+        self._state, self._detail = (State.WAITING_FOR_IMAGE if self._camera
+                                     else State.WAITING_FOR_CAMERA_INFO), ''
+        self._said: tuple[State, str, int] | None = None
+
+    def configure(self, config: Config) -> None:
+        """
+        Take other parameters from the next frame on; the trajectory goes on.
+
+        DjetError where the scale needs something that can't be had while running.
+        """
+        before, after = self.config.odometry, config.odometry
+        if (before.scale, before.scale_value, before.scale_uncertainty) != (
+                after.scale, after.scale_value, after.scale_uncertainty):
+            self._scale = scale_source(after)
+        self.config = config
+        self._odometry.configure(config.estimator, after, self._scale)
+        self._messages = Messages(self._message_type, after)
+        self._path = deque(self._path if before == after else (),
+                           maxlen=config.ros.path_length)
+        if before.rectified != after.rectified and self._info is not None:
+            info, self._info = self._info, None
+            self.camera_info(info)
+
+    def camera_info(self, message: Any) -> list[Outgoing]:
+        """Take a CameraInfo; the camera is made anew only where it says something new."""
+        if self._info is not None and same_camera(self._info, message):
+            return []
+        self._info = message
+        try:
+            self._camera = Camera(message, means_rectified(
+                self.config.odometry.rectified, self._image_topic))
+        except BadMessage as problem:
+            self._camera = None
+            self.counts.rejected_infos[problem.reason] += 1
+            return self._reject(problem, stamp_ns(message.header))
+        self.problem = None
+        if self.last is None:
+            self._enter(State.WAITING_FOR_IMAGE)
+        return []
+
+    def image(self, message: Any) -> list[Outgoing]:
+        """Take an Image or a CompressedImage, and give what comes of it."""
+        self.counts.received += 1
+        stamp = stamp_ns(message.header)
+        if self._camera is None:
+            return self._without_camera(stamp)
+        if self._frame is not None and self._frame.stamp_ns == stamp:
+            self.counts.dropped['equal_stamp'] += 1
+            return []
+        try:
+            gray = self._camera.undistort(gray_image(message))
+        except BadMessage as problem:
+            self.counts.rejected[problem.reason] += 1
+            return self._reject(problem, stamp)
+        return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id))
+
+    def speed(self, message: Any) -> None:
+        """Take a TwistStamped or an Odometry as the camera's speed, for odometry.scale 'speed'."""
+        if isinstance(self._scale, SpeedScale):
+            linear = (message.twist.twist if hasattr(message.twist, 'twist')
+                      else message.twist).linear
+            self._scale.add(stamp_ns(message.header),
+                            float(np.linalg.norm([linear.x, linear.y, linear.z])))
+
+    def count_dropped(self, reason: str, number: int = 1) -> None:
+        """Count images that a face received and did not hand on."""
+        self.counts.received += number
+        self.counts.dropped[reason] += number
+
+    def diagnosis(self) -> Diagnosis:
+        """Say how the odometry is doing."""
+        diagnosis = diagnose(self._state, self._detail, self.counts, self.last, self._rate.hertz)
+        diagnosis.values.update(self.face_values)
+        return diagnosis
+
+    def diagnostics(self, stamp: int) -> Outgoing:
+        """Give the diagnostics message of this moment, in nanoseconds."""
+        diagnosis = self.diagnosis()
+        return Outgoing('/diagnostics', self._messages.diagnostics(
+            stamp, diagnosis.level, diagnosis.summary, diagnosis.values))
+
+    def debug_image(self) -> Outgoing | None:
+        """Draw the last pair; None where there is none. Costs time: ask only if somebody looks."""
+        if self._frame is None or self.last is None or self.last.relative is None:
+            return None
+        return Outgoing('debug_image', self._messages.picture(
+            self._frame.stamp_ns, self._frame.frame_id,
+            debug_image(self._frame.gray, self.last.relative)))
+
+    def _without_camera(self, stamp: int) -> list[Outgoing]:
+        """Drop an image for want of a camera; an unusable CameraInfo stays the problem."""
+        self.counts.dropped['waiting_for_camera_info'] += 1
+        if self._info is None:
+            self._enter(State.WAITING_FOR_CAMERA_INFO)
+        return self._diagnostics_if_due(stamp)
+
+    def _reject(self, problem: BadMessage, stamp: int) -> list[Outgoing]:
+        self.problem = problem
+        self._enter(State.REJECTING, problem.reason)
+        return self._diagnostics_if_due(stamp)
+
+    def _process(self, frame: Frame) -> list[Outgoing]:
+        if self._frame is not None and frame.stamp_ns < self._frame.stamp_ns:
+            self._path.clear()
+            self._path_stamp = None
+        result = self._odometry.process(frame)
+        self.last, self._frame, self.problem = result, frame, None
+        self.counts.processed += 1
+        self.counts.status[result.status.value] += 1
+        self._rate.add(frame.stamp_ns)
+        self._enter(*self._judge(result))
+        return [*self._poses(result), *self._diagnostics_if_due(frame.stamp_ns)]
+
+    def _judge(self, result: OdometryResult) -> tuple[State, str]:
+        """State that a result puts the odometry into."""
+        status = result.status
+        if status in TRACKED or status in STARTED:
+            self._bad_pairs = 0
+            if status in TRACKED:
+                return (State.STANDING if result.standing else State.TRACKING), ''
+            first = self.counts.processed == 1
+            return (State.STARTED, '') if first else (State.RESTARTED, status.value)
+        self._bad_pairs += 1
+        lost = self._bad_pairs >= self.config.odometry.max_lost
+        return (State.LOST if lost else State.BAD_PAIR), status.value
+
+    def _poses(self, result: OdometryResult) -> list[Outgoing]:
+        make = self._messages
+        outgoing = []
+        if result.status in TRACKED:
+            outgoing += [Outgoing('relative_pose', make.relative_pose(result)),
+                         Outgoing('relative_pose_cov', make.relative_pose_cov(result))]
+        if result.status in TRACKED or result.status in STARTED:
+            outgoing.append(Outgoing('odometry', make.odometry(result)))
+            if self.config.ros.publish_tf:
+                outgoing.append(Outgoing('/tf', make.transform(result)))
+            if self.config.ros.publish_path:
+                outgoing += self._path_if_due(result)
+        return outgoing
+
+    def _path_if_due(self, result: OdometryResult) -> list[Outgoing]:
+        self._path.append(self._messages.pose_stamped(result))
+        period = self.config.ros.path_period * 1e9
+        if self._path_stamp is not None and result.stamp_ns - self._path_stamp < period:
+            return []
+        self._path_stamp = result.stamp_ns
+        return [Outgoing('path', self._messages.path(self._path))]
+
+    def _enter(self, state: State, detail: str = '') -> None:
+        self._state, self._detail = state, detail
+
+    def _diagnostics_if_due(self, stamp: int) -> list[Outgoing]:
+        if self._said is not None:
+            state, detail, said = self._said
+            if (state, detail) == (self._state, self._detail) \
+                    and 0 <= stamp - said < _DIAGNOSTICS_PERIOD_NS:
+                return []
+        self._said = self._state, self._detail, stamp
+        return [self.diagnostics(stamp)]

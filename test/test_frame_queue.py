@@ -1,0 +1,111 @@
+"""The frame queue, with real threads."""
+
+from threading import Thread
+from time import monotonic
+
+from djet_ros.odometry.queue import FrameQueue
+import pytest
+
+
+def in_thread(function, *args):
+    thread = Thread(target=function, args=args, daemon=True)
+    thread.start()
+    return thread
+
+
+def drained(queue):
+    items = []
+    while (item := queue.get(timeout=0)) is not None:
+        items.append(item)
+    return items
+
+
+def test_latest_keeps_the_newest_in_order_and_counts_the_rest():
+    queue = FrameQueue('latest', 2)
+    assert all(queue.put(i) for i in range(5))
+    assert queue.dropped == 3
+    assert drained(queue) == [3, 4]
+
+
+def test_every_loses_nothing_however_slow_the_reader_is():
+    queue, got = FrameQueue('every', 3), []
+
+    def read():
+        while (item := queue.get()) is not None:
+            got.append(item)
+
+    reader = in_thread(read)
+    for i in range(2000):
+        assert queue.put(i)
+        assert len(queue) <= 3
+    queue.close()
+    reader.join(5)
+    assert got == list(range(2000))
+    assert queue.dropped == 0
+
+
+def test_many_writers_and_readers_account_for_every_item():
+    queue, got = FrameQueue('latest', 4), []
+
+    def read():
+        while (item := queue.get()) is not None:
+            got.append(item)
+
+    readers = [in_thread(read) for _ in range(3)]
+    writers = [in_thread(lambda n=n: [queue.put(1000 * n + i) for i in range(1000)])
+               for n in range(1, 5)]
+    for thread in writers:
+        thread.join(10)
+    queue.close()
+    for thread in readers:
+        thread.join(10)
+    assert len(got) + queue.dropped == 4000
+    assert len(set(got)) == len(got)
+
+
+def test_a_full_queue_lets_the_sender_wait_as_long_as_it_wants():
+    queue = FrameQueue('every', 1)
+    assert queue.put('a')
+    start = monotonic()
+    assert not queue.put('b', timeout=0.05)
+    assert monotonic() - start >= 0.05
+    assert drained(queue) == ['a']
+
+
+def test_an_empty_queue_lets_the_reader_wait_as_long_as_it_wants():
+    start = monotonic()
+    assert FrameQueue('latest', 1).get(timeout=0.05) is None
+    assert monotonic() - start >= 0.05
+
+
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_closing_wakes_everybody_and_leaves_what_waits(policy):
+    queue, answers = FrameQueue(policy, 1), []
+    reader = in_thread(lambda: answers.append(queue.get()))
+    queue.close()
+    reader.join(5)
+    assert answers == [None]
+    assert not queue.put('late')
+
+    queue = FrameQueue('every', 1)
+    queue.put('first')
+    writer = in_thread(lambda: answers.append(queue.put('second')))
+    queue.close()
+    writer.join(5)
+    assert answers == [None, False]
+    assert drained(queue) == ['first']
+
+
+def test_clearing_makes_room():
+    queue = FrameQueue('every', 2)
+    queue.put(1)
+    queue.put(2)
+    assert queue.clear() == 2
+    assert queue.put(3, timeout=0)
+    assert drained(queue) == [3]
+
+
+@pytest.mark.parametrize('policy, size', [('newest', 1), ('latest', 0)])
+def test_a_senseless_queue_is_refused(policy, size):
+    with pytest.raises(ValueError, match='queue policy'):
+        FrameQueue(policy, size)

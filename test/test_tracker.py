@@ -1,0 +1,378 @@
+"""The tracker: messages in, messages out, and every image accounted for."""
+
+from cards import Cards, K, pose, SIZE
+import cv2
+from djet_ros.config import Config, from_flat, with_values
+from djet_ros.core.types import Status
+from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.tracker import Tracker
+import numpy as np
+import pytest
+from ros_messages import camera_info, compressed, header, image, message_type, serialised
+
+STEP = pose(x=0.25, z=0.15, yaw=0.01)
+RAW = '/camera/image_raw'
+FAST = {'estimator.max_features': 600}
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Give the images of a drive of 12 frames."""
+    cards, here, images = Cards(), np.eye(4), []
+    for _ in range(12):
+        images.append(cards.gray(here))
+        here = here @ STEP
+    return images
+
+
+def tracker(info=True, topic=RAW, **values):
+    result = Tracker(from_flat({**FAST, **values}), message_type, image_topic=topic)
+    if info:
+        assert result.camera_info(camera_info(K, SIZE)) == []
+    return result
+
+
+def ns(seconds):
+    return round(seconds * 1e9)
+
+
+def play(tracker, images, start=0.0, period=0.1):
+    """Send images; gives what came out of each, by topic."""
+    return [by_topic(tracker.image(image(gray, stamp_ns=ns(start + i * period))))
+            for i, gray in enumerate(images)]
+
+
+def by_topic(outgoing):
+    for _, message in outgoing:
+        assert len(serialised(message)) > 0
+    topics = [topic for topic, _ in outgoing]
+    assert len(set(topics)) == len(topics)
+    return dict(outgoing)
+
+
+def values(diagnostics):
+    return {pair.key: pair.value for pair in diagnostics.status[0].values}
+
+
+def accounted(counts):
+    return counts.processed + counts.dropped.total() + counts.rejected.total()
+
+
+def test_a_drive_gives_relative_poses_and_odometry_with_the_images_stamps(drive):
+    out = play(tracker(), drive[:4])
+    assert set(out[0]) == {'odometry', '/diagnostics'}
+    for i, messages in enumerate(out[1:], 1):
+        assert {'relative_pose', 'relative_pose_cov', 'odometry'} <= set(messages)
+        for topic in ('relative_pose', 'relative_pose_cov', 'odometry'):
+            assert stamp_ns(messages[topic].header) == ns(i * 0.1)
+    position = out[3]['odometry'].pose.pose.position
+    ahead = np.array([position.x, position.y, position.z]) / 3
+    direction = STEP[:3, 3] / np.linalg.norm(STEP[:3, 3])
+    assert np.degrees(np.arccos(ahead @ direction / np.linalg.norm(ahead))) < 8
+
+
+def test_the_same_messages_give_the_same_bytes_also_after_a_reset(drive):
+    def poses(tracker):
+        return [serialised(message) for out in play(tracker, drive[:4])
+                for topic, message in out.items() if topic != '/diagnostics']
+
+    one = tracker()
+    first = poses(one)
+    assert first == poses(tracker())
+    one.reset()
+    assert one.counts == Counts()
+    assert one.last is None
+    assert first == poses(one)
+
+
+def test_compressed_images_are_tracked_like_raw_ones(drive):
+    one = tracker()
+    for i, gray in enumerate(drive[:3]):
+        png = cv2.imencode('.png', gray)[1].tobytes()
+        out = by_topic(one.image(compressed(png, 'png', ns(i * 0.1))))
+    reference = tracker()
+    expected = play(reference, drive[:3])[-1]
+    assert serialised(out['odometry']) == serialised(expected['odometry'])
+
+
+# CameraInfo: latched, periodic, late, changing
+
+def test_images_before_any_camera_info_are_counted_and_said(drive):
+    one = tracker(info=False)
+    out = play(one, drive[:3])
+    assert out[0]['/diagnostics'].status[0].message == 'waiting for camera_info'
+    assert out[0]['/diagnostics'].status[0].level == 1
+    assert one.counts.dropped == {'waiting_for_camera_info': 3}
+    assert one.camera_info(camera_info(K, SIZE)) == []
+    later = play(one, drive[3:6], start=0.3)
+    assert one.counts.processed == 3
+    assert 'relative_pose' in later[1]
+    assert accounted(one.counts) == one.counts.received == 6
+
+
+def test_a_periodic_camera_info_changes_nothing(drive):
+    one = tracker()
+    for i, gray in enumerate(drive[:4]):
+        one.camera_info(camera_info(K, SIZE, stamp_ns=ns(i * 0.1)))
+        one.image(image(gray, stamp_ns=ns(i * 0.1)))
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 3}
+
+
+def test_another_calibration_begins_a_new_pair(drive):
+    one = tracker()
+    play(one, drive[:2])
+    one.camera_info(camera_info(K * [[1.05], [1.05], [1]], SIZE))
+    out = play(one, drive[2:4], start=0.2)
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 2, 'SIZE_CHANGED': 1}
+    assert out[0]['/diagnostics'].status[0].message == 'restarted: SIZE_CHANGED'
+
+
+def test_an_uncalibrated_camera_is_an_error_until_it_is_calibrated(drive):
+    one = tracker(info=False)
+    zeros = camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
+    said = by_topic(one.camera_info(zeros))['/diagnostics'].status[0]
+    assert (said.level, said.message) == (2, 'message rejected: uncalibrated')
+    assert 'calibrate' in str(one.problem)
+    play(one, drive[:2])
+    assert one.counts.rejected_infos == {'uncalibrated': 1}
+    assert one.diagnosis().level == 'ERROR'
+    one.camera_info(camera_info(K, SIZE))
+    assert one.problem is None
+    play(one, drive[2:4], start=0.2)
+    assert one.diagnosis().level == 'OK'
+
+
+def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
+    info = camera_info(K, SIZE, d=np.array([-0.2, 0.05, 0, 0, 0]))
+    poses = {}
+    for topic in (RAW, '/camera/image_rect'):
+        one = tracker(info=False, topic=topic)
+        one.camera_info(info)
+        play(one, drive[:2])
+        poses[topic] = one.last.pose
+    plain = tracker()
+    play(plain, drive[:2])
+    assert np.array_equal(poses['/camera/image_rect'], plain.last.pose)
+    assert not np.array_equal(poses[RAW], plain.last.pose)
+
+
+# Time
+
+def test_an_equal_stamp_drops_the_image(drive):
+    one = tracker()
+    play(one, drive[:2])
+    assert play(one, [drive[2]], start=0.1) == [{}]
+    assert one.counts.dropped == {'equal_stamp': 1}
+    play(one, [drive[2]], start=0.2)
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 2}
+
+
+def test_a_bag_that_loops_begins_anew(drive):
+    one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.0})
+    first = play(one, drive[:4], start=50.0)
+    again = play(one, drive[:4], start=50.0)
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 6, 'TIME_JUMP': 1}
+    assert again[0]['/diagnostics'].status[0].message == 'restarted: TIME_JUMP'
+    for before, after in zip(first, again, strict=True):
+        assert serialised(before['odometry']) == serialised(after['odometry'])
+        assert len(before['path'].poses) == len(after['path'].poses)
+
+
+def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
+    one = tracker(**{'odometry.max_gap': 0.5})
+    play(one, drive[:3])
+    before = one.last.pose
+    out = play(one, drive[3:5], start=5.0)
+    assert 'relative_pose' not in out[0]
+    assert np.array_equal(one.last.pose[:3, 3] != before[:3, 3], [True] * 3)
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 3, 'TIME_JUMP': 1}
+    covariance = np.reshape(out[0]['odometry'].pose.covariance, (6, 6))
+    assert covariance[0, 0] > 1e5
+
+
+# Bad images
+
+def of_another_size():
+    return image(np.zeros((100, 100), np.uint8), stamp_ns=ns(0.3))
+
+
+BAD = {
+    'unknown_encoding': lambda gray: image(gray, 'sepia', stamp_ns=ns(0.3)),
+    'short_data': lambda gray: image(gray, stamp_ns=ns(0.3), data=np.zeros(9, np.uint8)),
+    'short_step': lambda gray: image(gray, stamp_ns=ns(0.3), step=3),
+    'too_large': lambda gray: image(gray, stamp_ns=ns(0.3), height=2**31),
+    'empty': lambda gray: image(gray, stamp_ns=ns(0.3), width=0),
+    'size_mismatch': lambda gray: of_another_size(),
+    'undecodable': lambda gray: compressed(b'\xff\xd8\xff\xd9', 'jpeg', ns(0.3)),
+}
+
+
+@pytest.mark.parametrize('reason', BAD)
+def test_a_bad_image_is_an_error_with_its_reason_and_the_next_good_one_is_tracked(drive, reason):
+    one = tracker()
+    play(one, drive[:3])
+    out = by_topic(one.image(BAD[reason](drive[3])))
+    status = out.pop('/diagnostics').status[0]
+    assert out == {}
+    assert (status.level, status.message) == (2, f'message rejected: {reason}')
+    assert one.problem.reason == reason
+    assert one.counts.rejected == {reason: 1}
+    good = play(one, [drive[4]], start=0.4)[0]
+    assert 'relative_pose' in good
+    assert one.problem is None
+    assert good['/diagnostics'].status[0].message == 'tracking'
+    assert values(good['/diagnostics'])[f'frames rejected: {reason}'] == '1'
+    assert accounted(one.counts) == one.counts.received == 5
+
+
+def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
+    one = tracker(**{'odometry.max_lost': 2})
+    play(one, drive[:2])
+    black = np.zeros_like(drive[0])
+    out = play(one, [black] * 3, start=0.2)
+    said = [o['/diagnostics'].status[0] for o in out[:2]]
+    assert [(s.level, s.message) for s in said] == [
+        (1, 'bad pair: TOO_FEW_MATCHES'), (2, 'lost: TOO_FEW_MATCHES')]
+    assert all('odometry' not in o for o in out)
+    play(one, drive[2:4], start=0.5)
+    assert one.diagnosis().summary == 'tracking'
+    assert one.last.status is Status.OK
+
+
+# What is published when
+
+def test_diagnostics_come_on_a_change_of_state_and_once_per_second_of_stamps(drive):
+    one = tracker()
+    images = [drive[i % 2] for i in range(24)]
+    said = [i for i, out in enumerate(play(one, images)) if '/diagnostics' in out]
+    # The first frame, the first pair, then every second.
+    assert said == [0, 1, 11, 21]
+
+
+def test_a_path_comes_on_demand_throttled_and_bounded(drive):
+    assert all('path' not in out for out in play(tracker(), drive[:3]))
+    one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.25, 'ros.path_length': 4})
+    out = play(one, drive[:8])
+    assert [i for i, o in enumerate(out) if 'path' in o] == [0, 3, 6]
+    assert len(out[6]['path'].poses) == 4
+    last = out[6]['path'].poses[-1].pose.position
+    assert last == out[6]['odometry'].pose.pose.position
+
+
+def test_a_transform_comes_on_demand(drive):
+    assert all('/tf' not in out for out in play(tracker(), drive[:2]))
+    out = play(tracker(**{'ros.publish_tf': True}), drive[:2])[1]
+    transform = out['/tf'].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera')
+    assert transform.transform.rotation == out['odometry'].pose.pose.orientation
+
+
+def test_a_debug_image_shows_the_last_pair(drive):
+    one = tracker()
+    assert one.debug_image() is None
+    play(one, drive[:1])
+    assert one.debug_image() is None
+    play(one, drive[1:2], start=0.1)
+    topic, message = one.debug_image()
+    assert topic == 'debug_image'
+    assert stamp_ns(message.header) == ns(0.1)
+    drawn = np.frombuffer(message.data, np.uint8).reshape(*drive[1].shape, 3)
+    coloured = (drawn.max(2) - drawn.min(2) > 60).mean()
+    assert 0.01 < coloured < 0.9
+    play(one, [np.zeros_like(drive[0])], start=0.2)
+    assert one.debug_image() is not None
+
+
+def test_speeds_give_the_length(drive):
+    one = tracker(**{'odometry.scale': 'speed'})
+    vector = message_type('geometry_msgs/msg/Vector3')
+    twist = message_type('geometry_msgs/msg/Twist')(
+        linear=vector(x=3.0, y=0.0, z=4.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    for i, gray in enumerate(drive[:3]):
+        stamped = message_type('geometry_msgs/msg/TwistStamped')(
+            header=header(ns(i * 0.1)), twist=twist)
+        one.speed(stamped)
+        one.image(image(gray, stamp_ns=ns(i * 0.1)))
+    assert np.linalg.norm(one.last.motion[:3, 3]) == pytest.approx(0.5)
+    assert one.last.scale_known
+    one.reset()
+    play(one, drive[:2])
+    assert not one.last.scale_known
+
+
+def test_faces_add_their_counts_and_values(drive):
+    one = tracker()
+    one.count_dropped('queue_full', 3)
+    one.face_values['latency (ms)'] = '7.0'
+    out = play(one, drive[:1])[0]
+    said = values(out['/diagnostics'])
+    assert said['frames received'] == '4'
+    assert said['frames dropped: queue_full'] == '3'
+    assert said['latency (ms)'] == '7.0'
+
+
+# Parameters at run time
+
+def test_new_parameters_hold_from_the_next_frame_and_the_trajectory_goes_on(drive):
+    one = tracker()
+    play(one, drive[:2])
+    before = one.last.pose
+    one.configure(with_values(one.config, {
+        'estimator.method': 'rpe', 'odometry.scale': 'constant', 'odometry.scale_value': 2.0,
+        'odometry.odom_frame': 'world'}))
+    out = play(one, drive[2:3], start=0.2)[0]
+    assert one.last.status is Status.OK
+    assert np.linalg.norm(one.last.pose[:3, 3] - before[:3, 3]) == pytest.approx(2.0)
+    assert out['odometry'].header.frame_id == 'world'
+
+
+def test_a_switch_to_rectified_images_takes_the_other_camera(drive):
+    one = tracker(info=False)
+    one.camera_info(camera_info(K, SIZE, p=np.hstack([1.1 * K, np.zeros((3, 1))]).ravel() /
+                                np.array([1] * 10 + [1.1, 1])))
+    play(one, drive[:1])
+    one.configure(with_values(one.config, {'odometry.rectified': 'true'}))
+    play(one, drive[1:2], start=0.1)
+    assert one.last.status is Status.SIZE_CHANGED
+
+
+# Diagnostics as a pure function
+
+def test_every_state_has_a_level():
+    assert set(LEVELS) == set(State)
+
+
+def test_diagnostics_say_what_was_counted(drive):
+    one = tracker()
+    play(one, drive[:3])
+    counts = Counts(received=9, processed=5)
+    counts.dropped.update(equal_stamp=3)
+    counts.rejected.update(short_data=1)
+    counts.status.update(OK=4, FIRST_FRAME=1)
+    told = diagnose(State.BAD_PAIR, 'DEGENERATE', counts, one.last, 9.987)
+    assert (told.level, told.summary) == ('WARN', 'bad pair: DEGENERATE')
+    assert told.values['frames received'] == '9'
+    assert told.values['frames dropped: equal_stamp'] == '3'
+    assert told.values['frames rejected: short_data'] == '1'
+    assert told.values['status: OK'] == '4'
+    assert told.values['rate (Hz)'] == '9.99'
+    assert told.values['scale'] == 'unknown'
+    assert int(told.values['inliers']) <= int(told.values['matches'])
+    assert float(told.values['median residual (px)']) < 2
+    assert 'time of matching (ms)' in told.values
+
+
+def test_before_anything_happened_there_is_something_to_say():
+    told = Tracker(Config(), message_type).diagnosis()
+    assert (told.level, told.summary) == ('WARN', 'waiting for camera_info')
+
+
+def test_the_rate_comes_from_stamps():
+    rate = StampRate(frames=5)
+    assert rate.hertz is None
+    for i in range(20):
+        rate.add(ns(0.05 * i))
+    assert rate.hertz == pytest.approx(20)
+    rate.add(0)
+    assert rate.hertz is None
