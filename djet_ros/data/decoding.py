@@ -22,9 +22,10 @@ from rosbags.typesys.store import Typestore
 
 Decoder: TypeAlias = Callable[[memoryview], Any]
 
-# rosbags compiles a definition to code, one line per element of a fixed array.
-LONGEST_DEFINITION = 64 << 10
-LONGEST_FIXED_ARRAY = 1024
+# rosbags compiles a definition to code, with lines for each element of a fixed array of messages
+# or strings. Real definitions have a few kB with their comments, and hardly such arrays.
+LONGEST_DEFINITION = 32 << 10
+MOST_FIXED_ELEMENTS = 256
 
 FAMILIES = {'bool': 'bool', 'string': 'text', 'float32': 'float', 'float64': 'float'}
 
@@ -77,10 +78,8 @@ def _store(connection: Connection) -> Typestore:
     if len(connection.definition) > LONGEST_DEFINITION:
         raise ValueError(f'its definition has {len(connection.definition)} characters')
     types = get_types_from_msg(connection.definition, connection.msgtype)
-    for _, fields in types.values():
-        for name, (kind, detail) in fields:
-            if kind == Nodetype.ARRAY and int(detail[1]) > LONGEST_FIXED_ARRAY:
-                raise ValueError(f"its field '{name}' is an array of {detail[1]}")
+    if (elements := sum(map(_fixed_elements, types.values()))) > MOST_FIXED_ELEMENTS:
+        raise ValueError(f'its definition has fixed arrays of {elements} elements')
     if connection.encoding == 'cdr' and all(
             jazzy().fielddefs.get(name, ((), None))[1] == fields
             for name, (_, fields) in types.items()):
@@ -88,6 +87,12 @@ def _store(connection: Connection) -> Typestore:
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
+
+
+def _fixed_elements(definition: Any) -> int:
+    _, fields = definition
+    return sum(detail[1] for _, (kind, detail) in fields if kind == Nodetype.ARRAY
+               and (detail[0][0] == Nodetype.NAME or detail[0][1][0] == 'string'))
 
 
 def _identity(message: Any) -> Any:
