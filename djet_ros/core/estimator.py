@@ -53,12 +53,15 @@ class TwoViewEstimator:
         """
         timings: dict[str, float] = {}
         with _timed(timings, 'matching'):
-            radius = self.config.search_radius * max(current.gray.shape)
-            matches = match_features(previous.features, current.features, radius)
-        x = previous.features.points[matches[:, 0]]
-        y = current.features.points[matches[:, 1]]
+            x, y = self.match(previous, current)
         return replace(self.estimate_matched(previous, current, x, y, prior, timings),
                        timings=timings)
+
+    def match(self, previous: View, current: View) -> tuple[Array, Array]:
+        """Match the features of two views: pixels x and y (N, 2) in the one and the other."""
+        radius = self.config.search_radius * max(current.gray.shape)
+        matches = match_features(previous.features, current.features, radius)
+        return previous.features.points[matches[:, 0]], current.features.points[matches[:, 1]]
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None,
