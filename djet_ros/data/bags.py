@@ -214,7 +214,7 @@ def _blaming(path: Path) -> Iterator[None]:
     try:
         yield
     except BrokenFile as error:
-        raise DjetError(f'{path} is damaged or no bag: {one_line(error)}') from error
+        raise DjetError(f'{path}: {one_line(error)}') from error
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror or error}') from error
 

@@ -48,10 +48,12 @@ def decoder(connection: Connection) -> Decoder:
     # The definition becomes generated code in rosbags, which fails on hostile text in any way.
     try:
         store = _store(connection)
+        if connection.msgtype not in store.types:
+            raise ValueError('it is unknown, and the bag holds no definition of it')
         store.get_msgdef(connection.msgtype)
     except Exception as error:
-        raise BrokenFile(f"type '{connection.msgtype[:80]}' can't be read: "
-                             f'{type(error).__name__} {one_line(error)[:80]}') from error
+        raise BrokenFile(f"its type '{connection.msgtype[:80]}' can't be used: "
+                         f'{type(error).__name__} {one_line(error)[:120]}') from error
     convert: Callable[[Any], Any] = _identity
     if store is not jazzy() and connection.msgtype in jazzy().types:
         convert = _converter(store, connection.msgtype)
