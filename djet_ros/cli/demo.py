@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     overwrite = ['--overwrite'] if args.overwrite else []
     sequence = args.sequence
     if sequence is None:
-        sequence = args.output / 'rendered' / 'sequences' / '00'
         _djet('render', 'road', args.output / 'rendered', *overwrite)
+        sequence, = (args.output / 'rendered' / 'sequences').iterdir()
     bag = args.output / 'bag'
     _djet('kitti-to-bag', sequence, bag, *overwrite)
     results = {method: args.output / method for method in METHODS}

@@ -16,6 +16,7 @@ from djet_ros.errors import DjetError
 # Only the module of the command that is called gets imported: help is quick, and no command
 # needs the libraries of another.
 COMMANDS = {
+    'render': 'render a scene with exact ground truth as a KITTI sequence',
     'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
 }
@@ -24,7 +25,6 @@ COMMANDS = {
 DISTRIBUTIONS = {
     'backports': 'backports.zstd',
     'cv2': 'opencv-python-headless',
-    'ruamel': 'ruamel.yaml',
     'yaml': 'PyYAML',
 }
 
