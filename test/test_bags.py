@@ -14,16 +14,6 @@ import sys
 import tracemalloc
 
 import cv2
-import numpy as np
-import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosDurability
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import (
-    CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer)
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-from scipy.spatial.transform import Rotation
-
 from djet_ros.cli import kitti_to_bag
 from djet_ros.data.bag_writers import (
     camera_info, mono8, OPTICAL, pose_stamped, ResultBag, STORAGES, write_kitti_bag)
@@ -33,6 +23,15 @@ from djet_ros.data.kitti import KittiSequence
 from djet_ros.data.storages.base import LARGEST_PIECE
 from djet_ros.data.storages.compression import zstd
 from djet_ros.errors import DjetError
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import (
+    CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer)
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from scipy.spatial.transform import Rotation
 
 K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 SECOND = 10**9
@@ -408,7 +407,7 @@ def test_an_mcap_without_chunks_or_index_is_read(whole, tmp_path):
 
 
 def without_chunks(data):
-    """Records of an MCAP file with its chunks dissolved, and no summary."""
+    """Dissolve the chunks of an MCAP file, and leave out its summary."""
     output, position = [data[:8]], 8
     while True:
         code, length = struct.unpack_from('<BQ', data, position)
@@ -538,6 +537,10 @@ def test_ground_truth_is_found_by_its_name_or_given(tmp_path):
     with BagSource(path, ground_truth_topic='/estimate') as source:
         assert source.ground_truth_topic == '/estimate'
         assert len(list(source)) == 5
+
+
+def test_an_empty_ros1_bag_is_empty_and_not_broken(tmp_path):
+    assert 'holds no message' in source_error(ros1_bag(tmp_path / 'old.bag', count=0))
 
 
 def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):

@@ -1,15 +1,14 @@
 """TUM RGB-D and EuRoC folders, and finding out what a path holds."""
 
 import cv2
-import numpy as np
-import pytest
-from scipy.spatial.transform import Rotation
-
 from djet_ros.data.bag_writers import write_kitti_bag
 from djet_ros.data.bags import BagSource
 from djet_ros.data.datasets import euroc, interpolate, open_sequence, tum_rgbd
 from djet_ros.data.kitti import KittiSequence
 from djet_ros.errors import DjetError
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 STAMPS = [1403636579763555584 + i * 50_000_000 for i in range(5)]
 SIZE = (160, 120)

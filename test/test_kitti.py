@@ -4,13 +4,12 @@ from fractions import Fraction
 from pathlib import Path
 
 import cv2
-from hypothesis import given, strategies as st
-import numpy as np
-import pytest
-
 from djet_ros.data.kitti import KittiSequence, read_poses, STAMP_OFFSET_NS
 from djet_ros.data.text import nanoseconds
 from djet_ros.errors import DjetError
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
 
 
 def test_a_sequence_gives_images_camera_stamps_and_poses(small_kitti):

@@ -5,14 +5,13 @@ import signal
 import subprocess
 import sys
 
+from djet_ros.data.kitti import read_poses
+from djet_ros.data.trajectories import KittiWriter, read_tum, TumWriter
+from djet_ros.errors import DjetError
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
-from djet_ros.data.kitti import read_poses
-from djet_ros.data.trajectories import KittiWriter, read_tum, TumWriter
-from djet_ros.errors import DjetError
 
 
 def some_poses(count=20):

@@ -66,8 +66,9 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     Topics: /camera/image_rect (mono8), /camera/camera_info, /ground_truth/pose (camera in the
     first camera, where the sequence knows it) and /tf_static (map to camera_first, REP 103).
     ``progress`` is called with the number of frames written so far. The bag appears under its
-    name when it is complete; a failure or an interrupt leaves nothing, and with ``overwrite``
-    leaves the old bag. Raises DjetError where ``out`` exists or can't be written.
+    name when it is complete; a failure or an interrupt leaves nothing (a kill a hidden folder
+    beside it), and with ``overwrite`` leaves the old bag. Raises DjetError where ``out`` exists
+    or can't be written.
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
@@ -154,10 +155,9 @@ def _connect(writer: Writer, topic: str, msgtype: str) -> Connection:
 @contextmanager
 def _appearing(out: Path, overwrite: bool) -> Iterator[Path]:
     """Give a place beside ``out`` to write to; it takes the name on success and goes otherwise."""
-    replaced = out.exists()
-    if replaced and not overwrite:
+    if out.exists() and not overwrite:
         raise DjetError(f'{out} exists; choose another name or pass --overwrite')
-    if replaced and not (out.is_dir() and is_bag(out)):
+    if out.exists() and not (out.is_dir() and is_bag(out)):
         raise DjetError(f'{out} exists and is no bag folder; it is not overwritten')
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -165,13 +165,24 @@ def _appearing(out: Path, overwrite: bool) -> Iterator[Path]:
             # The bag's file is named after its folder, so the folder has the final name already.
             folder = Path(beside) / out.name
             yield folder
-            if replaced:
-                out.rename(Path(beside) / 'replaced')
-            folder.rename(out)
+            _exchange(folder, out, Path(beside) / 'replaced')
     except (OSError, WriterError, sqlite3.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DjetError(f'{out} could not be written: {reason}; nothing was left '
                         'behind') from error
+
+
+def _exchange(new: Path, out: Path, aside: Path) -> None:
+    """Give a folder its final name; what has that name goes aside, and comes back on failure."""
+    replaced = out.exists()
+    if replaced:
+        out.rename(aside)
+    try:
+        new.rename(out)
+    except BaseException:
+        if replaced:
+            aside.rename(out)
+        raise
 
 
 def _frames(sequence: FrameSequence) -> Iterator[list[tuple[str, Any, int]]]:

@@ -78,7 +78,7 @@ class Bag:
         Where the bag is damaged, everything before the damage comes first, then DjetError.
         """
         for file, storage in self._storages:
-            chosen = {connection.id: connection for connection in storage.connections
+            chosen = {connection.number: connection for connection in storage.connections
                       if topics is None or connection.topic in topics}
             with _blaming(file):
                 yield from _decoded(storage, chosen)

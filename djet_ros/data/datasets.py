@@ -60,7 +60,7 @@ class UndistortedSequence:
         return len(self.stamps_ns)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Grayscale image (H, W) of a frame, rectified."""
+        """Rectified gray pixels (H, W) of a frame."""
         image = self._images.gray(index)
         if self._maps is None:
             return image

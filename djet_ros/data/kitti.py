@@ -48,7 +48,7 @@ class KittiSequence:
         return len(self.frame_paths)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Grayscale image (H, W) of a frame of the chosen range."""
+        """Gray pixels (H, W) of a frame of the chosen range."""
         return self._images.gray(index)
 
 

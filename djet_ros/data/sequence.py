@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 # 8192 x 8192: beyond any camera we know, and far below what would exhaust memory.
 LARGEST_IMAGE_PIXELS = 1 << 26
 
+PNG_END = b'IEND\xaeB`\x82'
+
 
 class FrameSequence(Protocol):
     """
@@ -37,7 +39,7 @@ class FrameSequence(Protocol):
         """Count the frames."""
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Grayscale image (H, W) of a frame."""
+        """Gray pixels (H, W) of a frame."""
 
 
 def from_first(poses: Array) -> Array:
@@ -68,10 +70,14 @@ class ImageFiles:
     def gray(self, index: int) -> NDArray[np.uint8]:
         """Image (H, W) uint8 of a file; colours become gray."""
         path = self.paths[index]
+        image = None
         try:
-            image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
-        except (OSError, cv2.error):
-            image = None
+            data = path.read_bytes()
+            # libpng would report a file that is cut short on stderr by itself.
+            if PNG_END in data:
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        except OSError as error:
+            raise DjetError(f'{path} could not be read: {error.strerror}') from error
         if image is None or image.shape != self.size[::-1]:
             raise DjetError(f'{path} is a damaged PNG image; replace it or leave its frame out '
                             'with --start and --end')

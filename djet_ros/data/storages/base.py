@@ -22,7 +22,7 @@ class Connection(NamedTuple):
     message definition, or '' where the file holds none.
     """
 
-    id: int
+    number: int
     topic: str
     msgtype: str
     encoding: str
@@ -37,7 +37,7 @@ class Storage(Protocol):
 
     def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """
-        Yield (connection id, stamp in ns, serialised message) in the order of stamps.
+        Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
         After the last message before a break in the file, raises BrokenFile.
         """

@@ -47,7 +47,7 @@ class Records(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a message lies: connection id, stamp in ns, first byte and end in its chunk."""
+    """Where a message lies: connection number, stamp in ns, first byte and end in its chunk."""
 
     connection: int
     stamp: int
@@ -87,7 +87,7 @@ class ChunkedFile(ABC):
 
     def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """
-        Yield (connection id, stamp in ns, serialised message) in the order of stamps.
+        Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
         After the last message before a break in the file, raises BrokenFile.
         """

@@ -37,7 +37,7 @@ class Ros1File(ChunkedFile):
         try:
             header, _, _ = _read_record(file, len(MAGIC))
             position, = _field(header, 'index_pos', '<Q')
-            if not len(MAGIC) < position < self.size:
+            if not len(MAGIC) < position <= self.size:
                 return False
             while position < self.size:
                 header, begin, length = _read_record(file, position)

@@ -51,7 +51,7 @@ class SqliteFile:
 
     def messages(self, wanted: Collection[int]) -> Iterator[Message]:
         """
-        Yield (connection id, stamp in ns, serialised message) in the order of stamps.
+        Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
         After the last message before a break in the file, raises BrokenFile.
         """
