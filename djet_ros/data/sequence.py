@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import struct
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.types import Array
@@ -70,7 +70,7 @@ class ImageFiles:
     def gray(self, index: int) -> NDArray[np.uint8]:
         """Image (H, W) uint8 of a file; colours become gray."""
         path = self.paths[index]
-        image = None
+        image: NDArray[Any] | None = None
         try:
             data = path.read_bytes()
             # libpng would report a file that is cut short on stderr by itself.
@@ -78,6 +78,8 @@ class ImageFiles:
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
         except OSError as error:
             raise DjetError(f'{path} could not be read: {error.strerror}') from error
+        except cv2.error:
+            image = None
         if image is None or image.shape != self.size[::-1]:
             raise DjetError(f'{path} is a damaged PNG image; replace it or leave its frame out '
                             'with --start and --end')
