@@ -1,0 +1,140 @@
+"""Two-view geometry, against exact points and against formulas of other making."""
+
+from __future__ import annotations
+
+from djet_ros.core.geometry import (
+    direction_angle,
+    epipolar_lines,
+    essential,
+    fundamental,
+    homogeneous,
+    in_front,
+    line_distances,
+    rays,
+    rotation_angle,
+    rotation_exp,
+    skew,
+    sphere_tangents,
+    unit,
+)
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SKEWED, two_views
+
+vectors = arrays(float, 3, elements=st.floats(-3, 3))
+directions = vectors.filter(lambda v: np.linalg.norm(v) > 1e-3).map(unit)
+
+
+@given(vectors, vectors)
+def test_the_skew_matrix_is_the_cross_product(v, w):
+    assert np.allclose(skew(v) @ w, np.cross(v, w), atol=1e-14)
+
+
+@given(vectors)
+@example(np.zeros(3))
+@example(np.array([1e-12, 0, 0]))
+@example(np.array([0, np.pi, 0]))
+def test_a_rotation_is_the_matrix_exponential_of_its_vector(omega):
+    assert np.allclose(rotation_exp(omega), expm(skew(omega)), atol=1e-13)
+
+
+@given(directions)
+@example(np.array([0.0, 0.0, 1.0]))
+@example(np.array([0.0, 0.0, -1.0]))
+@example(np.array([1.0, 0.0, -0.0]))
+@example(unit(np.array([1e-9, -1e-9, -1.0])))
+def test_the_tangents_of_the_sphere_are_orthonormal_everywhere(t):
+    basis = np.column_stack([sphere_tangents(t), t])
+    assert np.allclose(basis.T @ basis, np.eye(3), atol=1e-14)
+
+
+def test_unit_vectors_have_length_one_and_nothing_becomes_of_zero():
+    v = unit(np.array([[3.0, 0, 4.0], [0, 0, 0], [1e-100, 0, 0]]))
+    assert np.allclose(np.linalg.norm(v, axis=1), [1, 0, 1])
+    assert np.allclose(v[0], [0.6, 0, 0.8])
+
+
+@pytest.mark.parametrize('camera', [K, SKEWED])
+def test_rays_go_through_their_pixels(camera):
+    pixels = np.random.default_rng(1).uniform(0, 1000, (50, 2))
+    through = rays(camera, pixels) @ camera.T
+    assert np.allclose(through[:, :2] / through[:, 2:], pixels, atol=1e-9)
+    assert np.allclose(rays(camera, pixels)[:, 2], 1)
+
+
+@pytest.mark.parametrize('camera', [K, SKEWED])
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+def test_every_point_lies_on_its_epipolar_line(camera, t):
+    seen = two_views(np.random.default_rng(2), t=t, K=camera)
+    F = fundamental(camera, seen.R, seen.t)
+    assert np.abs(line_distances(epipolar_lines(F, seen.x), seen.y)).max() < 1e-9
+    # and on no other: the lines are not there by being zero
+    other = two_views(np.random.default_rng(2), t=t, K=camera, turn=(0.02, 0.0, 0.0))
+    assert np.median(np.abs(line_distances(epipolar_lines(F, other.x), other.y))) > 1
+
+
+@given(directions, vectors)
+def test_an_essential_matrix_has_two_equal_singular_values_and_a_zero(t, omega):
+    values = np.linalg.svd(essential(rotation_exp(omega), t), compute_uv=False)
+    assert np.allclose(values, [1, 1, 0], atol=1e-12)
+
+
+def test_the_distance_to_a_line_is_that_to_the_nearest_of_its_points_and_changes_sign_across_it():
+    # the line through a with direction u, as a cross product of two of its points
+    a, u = np.array([12.0, -7.0]), np.array([0.6, 0.8])
+    line = np.cross([*a, 1], [*(a + 5 * u), 1])
+    across = np.array([-0.8, 0.6])
+    offsets = np.array([-3.5, 0.0, 1e-6, 20.0])
+    y = a + 31.0 * u + offsets[:, None] * across
+    distances = line_distances(np.tile(line, (4, 1)), y)
+    assert np.allclose(np.abs(distances), np.abs(offsets), atol=1e-12)
+    assert distances[0] * distances[3] < 0
+
+
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+@pytest.mark.parametrize(('near', 'far'), [(4.0, 40.0), (1e3, 1e5)])
+def test_only_the_true_one_of_four_motions_has_all_points_in_front(t, near, far):
+    """A thousand baselines away, too: cv2.recoverPose would leave such points out."""
+    seen = two_views(np.random.default_rng(3), t=t, near=near, far=far)
+    rays_x, rays_y = rays(K, seen.x), rays(K, seen.y)
+    half_turn = Rotation.from_rotvec(np.pi * seen.t).as_matrix()
+    assert in_front(seen.R, seen.t, rays_x, rays_y).all()
+    for R, t in ((seen.R, -seen.t), (half_turn @ seen.R, seen.t), (half_turn @ seen.R, -seen.t)):
+        assert np.allclose(np.abs(np.einsum('ni,ij,nj->n', rays_y, essential(R, t), rays_x)), 0,
+                           atol=1e-9)
+        assert not in_front(R, t, rays_x, rays_y).any()
+
+
+def test_chirality_is_told_for_each_point_by_itself():
+    seen = two_views(np.random.default_rng(4), t=SIDEWAYS)
+    rays_y = rays(K, seen.y)
+    behind = np.arange(len(rays_y)) % 3 == 0
+    # mirrored at the direction of the far point, a point's parallax has the wrong sign
+    far_away = rays(K, seen.x) @ seen.R.T
+    rays_y[behind] = 2 * far_away[behind] - rays_y[behind]
+    assert np.array_equal(in_front(seen.R, seen.t, rays(K, seen.x), rays_y), ~behind)
+
+
+@pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-6, 0.3, np.pi - 1e-6])
+def test_angles_between_poses_are_exact_even_where_an_arc_cosine_is_blind(angle):
+    axis = unit(np.array([1.0, -2.0, 0.5]))
+    before = Rotation.from_rotvec([0.4, 0.1, -0.9]).as_matrix()
+    after = before @ Rotation.from_rotvec(angle * axis).as_matrix()
+    assert rotation_angle(before, after) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+    assert rotation_angle(after, before) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+    a = unit(np.cross(axis, [1.0, 0, 0]))
+    b = Rotation.from_rotvec(angle * axis).apply(a)
+    assert direction_angle(3 * a, b) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+
+
+def test_opposite_directions_are_half_a_turn_apart():
+    assert direction_angle(np.array([0, 0, 1.0]), np.array([0, 0, -2.0])) == pytest.approx(np.pi)
+
+
+def test_homogeneous_points_end_in_one():
+    assert np.array_equal(homogeneous(np.array([[2.0, 3.0]])), [[2, 3, 1]])

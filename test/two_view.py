@@ -1,0 +1,83 @@
+"""Two views with exact geometry: points seen by a camera in two places, and plain images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import unit
+from djet_ros.core.types import View
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# KITTI's gray camera, and one whose pixels are neither square nor upright.
+K = np.array([[718.856, 0.0, 607.1928], [0.0, 718.856, 185.2157], [0.0, 0.0, 1.0]])
+SKEWED = np.array([[700.0, 35.0, 590.0], [0.0, 560.0, 210.0], [0.0, 0.0, 1.0]])
+SIZE = (1241, 376)
+
+SIDEWAYS, FORWARD, BACKWARD = (1.0, 0.0, 0.1), (0.0, 0.02, -1.0), (0.05, 0.0, 1.0)
+TURN = (0.01, 0.03, -0.005)
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """
+    Points (N, 3) in the previous camera, and their exact pixels x and y (N, 2).
+
+    ``X_B = R X_A + t`` with t of unit length: one baseline is the unit of all lengths.
+    """
+
+    K: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    points: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+
+def two_views(rng: np.random.Generator, count: int = 200, t: Sequence[float] = SIDEWAYS,
+              turn: Sequence[float] = TURN, K: np.ndarray = K, near: float = 4.0,
+              far: float = 40.0) -> TwoViews:
+    """Points at depths between near and far baselines, all in both images; turn is in radians."""
+    R, direction = Rotation.from_rotvec(turn).as_matrix(), unit(np.asarray(t, float))
+    x = rng.uniform((0, 0), SIZE, (20 * count, 2))
+    rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
+    points = rays * rng.uniform(near, far, (len(x), 1))
+    y, depth = project(K, points @ R.T + direction)
+    both = np.flatnonzero((depth > 0.5) & (y >= 0).all(1) & (y < SIZE).all(1))[:count]
+    assert len(both) == count, 'too few of the points are in both images'
+    return TwoViews(K, R, direction, points[both], x[both], y[both])
+
+
+def project(K: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) and depths (N,) of points (N, 3) in the camera."""
+    pixels = points @ K.T
+    return pixels[:, :2] / pixels[:, 2:], points[:, 2]
+
+
+def moved_pose(R: np.ndarray, t: np.ndarray, by: float,
+               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Turn a pose and its direction by an angle in radians, each about an axis by chance."""
+    axes = unit(rng.normal(size=(2, 3)))
+    axes[1] = unit(np.cross(axes[1], t))
+    return (Rotation.from_rotvec(by * axes[0]).as_matrix() @ R,
+            Rotation.from_rotvec(by * axes[1]).as_matrix() @ t)
+
+
+def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
+    """Image (H, W) uint8 as cameras see them: soft shades, sharp edges and fine grain."""
+    width, height = size
+    shades = cv2.GaussianBlur(rng.normal(0, 900, (height, width)), (0, 0), 12)
+    image = 128 + shades + cv2.GaussianBlur(rng.normal(0, 60, (height, width)), (0, 0), 1.5)
+    for _ in range(width * height // 700):
+        corner, extent = rng.uniform((0, 0), size), rng.uniform(4, 30, 2)
+        box = [(round(v), round(v + e)) for v, e in zip(corner, extent)]
+        image[slice(*box[1]), slice(*box[0])] += rng.uniform(-60, 60)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:
+    """View of a wall without any texture."""
+    return TwoViewEstimator().view(np.full(size[::-1], gray, np.uint8), K)
