@@ -18,6 +18,10 @@ from djet_ros.errors import DjetError
 COMMANDS = {
     'render': 'render a scene with exact ground truth as a KITTI sequence',
     'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
+    'replay': 'get the trajectory of a camera from a recording',
+    'bench': 'measure the speed, as ratios against OpenCV from one run',
+    'replay': 'get the trajectory of a camera from a recording',
+    'bench': 'measure the speed of the pipeline against the plain chain of OpenCV',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
 }
 

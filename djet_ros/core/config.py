@@ -29,7 +29,7 @@ class EstimatorConfig:
         20, 'contrast in gray levels that makes a corner; lower it for dim images',
         minimum=1, maximum=255)
     search_radius: float = parameter(
-        0.2, 'how far a feature is sought from its place in the previous image, as a share of the '
+        0.15, 'how far a feature is sought from its place in the previous image, as a share of the '
         'longer image side; 1 searches the whole image', minimum=0.01, maximum=1.0)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.types import Features
+from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,28 +38,25 @@ def match_features(previous: Features, current: Features,
     """
     Match by Hamming distance with cross-check, among features at most search_radius pixels apart.
 
-    Both x and y may differ by that much. Gives (M, 2) indices into the previous and the current
-    features, in the order of the former. Distances are taken as matrix products of +-1
-    descriptors, exactly, in vertical strips: several times faster than brute force over all
-    pairs, and with fewer chances to be wrong.
+    Gives (M, 2) indices into the previous and the current features, in the order of the former.
+    Distances are taken as matrix products of +-1 descriptors, exactly, in vertical strips:
+    several times faster than brute force over all pairs, and with fewer chances to be wrong.
     """
     rows, columns = _from_left_to_right(previous), _from_left_to_right(current)
-    there, here = (previous.points[rows].astype(np.float32),
-                   current.points[columns].astype(np.float32))
+    there, here = previous.points[rows], current.points[columns]
     signs_there, signs_here = previous.signs[rows], current.signs[columns]
     forward = np.full(len(rows), -1, np.int64)
     backward = np.full(len(columns), -1, np.int64)
     best = np.full(len(columns), _NONE, np.float32)
     for start in range(0, len(rows), _STRIP):
         strip = slice(start, start + _STRIP)
-        reach = there[strip][[0, -1], 0] + np.float32([-search_radius, search_radius])
-        near = slice(*np.searchsorted(here[:, 0], reach))
+        left, right = there[strip][[0, -1], 0] + (-search_radius, search_radius)
+        near = slice(np.searchsorted(here[:, 0], left), np.searchsorted(here[:, 0], right))
         if near.start == near.stop:
             continue
         similarity = signs_there[strip] @ signs_here[near].T
-        for axis in (0, 1):
-            apart = np.abs(np.subtract.outer(there[strip, axis], here[near, axis]))
-            np.copyto(similarity, _NONE, where=apart > search_radius)
+        far = _squared_distances(there[strip], here[near]) > search_radius**2
+        np.copyto(similarity, _NONE, where=far)
         nearest = similarity.argmax(1)
         found = np.take_along_axis(similarity, nearest[:, None], 1)[:, 0] > _NONE
         forward[strip] = np.where(found, nearest + near.start, -1)
@@ -75,3 +72,12 @@ def match_features(previous: Features, current: Features,
 
 def _from_left_to_right(features: Features) -> NDArray[np.int64]:
     return np.argsort(features.points[:, 0], kind='stable')
+
+
+def _squared_distances(a: Array, b: Array) -> NDArray[np.float32]:
+    """Squared distances (N, M) between points (N, 2) and (M, 2), as one small matrix product."""
+    centre = a.mean(0)  # keeps the terms small, so that single precision is enough
+    a, b = a - centre, b - centre
+    left = np.column_stack([-2 * a, (a * a).sum(1), np.ones(len(a))]).astype(np.float32)
+    right = np.column_stack([b, np.ones(len(b)), (b * b).sum(1)]).astype(np.float32)
+    return np.asarray(left @ right.T)

@@ -104,7 +104,7 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids) -> JetProblem:
     widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
     S = S / max(float(np.median(widths)), 1e-12) if len(S) else S
     G = np.linalg.inv(K)[:2, :2]
-    M = G.T @ S @ G
+    M = G @ S @ G.T
     return JetProblem(rays(K, x).T.copy(), rays(K, paraboloids.minima()).T.copy(),
                       np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]))
 
