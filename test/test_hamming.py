@@ -83,7 +83,7 @@ def test_hamming_surfaces_count_the_bits_that_differ_pixel_by_pixel(radius):
     reference = dense_descriptors(image_a, x)
     for v_y in range(-radius, radius + 1):
         for v_x in range(-radius, radius + 1):
-            there = dense_descriptors(image_b, y + (v_x, v_y))
+            there = dense_descriptors(image_b, y + np.array([v_x, v_y]))
             expected = [bits_apart(a, b) for a, b in zip(reference, there)]
             assert surfaces[v_y + radius, v_x + radius].tolist() == expected
 

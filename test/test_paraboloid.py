@@ -99,7 +99,7 @@ def test_a_prime_b_and_c_are_those_that_the_paper_takes_from_the_quadratic_form_
     assert np.allclose(fitted.A[0], select @ A_k @ select.T, atol=1e-6)
     assert np.allclose(fitted.b[0], select @ A_k @ y_1, atol=1e-6)
     assert fitted.c[0] == pytest.approx(y_1 @ A_k @ y_1, abs=1e-6)
-    place = y + (1.25, -2.5)
+    place = y + np.array([1.25, -2.5])
     assert fitted.values(place[None])[0] == pytest.approx(
         np.array([*place, 1]) @ A_k @ np.array([*place, 1]), abs=1e-6)
 
@@ -121,7 +121,7 @@ def test_the_gradient_vanishes_in_the_minima_and_nothing_near_is_lower():
 
 
 def paper_optimum(A, b, g, h):
-    """The closed form as the paper prints it, where its b_k is -(b_1, b_2)^T."""
+    """Evaluate the closed form as the paper prints it, where its b_k is -(b_1, b_2)^T."""
     (a11, a12), (_, a22) = A
     b1, b2 = -b
     g1, g2 = g
@@ -131,14 +131,14 @@ def paper_optimum(A, b, g, h):
 
 
 def lagrange_optimum(A, b, g, h):
-    """The linear system of the paper's Lagrangian, solved as it stands."""
+    """Solve the linear system of the paper's Lagrangian as it stands."""
     system = np.block([[A, g[:, None]], [g[None], np.zeros((1, 1))]])
     return np.linalg.solve(system, [*-b, h])[:2]
 
 
 def brute_force_optimum(A, b, g, h):
     """
-    Lowest point of the line by search alone.
+    Find the lowest point of the line by search alone.
 
     In 40 decimal places: in doubles, a search sees a minimum only to half of their digits.
     """
