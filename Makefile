@@ -19,7 +19,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-test,peers
 	$(VENV)/bin/$(PYTEST)
 
 lint: $(VENV)/.installed-lint

@@ -37,9 +37,14 @@ setup(
         'scipy>=1.11.2,<2',
     ],
     extras_require={
+        # `djet evaluate --scheduler`
+        'cluster': [
+            'distributed>=2024.5,<2027',
+        ],
+        # what `djet evaluate` compares with
         'peers': [
-            'evo>=1.31,<2',
-            'poselib>=2.0.4,<3',
+            'evo>=1.38,<2',
+            'poselib>=2.0.5,<3',
         ],
         'test': [
             'colcon-common-extensions>=0.3,<0.4',

@@ -9,6 +9,7 @@ import shlex
 from typing import Any
 
 from djet_ros.cli import main
+from djet_ros.data.results import PLOT, SUMMARY
 from djet_ros.errors import DjetError
 from rich.console import Console
 from rich.table import Table
@@ -43,12 +44,10 @@ def run(args: argparse.Namespace) -> int:
     for method, folder in results.items():
         _djet('replay', bag, '--output', folder, '--method', method, *overwrite)
 
-    console = Console()
-    console.print(_comparison({method: json.loads((folder / 'summary.json').read_text())
-                               for method, folder in results.items()}))
+    Console().print(_comparison({method: json.loads((folder / SUMMARY).read_text())
+                                 for method, folder in results.items()}))
     for folder in results.values():
-        for plot in sorted(folder.glob('*.png')):
-            console.print(f'plot: {plot}', soft_wrap=True)
+        print(f'plot: {folder / PLOT}')
     return 0
 
 

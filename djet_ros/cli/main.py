@@ -20,8 +20,6 @@ COMMANDS = {
     'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
     'replay': 'get the trajectory of a camera from a recording',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
-    'replay': 'get the trajectory of a camera from a recording',
-    'bench': 'measure the speed of the pipeline against the plain chain of OpenCV',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
 }
 
