@@ -89,8 +89,10 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
 def inverse_2x2(A: Array) -> Array:
     """Inverses of (N, 2, 2) symmetric matrices; singular ones get a huge, finite inverse."""
     a, b, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 1]
+    # a trace of curvature where there is none, so that a flat surface weighs nothing
+    trace = np.where(np.abs(a * d - b * b) < 1e-12, np.copysign(1e-6, a + d), 0.0)
+    a, d = a + trace, d + trace
     determinant = a * d - b * b
-    determinant = np.where(np.abs(determinant) < 1e-12, 1e-12, determinant)
     return np.asarray(np.stack([d, -b, -b, a], axis=1).reshape(-1, 2, 2)
                       / determinant[:, None, None])
 
