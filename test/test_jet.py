@@ -1,0 +1,253 @@
+"""The joint optimiser: its residuals, their derivatives, the robust losses, and where it ends."""
+
+from __future__ import annotations
+
+from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
+from djet_ros.core.jet import (
+    epipolar_residuals,
+    jet_problem,
+    Loss,
+    minimise,
+    moved,
+    robust_scale,
+)
+from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+from two_view import BACKWARD, FORWARD, K, moved_pose, SIDEWAYS, SKEWED, two_views
+
+LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
+
+
+def circles(y):
+    """RP-E's surfaces: the squared distance to y."""
+    count = len(y)
+    return Paraboloids(y, np.repeat(np.eye(2)[None], count, axis=0), np.zeros((count, 2)),
+                       np.zeros(count), np.ones(count, bool))
+
+
+def random_surfaces(rng, y, kind):
+    """Ellipses with their minima some pixels beside y; or saddles and peaks among them."""
+    count = len(y)
+    half = rng.normal(size=(count, 2, 2))
+    A = half @ half.transpose(0, 2, 1) + 0.3 * np.eye(2)
+    if kind == 'indefinite':
+        A[::3] *= -1
+        A[1::3, 0, 0] *= -1
+    return Paraboloids(y, A, rng.normal(size=(count, 2)), rng.uniform(0, 80, count),
+                       np.ones(count, bool))
+
+
+def random_pose(rng):
+    t = rng.normal(size=3)
+    return Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), t / np.linalg.norm(t)
+
+
+@pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
+@pytest.mark.parametrize('camera', [K, SKEWED])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+def test_the_jacobian_is_that_of_central_differences(camera, kind, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 1000, (2, 30, 2))
+    problem = jet_problem(camera, x, random_surfaces(rng, y, kind))
+    R, t = random_pose(rng)
+    residuals = epipolar_residuals(problem, R, t)
+    tangents, step = residuals.tangents, 1e-6
+
+    def at(parameter, distance):
+        return epipolar_residuals(problem, *moved(R, t, tangents, distance * np.eye(5)[parameter]))
+
+    for parameter in range(5):
+        ahead, behind = at(parameter, step), at(parameter, -step)
+        numeric = (ahead.r - behind.r) / (2 * step)
+        # where g^T A'^-1 g of a saddle passes through zero, the residual has no derivative
+        steep = np.abs(ahead.r - 2 * residuals.r + behind.r) > 1e-4 * np.abs(ahead.r - behind.r)
+        assert steep.mean() < 0.2
+        scale = np.abs(residuals.jacobian).max(0) + np.abs(residuals.r)
+        wrong = np.abs(residuals.jacobian[parameter] - numeric) > 1e-6 * scale
+        assert not (wrong & ~steep).any()
+
+
+@pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
+@pytest.mark.parametrize('camera', [K, SKEWED])
+def test_a_squared_residual_is_what_the_line_costs_above_the_surfaces_own_minimum(camera, kind):
+    """In pixels, by the closed form of v_opt; all matches may be scaled alike."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(0, 1000, (2, 40, 2))
+    surfaces = random_surfaces(rng, y, kind)
+    R, t = random_pose(rng)
+    residuals = epipolar_residuals(jet_problem(camera, x, surfaces), R, t)
+
+    lines = np.column_stack([x, np.ones(40)]) @ fundamental(camera, R, t).T
+    h = -(np.column_stack([y, np.ones(40)]) * lines).sum(1)
+    v_opt = constrained_minimum(surfaces.A, surfaces.b, lines[:, :2], h)
+    above = surfaces.values(y + v_opt) - surfaces.values(surfaces.minima())
+    ratio = residuals.sign * residuals.r**2 / above
+    assert np.allclose(ratio, ratio[0], rtol=1e-6)
+    assert ratio[0] > 0
+    assert (residuals.sign < 0).any() == (kind == 'indefinite')
+
+
+def test_residuals_of_circles_are_the_distances_to_the_epipolar_lines_in_pixels():
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 1000, (2, 40, 2))
+    R, t = random_pose(rng)
+    lines = np.column_stack([x, np.ones(40)]) @ fundamental(SKEWED, R, t).T
+    distances = ((np.column_stack([y, np.ones(40)]) * lines).sum(1)
+                 / np.linalg.norm(lines[:, :2], axis=1))
+    residuals = epipolar_residuals(jet_problem(SKEWED, x, circles(y)), R, t)
+    assert np.allclose(residuals.r, distances, rtol=1e-9)
+
+
+def test_a_surface_without_any_curvature_has_no_say():
+    seen = two_views(np.random.default_rng(5))
+    surfaces = circles(seen.y + 0.5)
+    surfaces.A[:7] = 0
+    R, t = moved_pose(seen.R, seen.t, 0.01, np.random.default_rng(5))
+    residuals = epipolar_residuals(jet_problem(K, seen.x, surfaces), R, t)
+    assert np.abs(residuals.r[:7]).max() < 0.01 * np.median(np.abs(residuals.r[7:]))
+    assert np.abs(residuals.jacobian[:, :7]).max() < 0.01 * np.abs(residuals.jacobian).max()
+
+
+def test_some_of_the_matches_have_the_residuals_that_they_have_among_all():
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(0, 1000, (2, 20, 2))
+    problem, pose = jet_problem(K, x, random_surfaces(rng, y, 'bowls')), random_pose(rng)
+    whole = epipolar_residuals(problem, *pose)
+    part = epipolar_residuals(problem.subset(np.array([3, 11])), *pose)
+    assert np.allclose(part.r, whole.r[[3, 11]])
+    assert np.allclose(part.jacobian, whole.jacobian[:, [3, 11]])
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_moved_pose_is_a_pose_and_as_far_away_as_the_step_is_long(seed):
+    rng = np.random.default_rng(seed)
+    R, t = random_pose(rng)
+    step = 1e-3 * rng.normal(size=5)
+    R_new, t_new = moved(R, t, sphere_tangents(t), step)
+    assert np.allclose(R_new @ R_new.T, np.eye(3), atol=1e-12)
+    assert np.linalg.norm(t_new) == pytest.approx(1, abs=1e-12)
+    assert np.allclose(Rotation.from_matrix(R_new @ R.T).as_rotvec(), step[:3], atol=1e-12)
+    assert direction_angle(t, t_new) == pytest.approx(np.linalg.norm(step[3:]), rel=1e-4)
+
+
+@pytest.mark.parametrize('name', LOSSES)
+@pytest.mark.parametrize('scale', [0.3, 1.0, 4.0])
+def test_the_weight_of_a_loss_is_its_derivative_by_the_squared_residual(name, scale):
+    loss = Loss(name, scale)
+    squared = np.geomspace(1e-4, 1e4, 400)
+    _, weights = loss(squared)
+    numeric = (loss(squared * (1 + 1e-6))[0] - loss(squared * (1 - 1e-6))[0]) / (2e-6 * squared)
+    bend = np.isclose(squared, scale**2, rtol=1e-5)
+    assert np.allclose(weights[~bend], numeric[~bend], rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize('name', LOSSES)
+def test_a_loss_grows_with_the_residual_and_is_its_square_while_that_is_small(name):
+    loss = Loss(name, 2.0)
+    values, weights = loss(np.linspace(0, 30, 500)**2)
+    assert values[0] == 0
+    assert (np.diff(values) > 0).all()
+    assert (np.diff(weights) <= 1e-12).all() and (weights > 0).all()
+    small = np.array([1e-6, 1e-4])
+    assert np.allclose(loss(small)[0], small, rtol=1e-3)
+
+
+def test_the_losses_differ_in_how_much_a_gross_error_may_cost():
+    gross = np.array([1e6])
+    none, huber, cauchy, geman = (Loss(name, 2.0)(gross)[0][0] for name in LOSSES)
+    assert none == 1e6
+    assert huber == pytest.approx(2 * 2.0 * 1e3 - 2.0**2)
+    assert cauchy == pytest.approx(4 * np.log(1 + 1e6 / 4))
+    assert geman == pytest.approx(4, rel=1e-4)
+
+
+def test_an_unknown_loss_is_refused_by_name():
+    with pytest.raises(ValueError, match="loss is 'tukey'"):
+        Loss('tukey')(np.ones(1))
+
+
+@pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
+@pytest.mark.parametrize('name', LOSSES)
+def test_minimising_never_ends_above_the_cost_of_the_start(name, kind):
+    rng = np.random.default_rng(7)
+    loss = Loss(name, 1.0)
+    for _ in range(25):
+        x, y = rng.uniform(0, 1000, (2, 40, 2))
+        problem = jet_problem(K, x, random_surfaces(rng, y, kind))
+        R, t = random_pose(rng)
+        start = epipolar_residuals(problem, R, t)
+        cost = (start.sign * loss(start.r**2)[0]).sum()
+        found = minimise(problem, R, t, loss)
+        assert found.cost <= cost
+        # and the solution says the truth about itself
+        there = epipolar_residuals(problem, found.R, found.t)
+        assert found.cost == pytest.approx((there.sign * loss(there.r**2)[0]).sum())
+        assert np.allclose(found.residuals.r, there.r)
+
+
+@pytest.mark.parametrize('name', LOSSES)
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+@pytest.mark.parametrize('camera', [K, SKEWED])
+def test_without_noise_the_exact_pose_is_found_from_some_degrees_away(camera, t, name):
+    rng = np.random.default_rng(8)
+    seen = two_views(rng, t=t, K=camera)
+    problem = jet_problem(camera, seen.x, circles(seen.y))
+    for _ in range(5):
+        start = moved_pose(seen.R, seen.t, np.deg2rad(2), rng)
+        found = minimise(problem, *start, Loss(name, 10.0))
+        assert rotation_angle(found.R, seen.R) < 1e-9
+        assert direction_angle(found.t, seen.t) < 1e-9
+
+
+@pytest.mark.parametrize('name', LOSSES)
+def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name):
+    rng = np.random.default_rng(9)
+    seen = two_views(rng)
+    problem = jet_problem(K, seen.x, circles(seen.y + rng.normal(0, 0.5, seen.y.shape)))
+    loss = Loss(name, 1.0)
+    found = minimise(problem, *moved_pose(seen.R, seen.t, 0.01, rng), loss, 100)
+
+    def cost(step):
+        there = epipolar_residuals(problem, *moved(found.R, found.t, found.residuals.tangents,
+                                                   step))
+        return loss(there.r**2)[0].sum()
+
+    gradient = approx_fprime(np.zeros(5), cost, 1e-7)
+    uphill = approx_fprime(np.full(5, 1e-3), cost, 1e-7)
+    assert np.linalg.norm(gradient) < 1e-2 * np.linalg.norm(uphill)
+
+
+def test_a_third_of_gross_errors_does_not_move_a_robust_loss_and_ruins_the_plain_one():
+    rng = np.random.default_rng(10)
+    seen = two_views(rng)
+    y = seen.y.copy()
+    y[::3] += rng.uniform(-60, 60, y[::3].shape)
+    problem = jet_problem(K, seen.x, circles(y))
+    start = moved_pose(seen.R, seen.t, np.deg2rad(0.5), rng)
+    errors = {name: rotation_angle(minimise(problem, *start, Loss(name, 0.5), 100).R, seen.R)
+              for name in LOSSES}
+    assert errors['geman_mcclure'] < 1e-4 and errors['cauchy'] < 1e-3
+    assert errors['none'] > 1e-2
+
+
+def test_the_robust_scale_is_the_standard_deviation_of_the_inliers():
+    rng = np.random.default_rng(11)
+    residuals = rng.normal(0, 0.7, 100_000)
+    assert robust_scale(residuals) == pytest.approx(0.7, rel=0.02)
+    residuals[:5000] = 1e6
+    assert robust_scale(residuals) == pytest.approx(0.7, rel=0.1)
+
+
+def test_matches_that_determine_nothing_leave_the_pose_finite():
+    one = two_views(np.random.default_rng(12), count=1)
+    for count in (1, 30):
+        x, y = np.tile(one.x, (count, 1)), np.tile(one.y, (count, 1))
+        problem = jet_problem(K, x, circles(y + 3))
+        found = minimise(problem, one.R, one.t, Loss())
+        assert np.isfinite(found.R).all() and np.linalg.norm(found.t) == pytest.approx(1)
