@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 from djet_ros.core.types import Array, Features
 import numpy as np
@@ -22,7 +24,10 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
     residual surfaces use unrotated ones (`djet_ros.core.hamming`).
     """
     orb = cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
-    keypoints, descriptors = orb.detectAndCompute(gray, None)
+    keypoints: Sequence[cv2.KeyPoint] = ()
+    descriptors = None
+    if min(gray.shape) > orb.getEdgeThreshold():  # the pyramid fails on images of a pixel or two
+        keypoints, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
     return Features(
@@ -42,6 +47,8 @@ def match_features(previous: Features, current: Features,
     Distances are taken as matrix products of +-1 descriptors, exactly, in vertical strips:
     several times faster than brute force over all pairs, and with fewer chances to be wrong.
     """
+    if not len(previous) or not len(current):
+        return np.empty((0, 2), np.int64)
     rows, columns = _from_left_to_right(previous), _from_left_to_right(current)
     there, here = previous.points[rows], current.points[columns]
     signs_there, signs_here = previous.signs[rows], current.signs[columns]
