@@ -76,10 +76,11 @@ class NodeConfig:
         'raw', 'raw (image) or compressed (image/compressed, JPEG or PNG)',
         choices=('raw', 'compressed'))
     qos_reliability: str = parameter(
-        'best_effort', 'of the image and camera_info subscriptions; best_effort hears every '
-        'publisher', choices=('best_effort', 'reliable'))
+        'best_effort', 'of the subscriptions; best_effort hears every publisher (queue_policy '
+        'every subscribes reliably in any case)', choices=('best_effort', 'reliable'))
     qos_depth: int = parameter(
-        5, 'messages that the middleware keeps for each subscription', minimum=1, maximum=1000)
+        5, 'messages that the middleware keeps for each subscription (with queue_policy every: '
+        'all)', minimum=1, maximum=1000)
     queue_policy: str = parameter(
         'latest', 'latest (under load old frames are dropped and counted) or every (none is '
         'dropped: for a bag played into the node)', choices=('latest', 'every'))
@@ -251,8 +252,13 @@ def _ours(content: Any) -> Any:
     for name, parameters in nodes.items():
         if str(name).rpartition('/')[2] in ('**', '*', NODE_NAME):
             merged.update((key, value) for key, value in _flatten(parameters)
-                          if key.partition('.')[0] not in _ROS_OWN)
+                          if not is_ros_own(key))
     return merged
+
+
+def is_ros_own(name: str) -> bool:
+    """Tell of a parameter whether every ROS node has it, such as use_sim_time."""
+    return name.partition('.')[0] in _ROS_OWN
 
 
 def _flatten(content: Any) -> Iterator[tuple[str, Any]]:

@@ -8,11 +8,14 @@ from importlib.metadata import requires
 from pathlib import Path
 import re
 import sys
+from xml.etree import ElementTree
 
 import djet_ros
 from djet_ros.cli.main import DISTRIBUTIONS
 
 PACKAGE = Path(djet_ros.__file__).parent
+MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
+ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
 FLOORS = {'cli': 3, 'ros': 3, 'core': 1, '__init__': 1}
 ALL_OTHERS = 2
@@ -67,16 +70,17 @@ def test_the_core_knows_arrays_and_nothing_of_files_threads_or_terminals() -> No
         assert not called & OUTSIDE_CALLS, module
 
 
-def test_rclpy_is_imported_by_the_ros_face_only() -> None:
-    users = {module for module in TREES if 'rclpy' in libraries(module)}
+def test_what_comes_with_ros_is_imported_by_the_ros_face_only() -> None:
+    users = {module for module in TREES if libraries(module) & ROS_LIBRARIES}
+    assert users
     assert all(module.startswith('djet_ros.ros.') for module in users)
 
 
 def test_every_library_is_a_declared_dependency() -> None:
     declared = {re.split(r'[<>=!;\[ ]', line)[0] for line in requires('djet_ros') or []
                 if not re.search(r'extra == .(test|lint)', line)}
-    # Python 3.14 has zstd, and rclpy comes with ROS.
-    known = sys.stdlib_module_names | {'compression', 'djet_ros', 'rclpy'}
+    # Python 3.14 has zstd.
+    known = sys.stdlib_module_names | {'compression', 'djet_ros'} | ROS_LIBRARIES
     undeclared = {(module, library) for module in TREES for library in libraries(module) - known
                   if DISTRIBUTIONS.get(library, library) not in declared}
     assert not undeclared

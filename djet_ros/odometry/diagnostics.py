@@ -24,12 +24,13 @@ class State(StrEnum):
     BAD_PAIR = 'bad pair'
     LOST = 'lost'
     REJECTING = 'message rejected'
+    PAUSED = 'paused'
 
 
 LEVELS = {
     State.WAITING_FOR_CAMERA_INFO: 'WARN', State.WAITING_FOR_IMAGE: 'WARN', State.STARTED: 'OK',
     State.RESTARTED: 'WARN', State.TRACKING: 'OK', State.STANDING: 'OK', State.BAD_PAIR: 'WARN',
-    State.LOST: 'ERROR', State.REJECTING: 'ERROR',
+    State.LOST: 'ERROR', State.REJECTING: 'ERROR', State.PAUSED: 'WARN',
 }
 
 

@@ -55,6 +55,8 @@ class Tracker:
         self._messages = Messages(message_type, config.odometry)
         self._info: Any = None
         self._camera: Camera | None = None
+        self._paused = False
+        self._enter(State.WAITING_FOR_CAMERA_INFO)
         self._forget()
 
     def reset(self) -> None:
@@ -70,6 +72,8 @@ class Tracker:
     def _forget(self) -> None:
         self.counts = Counts()
         self.last: OdometryResult | None = None
+        # What became of the newest image: a status, or the reason why it was not used.
+        self.verdict = ''
         # Why the newest message could not be used, for a log; None when it could.
         self.problem: BadMessage | None = None
         self._frame: Frame | None = None
@@ -77,8 +81,7 @@ class Tracker:
         self._path_stamp: int | None = None
         self._rate = StampRate()
         self._bad_pairs = 0
-        self._state, self._detail = (State.WAITING_FOR_IMAGE if self._camera
-                                     else State.WAITING_FOR_CAMERA_INFO), ''
+        self._await()
         self._said: tuple[State, str, int] | None = None
 
     def configure(self, config: Config) -> None:
@@ -114,24 +117,47 @@ class Tracker:
             return self._reject(problem, stamp_ns(message.header))
         self.problem = None
         if self.last is None:
-            self._enter(State.WAITING_FOR_IMAGE)
+            self._await()
         return []
 
     def image(self, message: Any) -> list[Outgoing]:
         """Take an Image or a CompressedImage, and give what comes of it."""
         self.counts.received += 1
         stamp = stamp_ns(message.header)
+        if self._paused:
+            self._drop('paused')
+            return self._diagnostics_if_due(stamp)
         if self._camera is None:
             return self._without_camera(stamp)
         if self._frame is not None and self._frame.stamp_ns == stamp:
-            self.counts.dropped['equal_stamp'] += 1
+            self._drop('equal_stamp')
             return []
         try:
             gray = self._camera.undistort(gray_image(message))
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
+            self.verdict = problem.reason
             return self._reject(problem, stamp)
         return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id))
+
+    def pause(self) -> None:
+        """Drop all images until ``resume``; whatever is known by then stays known."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Take images again; whether the next one has a pair is for max_gap to say."""
+        self._paused = False
+        self._await()
+
+    def no_image_comes(self) -> None:
+        """Hear from a face, which has a clock, that no image has come for a while."""
+        self._await()
+        self._rate = StampRate()
+
+    @property
+    def state(self) -> State:
+        """What the odometry is doing."""
+        return State.PAUSED if self._paused else self._state
 
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed, for odometry.scale 'speed'."""
@@ -148,7 +174,8 @@ class Tracker:
 
     def diagnosis(self) -> Diagnosis:
         """Say how the odometry is doing."""
-        diagnosis = diagnose(self._state, self._detail, self.counts, self.last, self._rate.hertz)
+        diagnosis = diagnose(self.state, '' if self._paused else self._detail, self.counts,
+                             self.last, self._rate.hertz)
         diagnosis.values.update(self.face_values)
         return diagnosis
 
@@ -168,10 +195,13 @@ class Tracker:
 
     def _without_camera(self, stamp: int) -> list[Outgoing]:
         """Drop an image for want of a camera; an unusable CameraInfo stays the problem."""
-        self.counts.dropped['waiting_for_camera_info'] += 1
-        if self._info is None:
-            self._enter(State.WAITING_FOR_CAMERA_INFO)
+        self._drop('waiting_for_camera_info')
+        self._await()
         return self._diagnostics_if_due(stamp)
+
+    def _drop(self, reason: str) -> None:
+        self.counts.dropped[reason] += 1
+        self.verdict = reason
 
     def _reject(self, problem: BadMessage, stamp: int) -> list[Outgoing]:
         self.problem = problem
@@ -185,7 +215,8 @@ class Tracker:
         result = self._odometry.process(frame)
         self.last, self._frame, self.problem = result, frame, None
         self.counts.processed += 1
-        self.counts.status[result.status.value] += 1
+        self.verdict = result.status.value
+        self.counts.status[self.verdict] += 1
         self._rate.add(frame.stamp_ns)
         self._enter(*self._judge(result))
         return [*self._poses(result), *self._diagnostics_if_due(frame.stamp_ns)]
@@ -225,14 +256,21 @@ class Tracker:
         self._path_stamp = result.stamp_ns
         return [Outgoing('path', self._messages.path(self._path))]
 
+    def _await(self) -> None:
+        """Wait for what is missing; an unusable CameraInfo stays the problem."""
+        if self._camera is not None:
+            self._enter(State.WAITING_FOR_IMAGE)
+        elif self._info is None:
+            self._enter(State.WAITING_FOR_CAMERA_INFO)
+
     def _enter(self, state: State, detail: str = '') -> None:
         self._state, self._detail = state, detail
 
     def _diagnostics_if_due(self, stamp: int) -> list[Outgoing]:
         if self._said is not None:
             state, detail, said = self._said
-            if (state, detail) == (self._state, self._detail) \
+            if (state, detail) == (self.state, self._detail) \
                     and 0 <= stamp - said < _DIAGNOSTICS_PERIOD_NS:
                 return []
-        self._said = self._state, self._detail, stamp
+        self._said = self.state, self._detail, stamp
         return [self.diagnostics(stamp)]

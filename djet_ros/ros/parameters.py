@@ -1,0 +1,122 @@
+"""The node's parameters: declared from the one configuration, and changed only as it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from typing import Any
+
+from djet_ros.config import Config, flat, FlatParameter, from_flat, is_ros_own, with_values
+from djet_ros.errors import DjetError
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+# What a subscription or the queue was made with holds for its life.
+FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
+         'ros.queue_size')
+
+_KNOWN = flat(Config())
+
+
+class Parameters:
+    """
+    Parameters of a node that declares them automatically from overrides.
+
+    config: what they say. apply is called with each new configuration, before it is asked for
+    here. Raises DjetError where a value given at the start can't be used; unknown names are
+    only warned of, because a file may serve several nodes.
+    """
+
+    def __init__(self, node: Node, apply: Callable[[Config], None]) -> None:
+        self._apply = apply
+        given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
+        for name in given:
+            if name not in _KNOWN and not is_ros_own(name):
+                node.get_logger().warning(_refusal(name))
+        self.config = _live(from_flat(_ours(given)))
+
+        # Declared anew with the types, ranges and texts that the overrides do not know.
+        for item in flat(self.config).values():
+            if item.name in given:
+                node.undeclare_parameter(item.name)
+            node.declare_parameter(item.name, item.value, descriptor(item), ignore_override=True)
+        node.add_pre_set_parameters_callback(self._complete)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._take)
+
+    def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
+        """Make integers floats where those belong, and let a preset set its values."""
+        values = _values(parameters)
+        try:
+            config = with_values(self.config, values)
+        except DjetError:
+            # To be refused by _check, which can say why.
+            return parameters
+        before = flat(self.config)
+        return [Parameter(item.name, value=item.value) for item in flat(config).values()
+                if item.name in values or item.value != before[item.name].value
+                ] + [one for one in parameters if one.name not in _KNOWN]
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            _live(with_values(self.config, _values(parameters)))
+        except DjetError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        if values := _values(parameters):
+            config = with_values(self.config, values)
+            self._apply(config)
+            self.config = config
+
+
+def descriptor(item: FlatParameter) -> ParameterDescriptor:
+    """Describe a parameter to ROS: text, range, choices, and whether it can change."""
+    says = item.description
+    result = ParameterDescriptor(
+        description=says.text, read_only=item.name in FIXED,
+        additional_constraints=f'one of: {", ".join(says.choices)}' if says.choices else '')
+    if says.minimum is None or says.maximum is None:
+        return result
+    if item.type is int:
+        result.integer_range = [IntegerRange(
+            from_value=int(says.minimum), to_value=int(says.maximum), step=2 if says.odd else 1)]
+    elif item.type is float:
+        result.floating_point_range = [FloatingPointRange(
+            from_value=float(says.minimum), to_value=float(says.maximum))]
+    return result
+
+
+def _live(config: Config) -> Config:
+    """Refuse what can't be had on a live graph."""
+    if config.odometry.scale == 'ground_truth':
+        raise DjetError("odometry.scale is 'ground_truth', which only a recording has; choose "
+                        'none, constant or speed')
+    if config.ros.publish_tf and find_spec('tf2_msgs') is None:
+        raise DjetError('ros.publish_tf is true, and the package tf2_msgs is not installed: '
+                        'apt install ros-$ROS_DISTRO-tf2-msgs')
+    return config
+
+
+def _refusal(name: str) -> str:
+    """Word why an unknown name is unknown."""
+    try:
+        from_flat({name: None})
+    except DjetError as error:
+        return str(error)
+    raise ValueError(f'{name} is a parameter')
+
+
+def _values(parameters: list[Parameter]) -> dict[str, Any]:
+    return _ours({one.name: one.value for one in parameters})
+
+
+def _ours(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name in _KNOWN}
