@@ -76,7 +76,8 @@ class EstimatorConfig:
         check(self)
 
 
-# The paper does not say what becomes of surfaces without a minimum: they are kept.
+# The paper does not say what becomes of surfaces without a minimum. Kept as they are, their loss
+# has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
     'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0, 'snap_reference': False,
     'indefinite': 'keep', 'cull_outside': False, 'loss': 'none', 'step': 'share',

@@ -64,7 +64,7 @@ def fit_operator(window: int, sigma: float) -> Array:
 def fit_paraboloids(surfaces: NDArray[np.uint16], centres: Array, sigma: float) -> Paraboloids:
     """Fit sampled surfaces (P, P, N), indexed [v_y, v_x, k], around centres (N, 2)."""
     window, _, count = surfaces.shape
-    a = fit_operator(window, sigma) @ surfaces.reshape(-1, count).astype(float)
+    a = fit_operator(window, sigma) @ surfaces.reshape(window**2, count).astype(float)
     a11, a22, a12, a1, a2, a0 = a
     A = np.stack([a11, a12 / 2, a12 / 2, a22], axis=1).reshape(-1, 2, 2)
     return Paraboloids(centres, A, np.stack([a1, a2], axis=1) / 2, a0, np.ones(count, bool))

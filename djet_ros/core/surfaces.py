@@ -50,16 +50,20 @@ class DescriptorSurface:
         self._smoothed = current.smoothed
         self._radius = config.window // 2
         self._sigma = config.window_sigma
+        self._latest = _no_paraboloids(len(x))
         self.x = pixels.astype(float) if config.snap_reference else x
 
     def around(self, y: Array) -> Paraboloids:
         """Fit paraboloids to the Hamming surfaces around the whole pixels next to y."""
         centres = np.rint(y).astype(np.int64)
         usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
-        surfaces = hamming_surfaces(self._bits[:, usable], self._smoothed, centres[usable],
+        # Most windows stay on their pixel from one round to the next, and so does their fit.
+        moved = usable & (centres != self._latest.centres).any(1)
+        surfaces = hamming_surfaces(self._bits[:, moved], self._smoothed, centres[moved],
                                     self._radius)
-        fitted = fit_paraboloids(surfaces, centres[usable].astype(float), self._sigma)
-        return _spread(fitted, usable, y)
+        fitted = fit_paraboloids(surfaces, centres[moved].astype(float), self._sigma)
+        self._latest = replace(_put(self._latest, fitted, moved), usable=usable)
+        return self._latest
 
 
 class PhotometricSurface:
@@ -138,10 +142,15 @@ def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.flo
     return np.asarray(np.exp(-(offsets**2).sum(1) / (2 * sigma**2)), np.float32)
 
 
-def _spread(fitted: Paraboloids, usable: NDArray[np.bool_], y: Array) -> Paraboloids:
-    """Put the fits of the usable points back among all N."""
-    n = len(y)
-    centres, b, c = y.copy(), np.zeros((n, 2)), np.zeros(n)
-    A = np.repeat(np.eye(2)[None], n, axis=0)
-    centres[usable], A[usable], b[usable], c[usable] = fitted.centres, fitted.A, fitted.b, fitted.c
-    return Paraboloids(centres, A, b, c, usable)
+def _no_paraboloids(n: int) -> Paraboloids:
+    return Paraboloids(np.full((n, 2), np.nan), np.repeat(np.eye(2)[None], n, axis=0),
+                       np.zeros((n, 2)), np.zeros(n), np.zeros(n, bool))
+
+
+def _put(paraboloids: Paraboloids, fitted: Paraboloids,
+         places: NDArray[np.bool_]) -> Paraboloids:
+    """Give the paraboloids with those at some places (N,) bool replaced by fitted ones."""
+    arrays = {name: getattr(paraboloids, name).copy() for name in ('centres', 'A', 'b', 'c')}
+    for name, array in arrays.items():
+        array[places] = getattr(fitted, name)
+    return replace(paraboloids, **arrays)

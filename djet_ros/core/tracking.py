@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 _LEAST_SCALE = 0.02
 
 # Steps after which the costs of several starts tell their basins apart.
-_STEPS_TO_COMPARE = 10
+_STEPS_TO_COMPARE = 7
 
 # A match agrees with a pose within this many robust standard deviations.
 _INLIER = 3.0
