@@ -1,0 +1,81 @@
+"""
+Errors of estimated pairs against ground truth, as in the paper's section 5.1.
+
+Each pair is held against the true motion between the very two frames that it relates, which are
+neighbours unless a bad frame lies between them. The rules:
+* rotation: angle of the rotation between truth and estimate (Rodrigues), for every pair whose
+  motion was told (OK, NO_PARALLAX);
+* translation: angle between the true and the estimated direction, for every pair with status OK
+  whose true way is at least 5 cm: below that the direction of the truth is noise;
+* a pair whose motion was not told has no error: it is counted as a failure, and so is, for
+  translation, a pair called NO_PARALLAX although the camera went further than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from djet_ros.core.geometry import direction_angle, rotation_angle
+from djet_ros.core.types import Array, Status
+import numpy as np
+from numpy.typing import NDArray
+
+SHORTEST_WAY = 0.05
+
+
+@dataclass(frozen=True)
+class Pair:
+    """An estimated pair: its stamps, its status, and the motion (4, 4), current in previous."""
+
+    previous_stamp_ns: int
+    stamp_ns: int
+    status: Status
+    motion: Array
+
+
+@dataclass(frozen=True)
+class PairErrors:
+    """
+    Errors of N pairs in degrees, NaN where there is none by the rules of this module.
+
+    rotation_deg, translation_deg: (N,); compared: pairs with ground truth at both ends;
+    failures: how many of them have no rotation; translation_failures: how many of those whose
+    true way is long enough have no direction.
+    """
+
+    rotation_deg: NDArray[np.float64]
+    translation_deg: NDArray[np.float64]
+    compared: int
+    failures: int
+    translation_failures: int
+
+
+def pair_errors(pairs: Sequence[Pair], previous_truth: Array, truth: Array) -> PairErrors:
+    """Compare N pairs with the true poses (N, 4, 4) at their two ends, NaN where not known."""
+    rotation, translation = np.full((2, len(pairs)), np.nan)
+    compared = failures = translation_failures = 0
+    for i, (pair, start, end) in enumerate(zip(pairs, previous_truth, truth, strict=True)):
+        if not (np.isfinite(start).all() and np.isfinite(end).all()):
+            continue
+        compared += 1
+        true_motion = np.linalg.inv(start) @ end
+        far = bool(np.linalg.norm(true_motion[:3, 3]) >= SHORTEST_WAY)
+        if pair.status in (Status.OK, Status.NO_PARALLAX):
+            rotation[i] = np.degrees(rotation_angle(true_motion[:3, :3], pair.motion[:3, :3]))
+        else:
+            failures += 1
+        if pair.status is Status.OK and far:
+            translation[i] = np.degrees(direction_angle(true_motion[:3, 3], pair.motion[:3, 3]))
+        elif far:
+            translation_failures += 1
+    return PairErrors(rotation, translation, compared, failures, translation_failures)
+
+
+def statistics(errors: NDArray[np.float64]) -> dict[str, float] | None:
+    """Mean, median, 95th percentile and maximum of the errors there are; None without any."""
+    known = errors[np.isfinite(errors)]
+    if not known.size:
+        return None
+    return {'mean': float(known.mean()), 'median': float(np.median(known)),
+            'p95': float(np.percentile(known, 95)), 'max': float(known.max())}

@@ -1,0 +1,471 @@
+"""``djet replay`` in real processes: what it writes, and what it says where it can't."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+from cards import Cards, K, pose, SIZE
+import cv2
+from djet_ros.config import load_yaml
+from djet_ros.core.geometry import rotation_exp
+from djet_ros.core.types import Status
+from djet_ros.data.bag_writers import IMAGE_TOPIC, INFO_TOPIC, write_kitti_bag
+from djet_ros.data.bags import Bag
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.data.sources import open_source, pose_of
+from djet_ros.data.trajectories import read_tum, TumWriter
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.ground_truth import GroundTruth
+from djet_ros.evaluation.pair_errors import Pair, pair_errors, statistics
+import numpy as np
+import pytest
+from ros_messages import camera_info, header, image, message_type, STORE
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
+FRAMES = 6
+STEP = pose(x=0.25, z=0.15, yaw=0.01)
+SECOND = 10**9
+
+
+def djet(*words, expect=0):
+    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
+                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+    assert done.returncode == expect, done.stderr
+    assert 'Traceback' not in done.stderr
+    return done
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Write a small KITTI sequence with ground truth, and give its folder."""
+    root = tmp_path_factory.mktemp('dataset')
+    sequence = root / 'sequences' / '00'
+    (sequence / 'image_0').mkdir(parents=True)
+    (root / 'poses').mkdir()
+    cards, here, rows = Cards(), np.eye(4), []
+    for i in range(FRAMES):
+        cv2.imwrite(str(sequence / 'image_0' / f'{i:06d}.png'), cards.gray(here))
+        rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
+        here = here @ STEP
+    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
+    (sequence / 'calib.txt').write_text(f'P0: {row}\n')
+    (sequence / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(FRAMES)))
+    (root / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
+    return sequence
+
+
+@pytest.fixture(scope='module')
+def bag(folder, tmp_path_factory):
+    path = tmp_path_factory.mktemp('bags') / 'bag'
+    write_kitti_bag(KittiSequence(folder), path)
+    return path
+
+
+def record(path, messages):
+    """Write (topic, message, stamp) as a bag."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for topic, message, stamp in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], stamp, STORE.serialize_cdr(message, kind))
+    return path
+
+
+def drive(change=lambda i, message: message, info=True):
+    """Messages of a drive; change makes another message of an image (or None)."""
+    cards, here = Cards(), np.eye(4)
+    for i in range(FRAMES):
+        stamp = SECOND + i * SECOND // 10
+        if info:
+            yield INFO_TOPIC, camera_info(K, SIZE, stamp), stamp
+        message = change(i, image(cards.gray(here), stamp_ns=stamp))
+        if message is not None:
+            yield IMAGE_TOPIC, message, stamp
+        here = here @ STEP
+
+
+def summary(results):
+    return json.loads((results / 'summary.json').read_text())
+
+
+# What is written
+
+@pytest.fixture(scope='module')
+def replayed(bag, tmp_path_factory):
+    """Results of the bag, and what was printed."""
+    results = tmp_path_factory.mktemp('replay') / 'deep' / 'results'
+    return results, djet('replay', bag, '--output', results)
+
+
+def test_the_summary_holds_counts_and_errors(replayed):
+    results, _ = replayed
+    said = summary(results)
+    assert said['complete'] is True
+    assert said['error'] is None
+    assert (said['frames'], said['pairs'], said['images']) == (FRAMES, FRAMES - 1, FRAMES)
+    assert said['status'] == {'FIRST_FRAME': 1, 'OK': FRAMES - 1}
+    assert said['seconds'] > 0
+    assert said['compared_pairs'] == FRAMES - 1
+    assert said['failures'] == said['translation_failures'] == 0
+    for name, limit in (('rotation_error_deg', 0.5), ('translation_error_deg', 10)):
+        assert set(said[name]) == {'mean', 'median', 'p95', 'max'}
+        assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
+
+
+def test_both_trajectories_have_a_pose_for_each_frame(replayed):
+    results, _ = replayed
+    stamps, poses = read_tum(results / 'trajectory_tum.txt')
+    kitti = np.loadtxt(results / 'trajectory_kitti.txt').reshape(-1, 3, 4)
+    assert len(stamps) == FRAMES
+    assert np.allclose(kitti, poses[:, :3], atol=1e-12)
+    assert np.array_equal(poses[0], np.eye(4))
+
+
+def test_the_bag_holds_what_the_live_node_publishes(replayed):
+    results, _ = replayed
+    with Bag(results / 'bag') as out:
+        counts = {topic.name: topic.message_count for topic in out.topics}
+        relative = [m.message for m in out.messages({'/vo_node/relative_pose'})]
+    assert counts == {'/vo_node/relative_pose': FRAMES - 1, '/vo_node/odometry': FRAMES,
+                      '/vo_node/relative_pose_cov': FRAMES - 1, '/diagnostics': 2}
+    _, poses = read_tum(results / 'trajectory_tum.txt')
+    chained = np.eye(4)
+    for message in relative:
+        chained = chained @ pose_of(message)[1]
+    assert np.allclose(chained, poses[-1], atol=1e-9)
+
+
+def test_each_image_has_a_row(replayed):
+    results, _ = replayed
+    rows = list(csv.DictReader((results / 'frames.csv').open()))
+    assert [row['status'] for row in rows] == ['FIRST_FRAME'] + ['OK'] * (FRAMES - 1)
+    assert [row['image'] for row in rows] == [str(i) for i in range(FRAMES)]
+    assert int(rows[1]['inliers']) <= int(rows[1]['matches'])
+    assert rows[2]['previous_stamp_ns'] == rows[1]['stamp_ns']
+    errors = list(csv.DictReader((results / 'errors.csv').open()))
+    assert len(errors) == FRAMES - 1
+    assert float(errors[0]['rotation_error_deg']) < 0.5
+
+
+def test_the_table_is_short_and_says_where_the_plot_is(replayed):
+    results, done = replayed
+    assert done.stderr == ''
+    assert 'rotation' in done.stdout
+    assert done.stdout.rstrip().endswith(str(results / 'trajectory.png'))
+    assert len(done.stdout.splitlines()) < 25
+    assert cv2.imread(str(results / 'trajectory.png')).shape[0] > 300
+
+
+def test_a_folder_and_its_bag_give_the_same_bytes_each_time(folder, replayed, tmp_path):
+    djet('replay', folder, '--output', tmp_path / 'a')
+    for name in ('trajectory_tum.txt', 'trajectory_kitti.txt', 'errors.csv'):
+        assert (tmp_path / 'a' / name).read_bytes() == (replayed[0] / name).read_bytes(), name
+
+
+def test_flags_and_file_make_the_configuration_that_is_written(bag, tmp_path):
+    parameters = tmp_path / 'mine.yaml'
+    parameters.write_text('estimator: {max_features: 400, method: pjet}\n')
+    djet('replay', bag, '--output', tmp_path / 'r', '--config', parameters, '--method', 'rpe',
+         '--scale', 'ground_truth')
+    config = load_yaml(tmp_path / 'r' / 'config.yaml')
+    assert (config.estimator.method, config.estimator.max_features) == ('rpe', 400)
+    assert summary(tmp_path / 'r')['method'] == 'rpe'
+    _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert np.allclose(lengths, np.linalg.norm(STEP[:3, 3]), atol=1e-6)
+
+
+def test_results_are_replaced_only_on_demand_and_nothing_else_is(bag, replayed, tmp_path):
+    results = tmp_path / 'results'
+    shutil.copytree(replayed[0], results)
+    (results / 'notes.txt').write_text('mine')
+    before = (results / 'summary.json').read_bytes()
+    said = djet('replay', bag, '--output', results, expect=2).stderr
+    assert '--overwrite' in said
+    assert len(said.splitlines()) == 1
+    assert (results / 'summary.json').read_bytes() == before
+    djet('replay', bag, '--output', results, '--overwrite', '--preset', 'paper')
+    assert summary(results)['preset'] == 'paper'
+    assert (results / 'notes.txt').read_text() == 'mine'
+    other = tmp_path / 'other'
+    other.mkdir()
+    (other / 'thesis.tex').write_text('mine')
+    assert 'no earlier results' in djet('replay', bag, '--output', other, '--overwrite',
+                                        expect=2).stderr
+
+
+# What is refused
+
+def missing(tmp_path, bag):
+    return [tmp_path / 'absent']
+
+
+def empty_bag(tmp_path, bag):
+    return [record(tmp_path / 'empty', [])]
+
+
+def no_images(tmp_path, bag):
+    return [record(tmp_path / 'blind', [(INFO_TOPIC, camera_info(K, SIZE), SECOND)])]
+
+
+def no_info(tmp_path, bag):
+    return [record(tmp_path / 'wild', drive(info=False))]
+
+
+def late_info(tmp_path, bag):
+    messages = [*drive(info=False), (INFO_TOPIC, camera_info(K, SIZE), 9 * SECOND)]
+    return [record(tmp_path / 'late', messages)]
+
+
+def zeros(tmp_path, bag):
+    info = camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
+    return [record(tmp_path / 'zeros', [(INFO_TOPIC, info, SECOND), *drive(info=False)])]
+
+
+def sepia(tmp_path, bag):
+    return [record(tmp_path / 'sepia', drive(
+        lambda i, m: image(np.zeros(SIZE[::-1], np.uint8), 'sepia')))]
+
+
+def short(tmp_path, bag):
+    return [record(tmp_path / 'short', drive(
+        lambda i, m: image(np.zeros(SIZE[::-1], np.uint8), data=np.zeros(9, np.uint8))))]
+
+
+def wrong_poses(tmp_path, bag):
+    file = tmp_path / 'poses.txt'
+    file.write_text('1 0 0 0 0 1 0 0 0 0 1 0\n' * (FRAMES - 1))
+    return [bag, '--poses', file]
+
+
+def bad_config(tmp_path, bag):
+    file = tmp_path / 'bad.yaml'
+    file.write_text('estimator: {windw: 5}\n')
+    return [bag, '--config', file]
+
+
+@pytest.mark.parametrize('make, message', [
+    (missing, 'does not exist'), (empty_bag, 'holds no message'), (no_images, 'no image topic'),
+    (no_info, 'no CameraInfo'), (late_info, 'came after a CameraInfo'), (zeros, 'all zeros'),
+    (sepia, "'sepia'"), (short, '9 bytes'), (wrong_poses, '5 poses'),
+    (bad_config, "did you mean 'estimator.window'"),
+    (lambda t, b: [b, '--method', 'sift'], "'sift'"),
+    (lambda t, b: [b, '--scale', 'speed'], 'speed'),
+    (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
+])
+def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
+    done = djet('replay', *make(tmp_path, bag), '--output', tmp_path / 'results', expect=2)
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith('djet: error: ')
+    assert message in done.stderr
+
+
+def test_a_truncated_bag_leaves_what_was_before_the_cut(bag, tmp_path):
+    cut = tmp_path / 'cut.mcap'
+    whole = next(bag.glob('*.mcap')).read_bytes()
+    cut.write_bytes(whole[:len(whole) * 6 // 10])
+    results = tmp_path / 'results'
+    said = djet('replay', cut, '--output', results, expect=2).stderr
+    assert len(said.splitlines()) == 1
+    assert 'cut short' in said
+    told = summary(results)
+    assert told['complete'] is False
+    assert 'cut short' in told['error']
+    assert 1 < told['frames'] < FRAMES
+    assert len(read_tum(results / 'trajectory_tum.txt')[0]) == told['frames']
+    with Bag(results / 'bag') as out:
+        assert len(list(out.messages({'/vo_node/odometry'}))) == told['frames']
+    assert told['rotation_error_deg'] is not None
+
+
+@pytest.mark.parametrize('damage, reason, frames', [
+    (lambda i, m: image(np.zeros((100, 100), np.uint8), stamp_ns=SECOND + i * SECOND // 10)
+     if i == 3 else m, 'size_mismatch', FRAMES - 1),
+    (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999,
+                        stamp_ns=SECOND + i * SECOND // 10) if i in (2, 4) else m,
+     'size_mismatch|short_data', FRAMES - 2)])
+def test_a_bad_image_in_the_middle_is_named_and_the_rest_is_tracked(
+        damage, reason, frames, tmp_path):
+    results = tmp_path / 'results'
+    said = djet('replay', record(tmp_path / 'bag', drive(damage)), '--output', results,
+                expect=2).stderr
+    assert len(said.splitlines()) == 1
+    assert f'{FRAMES - frames} of {FRAMES} images' in said
+    told = summary(results)
+    assert told['complete'] is True
+    assert told['frames'] == frames
+    assert set(told['rejected']) <= set(reason.split('|'))
+    rows = list(csv.DictReader((results / 'frames.csv').open()))
+    assert sum(row['status'] == 'UNUSED' for row in rows) == FRAMES - frames
+
+
+def test_another_image_size_in_the_middle_is_named(tmp_path):
+    messages = list(drive())
+    for i, (topic, message, _) in enumerate(messages):
+        if i >= 6 and topic == IMAGE_TOPIC:
+            message.height, message.data = 200, message.data[:200 * SIZE[0]]
+        elif i >= 6:
+            message.height = 200
+    said = djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
+                expect=2).stderr
+    assert 'changes 1 times' in said
+    assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
+
+
+@pytest.mark.parametrize('sign, code', [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
+    endless = tmp_path / 'sequences' / '01'
+    shutil.copytree(folder, endless)
+    for i in range(FRAMES, 2000):
+        os.symlink(endless / 'image_0' / f'{i % FRAMES:06d}.png',
+                   endless / 'image_0' / f'{i:06d}.png')
+    (endless / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(2000)))
+    results = tmp_path / 'results'
+    process = subprocess.Popen([*DJET, 'replay', endless, '--output', results],
+                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    trajectory = results / 'trajectory_tum.txt'
+    deadline = time.monotonic() + 60
+    while not (trajectory.exists() and len(trajectory.read_text().splitlines()) > 5):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(sign)
+    assert process.wait(30) == code
+    assert 'Traceback' not in process.stderr.read()
+    told = summary(results)
+    assert told['complete'] is False
+    poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
+    assert len(poses) > 5
+    found = []
+    with Bag(results / 'bag') as out:
+        try:
+            found += out.messages({'/vo_node/odometry'})
+        except DjetError:
+            assert code == -9
+    assert sign == signal.SIGKILL or len(found) >= 5
+
+
+# Sources of ground truth
+
+def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
+    kitti = folder.parents[1] / 'poses' / '00.txt'
+    tum = tmp_path / 'truth.txt'
+    sequence = KittiSequence(folder)
+    with TumWriter(tum) as writer:
+        for stamp, true_pose in zip(sequence.stamps_ns.tolist(), sequence.poses, strict=True):
+            writer.write(stamp, true_pose)
+    for poses in (None, kitti, tum):
+        source = open_source(bag, poses=poses)
+        found = [pose_of(m.message) for m in source.messages()
+                 if m.topic == source.ground_truth_topic]
+        source.close()
+        assert [stamp for stamp, _ in found] == sequence.stamps_ns.tolist()
+        assert np.allclose([p for _, p in found], sequence.poses, atol=1e-12)
+
+
+def test_poses_are_read_from_every_kind_of_message():
+    quaternion = message_type('geometry_msgs/msg/Quaternion')(x=0.0, y=0.0, z=1.0, w=0.0)
+    point = message_type('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)
+    vector = message_type('geometry_msgs/msg/Vector3')(x=1.0, y=2.0, z=3.0)
+    posed = message_type('geometry_msgs/msg/Pose')(position=point, orientation=quaternion)
+    twist = message_type('geometry_msgs/msg/Twist')(linear=vector, angular=vector)
+    with_covariance = message_type('geometry_msgs/msg/PoseWithCovariance')(posed, np.zeros(36))
+    moving = message_type('geometry_msgs/msg/TwistWithCovariance')(twist, np.zeros(36))
+    head = header(5 * SECOND + 7)
+    for message in (
+            message_type('geometry_msgs/msg/PoseStamped')(head, posed),
+            message_type('nav_msgs/msg/Odometry')(head, 'a', with_covariance, moving),
+            message_type('geometry_msgs/msg/TransformStamped')(
+                head, 'a', message_type('geometry_msgs/msg/Transform')(vector, quaternion))):
+        stamp, found = pose_of(message)
+        assert stamp == 5 * SECOND + 7
+        assert np.allclose(found, [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    posed.orientation.z = 0.0
+    assert np.isnan(pose_of(message_type('geometry_msgs/msg/PoseStamped')(head, posed))[1]).all()
+
+
+def test_a_speed_topic_gives_metres(tmp_path):
+    messages = []
+    vector = message_type('geometry_msgs/msg/Vector3')
+    for topic, message, stamp in drive():
+        if topic == INFO_TOPIC:
+            twist = message_type('geometry_msgs/msg/Twist')(
+                linear=vector(x=2.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+            messages.append(('/wheel', message_type('geometry_msgs/msg/TwistStamped')(
+                header=header(stamp), twist=twist), stamp))
+        messages.append((topic, message, stamp))
+    djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
+         '--scale', 'speed')
+    _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
+    assert np.allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 0.2)
+
+
+def test_topics_are_for_bags(folder):
+    with pytest.raises(DjetError, match='for bags'):
+        open_source(folder, image_topic='/camera')
+
+
+# Errors
+
+def test_ground_truth_is_exact_at_its_stamps_and_interpolated_between_near_ones():
+    truth = GroundTruth()
+    for i, x in enumerate((0.0, 1.0, 4.0)):
+        truth.add(i * 80_000_000, pose(x=x, yaw=0.1 * i))
+    truth.add(SECOND, pose(x=9))
+    truth.add(2 * SECOND, np.full((4, 4), np.nan))
+    found = truth.at(np.array([80_000_000, 120_000_000, 500_000_000, SECOND, 2 * SECOND, -1]))
+    assert np.array_equal(found[0], pose(x=1.0, yaw=0.1))
+    assert np.allclose(found[1], pose(x=2.5, yaw=0.15))
+    assert np.array_equal(found[3], pose(x=9))
+    assert np.isnan(found[[2, 4, 5]]).all()
+
+
+def test_errors_follow_the_stated_rules():
+    truth = [np.eye(4), pose(z=1.0), pose(z=1.02), pose(z=2), pose(z=3), np.full((4, 4), np.nan)]
+    wrong = pose(x=1.0)
+    wrong[:3, :3] = rotation_exp(np.array([0, 0, np.radians(3)]))
+    pairs = [Pair(i, i + 1, status, wrong) for i, status in enumerate(
+        (Status.OK, Status.OK, Status.NO_PARALLAX, Status.TOO_FEW_MATCHES, Status.OK))]
+    errors = pair_errors(pairs, np.array(truth[:-1]), np.array(truth[1:]))
+    assert np.allclose(errors.rotation_deg, [3, 3, 3, np.nan, np.nan], equal_nan=True)
+    # The second pair went 2 cm; the third was called NO_PARALLAX but went a metre.
+    assert np.allclose(errors.translation_deg, [90, *[np.nan] * 4], equal_nan=True)
+    assert (errors.compared, errors.failures, errors.translation_failures) == (4, 1, 2)
+
+
+def test_statistics_leave_out_what_is_not_known():
+    assert statistics(np.array([np.nan])) is None
+    assert statistics(np.array([1.0, np.nan, 3.0])) == {
+        'mean': 2.0, 'median': 2.0, 'p95': pytest.approx(2.9), 'max': 3.0}
+
+
+def test_real_frames_are_replayed_within_a_degree(kitti, tmp_path):
+    source = kitti / 'sequences' / '06'
+    short = tmp_path / 'sequences' / '06'
+    (short / 'image_0').mkdir(parents=True)
+    for i in range(8):
+        os.symlink(source / 'image_0' / f'{i:06d}.png', short / 'image_0' / f'{i:06d}.png')
+    shutil.copy(source / 'calib.txt', short)
+    (short / 'times.txt').write_text(
+        '\n'.join((source / 'times.txt').read_text().splitlines()[:8]) + '\n')
+    truth = tmp_path / 'truth.txt'
+    truth.write_text('\n'.join((kitti / 'poses' / '06.txt').read_text().splitlines()[:8]) + '\n')
+    djet('replay', short, '--poses', truth, '--output', tmp_path / 'r')
+    said = summary(tmp_path / 'r')
+    assert said['status'] == {'FIRST_FRAME': 1, 'OK': 7}
+    assert said['rotation_error_deg']['max'] < 0.5
+    assert said['translation_error_deg']['max'] < 2
+
+
+def test_the_documented_call_is_understood():
+    parsed = djet('replay', '--help').stdout
+    for flag in ('--output', '--method', '--preset', '--overwrite', '--config', '--image-topic',
+                 '--info-topic', '--poses', '--scale'):
+        assert flag in parsed
