@@ -29,8 +29,8 @@ class EstimatorConfig:
         20, 'contrast in gray levels that makes a corner; lower it for dim images',
         minimum=1, maximum=255)
     search_radius: float = parameter(
-        0.15, 'how far a feature is sought from its place in the previous image, as a share of the '
-        'longer image side; 1 searches the whole image', minimum=0.01, maximum=1.0)
+        0.15, 'how far a feature is sought from its place in the previous image, as a share of '
+        'the longer image side; 1 searches the whole image', minimum=0.01, maximum=1.0)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)
     ransac_threshold: float = parameter(
@@ -79,9 +79,9 @@ class EstimatorConfig:
 # The paper does not say what becomes of surfaces without a minimum. Kept as they are, their loss
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
-    'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0, 'snap_reference': False,
-    'indefinite': 'keep', 'cull_outside': False, 'loss': 'none', 'step': 'share',
-    'step_share': 0.3, 'max_iterations': 20,
+    'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
+    'snap_reference': False, 'indefinite': 'drop', 'cull_outside': False, 'loss': 'none',
+    'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
 }
 
 

@@ -23,6 +23,7 @@ from djet_ros.core.features import match_features
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.data.bags import BagSource
 from djet_ros.data.datasets import open_sequence
 from djet_ros.data.sequence import FrameSequence
 from djet_ros.errors import DjetError
@@ -123,7 +124,7 @@ class _PlainChain:
 
     def __init__(self, sequence: FrameSequence) -> None:
         self._sequence = sequence
-        self._orb = cv2.ORB_create(preset('best').max_features)
+        self._orb = cv2.ORB.create(preset('best').max_features)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._last: tuple[Any, Any] | None = None
 
@@ -153,7 +154,7 @@ def kernel_speedup(view: View) -> float:
                        rng.integers(border, height - border, QUOTED_POINTS)], axis=1)
     offsets = np.mgrid[-radius:radius + 1, -radius:radius + 1].reshape(2, -1).T
     dense = (points[:, None] + offsets).reshape(-1, 2)
-    orb = cv2.ORB_create(nlevels=1, edgeThreshold=REACH + 1)
+    orb = cv2.ORB.create(nlevels=1, edgeThreshold=REACH + 1)
 
     def opencv() -> None:
         keypoints = [cv2.KeyPoint(float(x), float(y), 31.0, 0.0) for x, y in dense.tolist()]
@@ -180,7 +181,7 @@ def _estimator(**changes: Any) -> TwoViewEstimator:
 
 
 def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
-    """First two frames with very many matches, in random order, so that any first n are a fair n."""
+    """First two frames with very many matches, in random order: any first n are a fair n."""
     crowd = _estimator(max_features=4 * max(POINTS), fast_threshold=5)
     previous, current = (crowd.view(sequence.image(i), sequence.K) for i in (0, 1))
     radius = crowd.config.search_radius * max(previous.gray.shape)
@@ -211,7 +212,7 @@ def _fastest(action: Callable[[], None]) -> float:
 
 def _open(source: Path) -> FrameSequence:
     sequence = open_sequence(source)
-    if not hasattr(sequence, 'image'):
+    if isinstance(sequence, BagSource):
         raise DjetError(f'{source} is a bag; the bench reads image files, give a sequence folder')
     if len(sequence) < 2:
         raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
