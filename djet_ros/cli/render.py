@@ -39,7 +39,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Render, with a progress bar on stderr, and say what was written."""
     with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
-                  TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+                  TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(args.scene, total=None)
         folder = render_sequence(
             args.scene, args.out, args.frames, args.seed, args.size, overwrite=args.overwrite,

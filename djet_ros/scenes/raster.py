@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from djet_ros.core.types import Array
 from djet_ros.scenes.panel import PanelArrays
-from djet_ros.scenes.texture import Gray, Texture
+from djet_ros.scenes.texture import Gray, RipMap
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,6 +80,8 @@ def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
     seen &= (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3])
     seen &= nearest > 1 / reach
     index = np.flatnonzero(seen)
+    if len(index) > np.iinfo(np.int16).max:
+        raise ValueError(f'{len(index)} panels are in view; at most 32767 can be told apart')
     inverse = np.stack([np.cross(b, origin), np.cross(origin, a), normal], axis=1)[index]
     to_panel = inverse / volume[index, None, None] @ np.linalg.inv(K)
     nearest = np.minimum(nearest[index], _corner_maximum(to_panel[:, 2], boxes[index], raster))
@@ -165,8 +167,10 @@ def _cover(view: View, k: int, raster: Raster, box: tuple[slice, slice], closest
     texture = view.panels.textures[view.index[k]]
     if texture.opacity is not None and inside.any():
         rows, columns = np.nonzero(inside)
-        solid = _look_up(view, k, raster, rows + top, columns + left, opacity=True) > 127.5
-        inside[rows[~solid], columns[~solid]] = False
+        # An outline is sharp on any level.
+        open_ = _look_up(view, k, raster, rows + top, columns + left, texture.opacity,
+                         blend=False) <= 127.5
+        inside[rows[open_], columns[open_]] = False
     return biased, inside
 
 
@@ -176,23 +180,24 @@ def shade(view: View, ids: NDArray[np.int16], raster: Raster, background: float)
     flat = ids.ravel()
     order = np.argsort(flat, kind='stable')
     bounds = np.searchsorted(flat[order], np.arange(len(view.index) + 1))
-    for k, gain in enumerate(view.panels.gain[view.index]):
+    for k, panel in enumerate(view.index):
+        ripmap, gain = view.panels.textures[panel].brightness, float(view.panels.gain[panel])
         for start in range(bounds[k], bounds[k + 1], _CHUNK):
             samples = order[start:min(start + _CHUNK, bounds[k + 1])]
             rows, columns = np.divmod(samples, raster.shape[1])
-            radiance.ravel()[samples] = gain * _look_up(view, k, raster, rows, columns)
+            value = _look_up(view, k, raster, rows, columns, ripmap, blend=True)
+            radiance.ravel()[samples] = gain * value
     return radiance
 
 
 def _look_up(view: View, k: int, raster: Raster, rows: NDArray[np.intp],
-             columns: NDArray[np.intp], opacity: bool = False) -> Gray:
-    """Texture of panel k at samples (N,), filtered for the distance between samples."""
-    panel = view.index[k]
-    texture: Texture = view.panels.textures[panel]
-    ripmap = texture.brightness
-    if opacity and texture.opacity is not None:
-        ripmap = texture.opacity
-    to_texture = (view.panels.uv[panel] @ view.to_panel[k]).astype(np.float32)
+             columns: NDArray[np.intp], ripmap: RipMap, blend: bool) -> Gray:
+    """
+    Values (N,) of panel k at samples, filtered for the distance between samples.
+
+    blend: between the two nearest levels; without, it takes a quarter of the time.
+    """
+    to_texture = (view.panels.uv[view.index[k]] @ view.to_panel[k]).astype(np.float32)
     u, v = raster.position(columns), raster.position(rows)
     across, down, w = (row[0] * u + row[1] * v + row[2] for row in to_texture)
     z = 1 / w
@@ -201,8 +206,7 @@ def _look_up(view: View, k: int, raster: Raster, rows: NDArray[np.intp],
     height, width = ripmap.shape
     levels = [_level(row, to_texture[2], value, z, texels / raster.factor)
               for row, value, texels in zip(to_texture, (across, down), (width, height))]
-    if opacity:
-        # An outline needs no blending of levels, and takes a quarter of the time without.
+    if not blend:
         levels = [np.rint(level) for level in levels]
     return ripmap.sample(across, down, *levels)
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 ROAD_WIDTH = 14.4
 HALF_LANE = 5.0
-SIDEWALK = 6.9
 
 
 def road(rng: np.random.Generator) -> Texture:
