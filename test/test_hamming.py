@@ -118,6 +118,13 @@ def test_many_points_at_once_are_as_one_at_a_time():
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
 
 
+def test_no_points_have_no_descriptors():
+    smoothed, nowhere = smooth(pictures()['noise']), np.empty((0, 2), np.int64)
+    assert dense_descriptors(smoothed, nowhere).shape == (0, 32)
+    surfaces = hamming_surfaces(descriptor_bits(smoothed, nowhere), smoothed, nowhere, 2)
+    assert surfaces.shape == (5, 5, 0)
+
+
 @pytest.mark.parametrize('radius', [0, 3])
 def test_describable_means_that_every_test_in_the_window_reads_inside_the_image(radius):
     rows, columns = np.mgrid[-5:65, -5:75].reshape(2, -1)

@@ -93,7 +93,8 @@ def _gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
     side = 2 * reach + 1
     windows = np.lib.stride_tricks.sliding_window_view(smoothed, (side, side))
     patches = windows[centres[:, 1] - reach, centres[:, 0] - reach]
-    return np.ascontiguousarray(patches.reshape(len(centres), -1).T).reshape(side, side, -1)
+    points_last = np.ascontiguousarray(patches.reshape(len(centres), side * side).T)
+    return points_last.reshape(side, side, len(centres))
 
 
 def _count_differing_tests(bits: NDArray[np.bool_], patches: Image,
