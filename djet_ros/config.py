@@ -127,11 +127,11 @@ SECTIONS = ('estimator', 'odometry', 'ros')
 
 @dataclass(frozen=True)
 class FlatParameter:
-    """One parameter under its flat name, with its value, its type and its description."""
+    """One parameter under its flat name, with its value, its type (kind) and its description."""
 
     name: str
     value: Value
-    type: type
+    kind: type
     description: Description
 
 
@@ -190,11 +190,11 @@ def _lookup(name: str, known: Mapping[str, FlatParameter]) -> FlatParameter:
 def _typed(item: FlatParameter, value: Any) -> Value:
     """Check the type of a value, taking an int for a float and a YAML true for 'true'."""
     # YAML 1.1 takes 1e-4 for a text.
-    if item.type is float and type(value) in (int, float, str):
+    if item.kind is float and type(value) in (int, float, str):
         return _finite(item, value)
-    if item.type is str and type(value) is bool and str(value).lower() in item.description.choices:
+    if item.kind is str and type(value) is bool and str(value).lower() in item.description.choices:
         return str(value).lower()
-    if type(value) is not item.type:
+    if type(value) is not item.kind:
         raise _wrong_type(item, value)
     return cast(Value, value)
 
@@ -212,7 +212,7 @@ def _finite(item: FlatParameter, value: float | str) -> float:
 
 
 def _wrong_type(item: FlatParameter, value: Any) -> DjetError:
-    return DjetError(f'{item.name} is {_shown(value)}; it must be of type {item.type.__name__}')
+    return DjetError(f'{item.name} is {_shown(value)}; it must be of type {item.kind.__name__}')
 
 
 def _shown(value: Any) -> str:
@@ -343,7 +343,7 @@ def add_flags(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
         choices = item.description.choices
         parser.add_argument(
             '--' + name.rpartition('.')[2].replace('_', '-'), dest=name, default=None,
-            metavar='|'.join(choices) if choices else item.type.__name__.upper(),
+            metavar='|'.join(choices) if choices else item.kind.__name__.upper(),
             help=f'{item.description.text} (default: {item.value!r})'.replace('%', '%%'))
 
 
@@ -357,10 +357,10 @@ def flag_values(args: argparse.Namespace) -> dict[str, Any]:
 def parse_value(item: FlatParameter, text: str) -> Value:
     """Read a value of the parameter's type from a command line; DjetError where it isn't one."""
     try:
-        if item.type is bool:
+        if item.kind is bool:
             return {'true': True, 'false': False}[text.lower()]
-        if item.type is int:
+        if item.kind is int:
             return int(text)
     except (ValueError, KeyError):
         raise _wrong_type(item, text) from None
-    return _finite(item, text) if item.type is float else text
+    return _finite(item, text) if item.kind is float else text

@@ -27,9 +27,9 @@ def image(pixels, encoding='mono8', stamp_ns=0, padding=0, frame_id='camera', **
     return message_type('sensor_msgs/msg/Image')(**{**fields, **changes})
 
 
-def compressed(data, format='jpeg', stamp_ns=0):
+def compressed(data, kind='jpeg', stamp_ns=0):
     return message_type('sensor_msgs/msg/CompressedImage')(
-        header=header(stamp_ns), format=format, data=np.frombuffer(data, np.uint8))
+        header=header(stamp_ns), format=kind, data=np.frombuffer(data, np.uint8))
 
 
 def camera_info(K, size, stamp_ns=0, **changes):

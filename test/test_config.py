@@ -109,7 +109,8 @@ def test_a_wrong_value_is_refused_in_one_line_that_names_it(name, value, message
 @pytest.mark.parametrize('text', [
     'estimator: [1, 2]', '- 1', 'a: &a [*a]', 'x: {y: {z: 1}}', 'estimator: {window: {a: 1}}',
     '!!python/object/apply:os.system [true]', '{', '\x00', 'estimator: 2001-99-99',
-    '[' * 5000, 'n: ' + '9' * 5000, 'odometry: {max_gap: 0x' + 'f' * 5000 + '}', '/**: {ros__parameters: 7}', 'text',
+    '[' * 5000, 'n: ' + '9' * 5000, 'odometry: {max_gap: 0x' + 'f' * 5000 + '}',
+    '/**: {ros__parameters: 7}', 'text',
 ])
 def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text):
     path = written(tmp_path, text)

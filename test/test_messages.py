@@ -53,7 +53,7 @@ def a_result(seed=0, **changes):
 
 
 def matrix(pose):
-    """Pose message as a matrix (4, 4)."""
+    """Read a pose message, (4, 4)."""
     result = np.eye(4)
     q, p = pose.orientation, pose.position
     result[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()

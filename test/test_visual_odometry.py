@@ -208,7 +208,7 @@ def some_relative(rng):
 
 
 def error(pose_with_error, exact):
-    """ROS's perturbation: difference of positions, rotation vector in the fixed axes."""
+    """Perturbation as in ROS: difference of positions, rotation vector in the fixed axes."""
     return np.concatenate([
         pose_with_error[:3, 3] - exact[:3, 3],
         Rotation.from_matrix(pose_with_error[:3, :3] @ exact[:3, :3].T).as_rotvec()])

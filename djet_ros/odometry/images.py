@@ -35,9 +35,9 @@ class BadMessage(DjetError):
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Layout of one pixel, and what makes it gray: uint8 arrays (H, W, bytes) to (H, W)."""
+    """Bytes of one pixel, and what makes it gray: uint8 arrays (H, W, size) to (H, W)."""
 
-    bytes: int
+    size: int
     to_gray: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
     wide: bool = False
 
@@ -106,7 +106,7 @@ def _raw(message: Any) -> Gray:
     height, width, step = int(message.height), int(message.width), int(message.step)
     _check_size(width, height)
     depth = 2 if pixels.wide else 1
-    row = width * pixels.bytes * depth
+    row = width * pixels.size * depth
     data = _bytes(message.data)
     if step < row:
         raise BadMessage('short_step', f'image step is {step} bytes, a row of {width} pixels '
@@ -119,7 +119,7 @@ def _raw(message: Any) -> Gray:
         # The upper byte of each number.
         rows = rows[:, 0 if message.is_bigendian else 1::2]
     # Most cameras send no padding: then a gray image is the message's own memory.
-    return np.ascontiguousarray(pixels.to_gray(rows.reshape(height, width, pixels.bytes)))
+    return np.ascontiguousarray(pixels.to_gray(rows.reshape(height, width, pixels.size)))
 
 
 def _compressed(message: Any) -> Gray:

@@ -156,7 +156,7 @@ class Tracker:
 
     @property
     def state(self) -> State:
-        """What the odometry is doing."""
+        """Tell what the odometry is doing."""
         return State.PAUSED if self._paused else self._state
 
     def speed(self, message: Any) -> None:

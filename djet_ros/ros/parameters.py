@@ -85,10 +85,10 @@ def descriptor(item: FlatParameter) -> ParameterDescriptor:
         additional_constraints=f'one of: {", ".join(says.choices)}' if says.choices else '')
     if says.minimum is None or says.maximum is None:
         return result
-    if item.type is int:
+    if item.kind is int:
         result.integer_range = [IntegerRange(
             from_value=int(says.minimum), to_value=int(says.maximum), step=2 if says.odd else 1)]
-    elif item.type is float:
+    elif item.kind is float:
         result.floating_point_range = [FloatingPointRange(
             from_value=float(says.minimum), to_value=float(says.maximum))]
     return result

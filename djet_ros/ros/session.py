@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 
 from djet_ros.config import Config
 from djet_ros.odometry.diagnostics import LEVELS, State
-from djet_ros.odometry.queue import FrameQueue
+from djet_ros.odometry.frame_queue import FrameQueue
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -85,13 +85,14 @@ class Session:
         self._speeds: deque[Any] = deque(maxlen=_WAITING_SPEEDS)
         self._counted_drops = self._lost = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
-        self._last_image = self._last_diagnostics = -np.inf
+        self._started = self._last_image = self._last_diagnostics = -np.inf
         self._logged: dict[str, float] = {}
         self._stopping = False
         self._worker = Thread(target=self._work, name='odometry', daemon=True)
 
     def start(self) -> None:
         """Begin to work."""
+        self._started = self._last_image = monotonic()
         self._worker.start()
 
     def stop(self, timeout: float = 0.5) -> None:
@@ -193,9 +194,8 @@ class Session:
             self._lock.release()
 
     def _log_what_is_missing(self, silent: bool) -> None:
-        missing = [what for what, is_missing in (
-            ('image', silent), ('camera_info', self._newest_info is None)) if is_missing]
-        for what in missing:
+        without_info = self._newest_info is None and monotonic() - self._started > SILENCE
+        for what in ['image'] * silent + ['camera_info'] * without_info:
             topic = self._topics[what]
             count = self._wiring.count_publishers(topic)
             self._log_throttled(what, f'waiting for {what} on {topic}: ' + (

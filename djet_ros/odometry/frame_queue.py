@@ -31,7 +31,7 @@ class FrameQueue(Generic[Item]):
 
     @property
     def dropped(self) -> int:
-        """Number of items dropped so far to make room."""
+        """Count the items dropped so far to make room."""
         with self._changed:
             return self._dropped
 
