@@ -63,7 +63,9 @@ class DescriptorSurface:
                                     self._radius)
         fitted = fit_paraboloids(surfaces, centres[moved].astype(float), self._sigma)
         self._latest = replace(_put(self._latest, fitted, moved), usable=usable)
-        return self._latest
+        # A match that never had a surface stays where it is.
+        latest = self._latest.centres
+        return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
 
 class PhotometricSurface:

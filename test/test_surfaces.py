@@ -1,0 +1,218 @@
+"""The three residual surfaces: each against the paper's formula, summed point by point."""
+
+from __future__ import annotations
+
+import cv2
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.hamming import dense_descriptors, smooth
+from djet_ros.core.orb_pattern import REACH
+from djet_ros.core.paraboloid import indefinite, Paraboloids
+from djet_ros.core.surfaces import (
+    DescriptorSurface,
+    PhotometricSurface,
+    ReprojectionSurface,
+    with_minimum,
+)
+import numpy as np
+import pytest
+from two_view import K, textured
+
+SIZE = (160, 120)
+
+
+def view(gray):
+    return TwoViewEstimator().view(gray, K)
+
+
+def hills(shift=(0.0, 0.0), size=SIZE):
+    """Smooth image (H, W) uint8 of soft hills, moved by a sub-pixel shift (x, y)."""
+    rng = np.random.default_rng(31)
+    rows, columns = np.mgrid[:size[1], :size[0]].astype(float)
+    image = np.full((size[1], size[0]), 128.0)
+    for _ in range(12):
+        wave, phase = rng.normal(0, 0.16, 2), rng.uniform(0, 2 * np.pi)
+        image += 10 * np.sin(wave[0] * (columns - shift[0]) + wave[1] * (rows - shift[1]) + phase)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope='module')
+def pair():
+    rng = np.random.default_rng(32)
+    return view(textured(rng, SIZE)), view(textured(rng, SIZE))
+
+
+@pytest.mark.parametrize(('side', 'sigma'), [(3, 0.0), (5, 1.0), (7, 0.0), (7, 2.0)])
+def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_nearest_pixel(
+        pair, side, sigma):
+    previous, current = pair
+    x, y = np.array([[60.4, 50.0], [90.0, 70.6]]), np.array([[64.2, 48.7], [88.0, 66.4]])
+    surface = DescriptorSurface(previous, current, x,
+                                EstimatorConfig(window=side, window_sigma=sigma))
+    fitted = surface.around(y)
+    assert fitted.usable.all()
+    assert np.array_equal(fitted.centres, [[64, 49], [88, 66]])
+    radius = side // 2
+    for k, (x_k, y_k) in enumerate([((60, 50), (64, 49)), ((90, 71), (88, 66))]):
+        reference = dense_descriptors(previous.smoothed, np.array([x_k]))
+        rows, z, roots = [], [], []
+        for v2 in range(-radius, radius + 1):
+            for v1 in range(-radius, radius + 1):
+                there = dense_descriptors(current.smoothed, np.array([y_k]) + np.array([v1, v2]))
+                z.append(cv2.norm(reference, there, cv2.NORM_HAMMING))
+                rows.append([v1 * v1, v2 * v2, 2 * v1 * v2, 2 * v1, 2 * v2, 1])
+                roots.append(np.exp(-(v1 * v1 + v2 * v2) / (4 * sigma**2)) if sigma else 1.0)
+        D, root = np.array(rows, float), np.array(roots)
+        a11, a22, a12, b1, b2, c = np.linalg.lstsq(D * root[:, None], z * root, rcond=None)[0]
+        assert np.allclose(fitted.A[k], [[a11, a12], [a12, a22]], atol=1e-8)
+        assert np.allclose(fitted.b[k], [b1, b2], atol=1e-8)
+        assert fitted.c[k] == pytest.approx(c, abs=1e-8)
+
+
+@pytest.mark.parametrize('snap', [True, False])
+def test_the_reference_point_is_where_its_descriptor_was_taken_or_as_printed(pair, snap):
+    x = np.array([[60.4, 50.0], [90.0, 70.6]])
+    surface = DescriptorSurface(*pair, x, EstimatorConfig(snap_reference=snap))
+    assert np.array_equal(surface.x, [[60, 50], [90, 71]] if snap else x)
+
+
+def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
+    image = textured(np.random.default_rng(33), SIZE)
+    moved = np.roll(image, (1, -2), axis=(0, 1))  # one down, two to the left
+    grid = np.stack(np.meshgrid(np.arange(30, 130, 10), np.arange(30, 90, 10)), -1)
+    x = grid.reshape(-1, 2).astype(float)
+    shift = np.array([-2, 1])
+    surface = DescriptorSurface(view(image), view(moved), x, EstimatorConfig())
+    y = x + shift + (1, -1)  # started beside the right place, the window follows the minimum
+    for _ in range(3):
+        fitted, _ = with_minimum(surface.around(y), 'project')
+        y = np.clip(fitted.minima(), y - 1, y + 1)
+    assert np.median(np.linalg.norm(y - x - shift, axis=1)) < 0.25
+
+
+def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(pair):
+    rng = np.random.default_rng(34)
+    x = rng.uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
+    surface = DescriptorSurface(*pair, x, EstimatorConfig())
+    y = x.copy()
+    for _ in range(4):
+        y = y + rng.normal(0, 1.0, y.shape) * (rng.uniform(size=(30, 1)) < 0.5)
+        asked = surface.around(y)
+        fresh = DescriptorSurface(*pair, x, EstimatorConfig()).around(y)
+        for name in ('centres', 'A', 'b', 'c', 'usable'):
+            assert np.array_equal(getattr(asked, name), getattr(fresh, name)), name
+
+
+@pytest.mark.parametrize('side', [3, 7])
+def test_points_without_descriptors_at_the_border_have_no_surface(pair, side):
+    margin, (width, height) = REACH + side // 2, SIZE
+    x, y = np.full((8, 2), 60.0), np.full((8, 2), 60.0)
+    y[1], y[2] = (margin, margin), (margin - 1, 60)
+    y[3], y[4] = (width - 1 - margin, height - 1 - margin), (60, height - margin)
+    y[5] = (-1e4, 1e4)
+    x[6], x[7] = (REACH, height - 1 - REACH), (REACH - 1, 60)
+    surface = DescriptorSurface(*pair, x, EstimatorConfig(window=side))
+    fitted = surface.around(y)
+    assert fitted.usable.tolist() == [True, True, False, True, False, False, True, False]
+    assert np.array_equal(fitted.centres, y)
+
+
+def bilinear(image, x, y):
+    column, row = int(np.floor(x)), int(np.floor(y))
+    f, g = x - column, y - row
+    return ((1 - f) * (1 - g) * image[row, column] + f * (1 - g) * image[row, column + 1]
+            + (1 - f) * g * image[row + 1, column] + f * g * image[row + 1, column + 1])
+
+
+def gradient(image, x, y):
+    """Evaluate Scharr's derivatives per pixel, between pixels by interpolation."""
+    smooth_3, slope = np.array([3, 10, 3]) / 16, np.array([-1, 0, 1]) / 2
+    gx = cv2.filter2D(image, -1, np.outer(smooth_3, slope), borderType=cv2.BORDER_REFLECT_101)
+    gy = cv2.filter2D(image, -1, np.outer(slope, smooth_3), borderType=cv2.BORDER_REFLECT_101)
+    return np.array([bilinear(gx, x, y), bilinear(gy, x, y)])
+
+
+@pytest.mark.parametrize(('side', 'sigma'), [(5, 0.0), (7, 1.5)])
+def test_the_photometric_surface_is_the_papers_lucas_kanade_sums(pair, side, sigma):
+    """Of the intensities that ORB's tests see, too: the smoothed image."""
+    previous, current = pair
+    x = np.array([[60.0, 50.0], [90.3, 70.62], [33.141, 88.007]])
+    y = np.array([[64.0, 49.0], [88.47, 66.81], [41.99, 77.53]])
+    config = EstimatorConfig(method='pjet', window=side, window_sigma=sigma)
+    fitted = PhotometricSurface(previous, current, x, config).around(y)
+    assert fitted.usable.all() and np.array_equal(fitted.centres, y)
+    I_A, I_B = previous.smoothed.astype(float), current.smoothed.astype(float)
+    radius = side // 2
+    for k in range(3):
+        A, b, c = np.zeros((2, 2)), np.zeros(2), 0.0
+        for v2 in range(-radius, radius + 1):
+            for v1 in range(-radius, radius + 1):
+                W = np.exp(-(v1 * v1 + v2 * v2) / (2 * sigma**2)) if sigma else 1.0
+                difference = (bilinear(I_A, x[k, 0] + v1, x[k, 1] + v2)
+                              - bilinear(I_B, y[k, 0] + v1, y[k, 1] + v2))
+                slope = gradient(I_B, y[k, 0] + v1, y[k, 1] + v2)
+                A += W * np.outer(slope, slope)
+                b -= W * slope * difference
+                c += W * difference**2
+        assert np.allclose(fitted.A[k], A, rtol=1e-3)
+        assert np.allclose(fitted.b[k], b, rtol=1e-3, atol=1e-3 * np.abs(b).max())
+        assert fitted.c[k] == pytest.approx(c, rel=1e-3)
+
+
+@pytest.mark.parametrize('shift', [(0.3, -0.2), (-0.85, 0.6), (1.4, 1.1)])
+def test_the_minimum_of_the_photometric_surface_is_the_shift_of_a_smooth_image(shift):
+    x = np.random.default_rng(35).uniform(25, 90, (40, 2))
+    surface = PhotometricSurface(view(hills()), view(hills(shift)), x,
+                                 EstimatorConfig(method='pjet', window=15, window_sigma=0.0))
+    y = x
+    for _ in range(4):
+        y = surface.around(y).minima()
+    errors = np.linalg.norm(y - x - shift, axis=1)
+    assert np.median(errors) < 0.02
+    assert errors.max() < 0.15
+
+
+def test_the_photometric_surface_needs_its_windows_inside_both_images(pair):
+    width, height = SIZE
+    inside = [(5, 5), (width - 6, height - 6), (60, 60)]
+    outside = [(2, 60), (60, height - 3), (width + 9, 60), (-3, -3)]
+    config = EstimatorConfig(method='pjet', window=7)
+    places = np.array(inside + outside, float)
+    middle = np.full_like(places, 60.0)
+    expected = [True] * 3 + [False] * 4
+    assert PhotometricSurface(*pair, middle, config).around(places).usable.tolist() == expected
+    assert PhotometricSurface(*pair, places, config).around(middle).usable.tolist() == expected
+
+
+def test_the_reprojection_surface_is_the_squared_distance_to_the_observed_point():
+    rng = np.random.default_rng(36)
+    x, y, keypoints, places = rng.uniform(0, 500, (4, 25, 2))
+    surface = ReprojectionSurface(x, y)
+    for fitted in (surface.around(y), surface.around(keypoints)):
+        assert np.allclose(fitted.values(places), ((places - y)**2).sum(1))
+        assert np.allclose(fitted.minima(), y)
+        assert fitted.usable.all()
+    assert np.array_equal(surface.x, x)
+
+
+@pytest.mark.parametrize('policy', ['project', 'drop', 'keep'])
+def test_surfaces_without_a_minimum_are_counted_and_treated_by_policy(policy):
+    A = np.array([np.eye(2), -np.eye(2), np.diag([2.0, -1.0]), np.diag([3.0, 1.0]),
+                  np.diag([1.0, -1.0])])
+    usable = np.array([True, True, True, True, False])  # the last one is out already
+    before = Paraboloids(np.zeros((5, 2)), A, np.ones((5, 2)), np.arange(5.0), usable)
+    after, count = with_minimum(before, policy)
+    assert count == 2
+    assert np.array_equal(after.b, before.b) and np.array_equal(after.c, before.c)
+    if policy == 'project':
+        assert not indefinite(after).any()
+        assert np.allclose(after.A[[0, 3]], A[[0, 3]])
+    else:
+        assert np.array_equal(after.A, A)
+    dropped = [True, False, False, True, False] if policy == 'drop' else usable.tolist()
+    assert after.usable.tolist() == dropped
+
+
+def test_views_carry_the_smoothed_image_that_orb_tests():
+    gray = textured(np.random.default_rng(37), SIZE)
+    assert np.array_equal(view(gray).smoothed, smooth(gray))
