@@ -74,9 +74,9 @@ class PhotometricSurface:
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
         radius = config.window // 2
         steps = np.arange(-radius, radius + 1, dtype=np.float32)
-        self._offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         self._radius = radius
-        self._weights = _weight_window(self._offsets, config.window_sigma)
+        self._weights = _weight_window(offsets, config.window_sigma)
         self._image = current.smoothed.astype(np.float32)
         self._gradient = [
             np.asarray(cv2.Scharr(self._image, cv2.CV_32F, *order, scale=1 / 32), np.float32)
@@ -98,10 +98,20 @@ class PhotometricSurface:
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
     def _sample(self, image: NDArray[np.float32], points: Array) -> NDArray[np.float32]:
-        """Bilinear samples (N, P^2) of the window around each point."""
-        places = points[:, None, :].astype(np.float32) + self._offsets
-        return np.asarray(cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR,
-                                    borderMode=cv2.BORDER_REPLICATE))
+        """
+        Bilinear samples (N, P^2) of the window around each point; anything for points outside.
+
+        Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
+        """
+        places = np.where(self._inside(points, image.shape)[:, None], points, self._radius + 1)
+        corners = np.floor(places).astype(np.int64)
+        fx, fy = (places - corners).astype(np.float32).T[:, :, None, None]
+        side = 2 * self._radius + 2
+        windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
+        patches = windows[corners[:, 1] - self._radius, corners[:, 0] - self._radius]
+        rows = (1 - fy) * patches[:, :-1] + fy * patches[:, 1:]
+        samples = (1 - fx) * rows[:, :, :-1] + fx * rows[:, :, 1:]
+        return np.asarray(samples.reshape(len(points), self._weights.size))
 
     def _inside(self, points: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         margin = self._radius + 1
