@@ -7,6 +7,7 @@ from djet_ros.core.types import Status
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Tracker
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from ros_messages import camera_info, compressed, header, image, message_type, serialised
@@ -310,6 +311,36 @@ def test_faces_add_their_counts_and_values(drive):
     assert said['frames received'] == '4'
     assert said['frames dropped: queue_full'] == '3'
     assert said['latency (ms)'] == '7.0'
+
+
+SMALL = np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8)
+SENT = st.sampled_from(['good', 'black', 'short', 'unknown', 'size', 'info', 'zeros', 'reset'])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(SENT, st.integers(-10**9, 4 * 10**9)), max_size=12))
+def test_whatever_comes_in_whatever_order_every_image_is_accounted_for(events):
+    one, sent = tracker(info=False), 0
+    for what, stamp in events:
+        if what == 'reset':
+            one.reset()
+            sent = 0
+        elif what in ('info', 'zeros'):
+            calibration = K if what == 'info' else np.zeros((3, 3))
+            one.camera_info(camera_info(calibration, (64, 48), stamp))
+        else:
+            message = {
+                'good': lambda t: image(SMALL, stamp_ns=t),
+                'black': lambda t: image(np.zeros_like(SMALL), stamp_ns=t),
+                'short': lambda t: image(SMALL, stamp_ns=t, height=99),
+                'unknown': lambda t: image(SMALL, 'sepia', stamp_ns=t),
+                'size': lambda t: image(SMALL[:40], stamp_ns=t)}[what](stamp)
+            for _, out in one.image(message):
+                assert len(serialised(out)) > 0
+            sent += 1
+        assert accounted(one.counts) == one.counts.received == sent
+        assert one.counts.status.total() == one.counts.processed
+    assert len(serialised(one.diagnostics(0).message)) > 0
 
 
 # Parameters at run time

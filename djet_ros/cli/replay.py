@@ -88,9 +88,10 @@ class _Rate(ProgressColumn):
 
 def _with_progress(replay: Replay, images: int) -> Outcome:
     console = Console(stderr=True)
+    if not console.is_terminal:
+        return replay.run()
     with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), _Rate(),
-                  TimeRemainingColumn(), console=console,
-                  disable=not console.is_terminal) as bar:
+                  TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task('replay', total=images)
         return replay.run(lambda: bar.advance(task))
 

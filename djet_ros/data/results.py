@@ -105,14 +105,19 @@ class ResultsFolder:
             beside.write_text(json.dumps(summary, indent=2) + '\n')
             os.replace(beside, self.path / SUMMARY)
         except OSError as error:
+            beside.unlink(missing_ok=True)
             raise _blame(self.path, error) from error
 
     def close(self) -> None:
         """Complete the bag and close the files."""
-        self._table.close()
-        for trajectory in self._trajectories:
-            trajectory.close()
-        self._bag.close()
+        try:
+            self._table.close()
+            for trajectory in self._trajectories:
+                trajectory.close()
+        except OSError as error:
+            raise _blame(self.path, error) from error
+        finally:
+            self._bag.close()
 
     def __enter__(self) -> Self:
         """Give the folder itself."""
