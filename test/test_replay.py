@@ -428,14 +428,14 @@ def test_ground_truth_is_exact_at_its_stamps_and_interpolated_between_near_ones(
 
 
 def test_errors_follow_the_stated_rules():
-    truth = [np.eye(4), pose(z=1.0), pose(z=1.02), pose(z=2), pose(z=3), np.full((4, 4), np.nan)]
+    truth = [np.eye(4), pose(z=1.0), pose(z=1.005), pose(z=2), pose(z=3), np.full((4, 4), np.nan)]
     wrong = pose(x=1.0)
     wrong[:3, :3] = rotation_exp(np.array([0, 0, np.radians(3)]))
     pairs = [Pair(i, i + 1, status, wrong) for i, status in enumerate(
         (Status.OK, Status.OK, Status.NO_PARALLAX, Status.TOO_FEW_MATCHES, Status.OK))]
     errors = pair_errors(pairs, np.array(truth[:-1]), np.array(truth[1:]))
     assert np.allclose(errors.rotation_deg, [3, 3, 3, np.nan, np.nan], equal_nan=True)
-    # The second pair went 2 cm; the third was called NO_PARALLAX but went a metre.
+    # The second pair went 5 mm; the third was called NO_PARALLAX but went a metre.
     assert np.allclose(errors.translation_deg, [90, *[np.nan] * 4], equal_nan=True)
     assert (errors.compared, errors.failures, errors.translation_failures) == (4, 1, 2)
 

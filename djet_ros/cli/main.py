@@ -20,6 +20,8 @@ COMMANDS = {
     'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
     'replay': 'get the trajectory of a camera from a recording',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
+    'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
+    'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
 }
 

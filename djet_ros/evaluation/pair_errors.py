@@ -6,7 +6,7 @@ neighbours unless a bad frame lies between them. The rules:
 * rotation: angle of the rotation between truth and estimate (Rodrigues), for every pair whose
   motion was told (OK, NO_PARALLAX);
 * translation: angle between the true and the estimated direction, for every pair with status OK
-  whose true way is at least 5 cm: below that the direction of the truth is noise;
+  whose true way is at least 1 cm: below that the direction of the truth is noise;
 * a pair whose motion was not told has no error: it is counted as a failure, and so is, for
   translation, a pair called NO_PARALLAX although the camera went further than that.
 """
@@ -21,7 +21,7 @@ from djet_ros.core.types import Array, Status
 import numpy as np
 from numpy.typing import NDArray
 
-SHORTEST_WAY = 0.05
+SHORTEST_WAY = 0.01
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,21 @@ class PairErrors:
     translation_failures: int
 
 
+def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[float, float]:
+    """Errors of the rotation and of the direction of one motion (4, 4), in degrees, or NaN."""
+    rotation = translation = float('nan')
+    if status in (Status.OK, Status.NO_PARALLAX):
+        rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
+    if status is Status.OK and has_direction(true_motion):
+        translation = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
+    return rotation, translation
+
+
+def has_direction(true_motion: Array) -> bool:
+    """Tell whether a true motion (4, 4) goes far enough for its direction to mean something."""
+    return bool(np.linalg.norm(true_motion[:3, 3]) >= SHORTEST_WAY)
+
+
 def pair_errors(pairs: Sequence[Pair], previous_truth: Array, truth: Array) -> PairErrors:
     """Compare N pairs with the true poses (N, 4, 4) at their two ends, NaN where not known."""
     rotation, translation = np.full((2, len(pairs)), np.nan)
@@ -60,15 +75,9 @@ def pair_errors(pairs: Sequence[Pair], previous_truth: Array, truth: Array) -> P
             continue
         compared += 1
         true_motion = np.linalg.inv(start) @ end
-        far = bool(np.linalg.norm(true_motion[:3, 3]) >= SHORTEST_WAY)
-        if pair.status in (Status.OK, Status.NO_PARALLAX):
-            rotation[i] = np.degrees(rotation_angle(true_motion[:3, :3], pair.motion[:3, :3]))
-        else:
-            failures += 1
-        if pair.status is Status.OK and far:
-            translation[i] = np.degrees(direction_angle(true_motion[:3, 3], pair.motion[:3, 3]))
-        elif far:
-            translation_failures += 1
+        rotation[i], translation[i] = motion_errors(pair.status, pair.motion, true_motion)
+        failures += int(np.isnan(rotation[i]))
+        translation_failures += int(np.isnan(translation[i]) and has_direction(true_motion))
     return PairErrors(rotation, translation, compared, failures, translation_failures)
 
 

@@ -1,0 +1,49 @@
+"""``djet evaluate``: the paper's Table 1 on any sequences with ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from djet_ros.cli.pair_runs import (
+    add_run_arguments,
+    evaluated,
+    print_table,
+    shared_values,
+    split,
+)
+from djet_ros.evaluation.entrants import default_methods, entrants, TITLES
+from djet_ros.evaluation.evo import find_tool
+from djet_ros.evaluation.report import write_report
+from rich.console import Console
+
+DESCRIPTION = """\
+Estimate the relative pose of all neighbouring frames by several methods on the same matches,
+compare with the ground truth, and write tables, plots, trajectories and index.html. A run that
+was broken off is taken up where it ended.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser('evaluate', description=DESCRIPTION)
+    add_run_arguments(parser)
+    parser.add_argument('--methods', metavar='LIST',
+                        help=f'of {", ".join(TITLES)} (default: all that are installed)')
+    parser.add_argument('--evo', action='store_true',
+                        help="also evo's metrics of the trajectories, by its own commands")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, and print the tables."""
+    methods = default_methods() if args.methods is None else split(args.methods)
+    competing = entrants(methods, split(args.presets), shared_values(args))
+    if args.evo:
+        find_tool('evo_ape')
+    with evaluated(args, competing) as (sources, records):
+        tables = write_report(args.output, sources, competing, records, with_evo=args.evo)
+    console = Console()
+    for table in tables:
+        print_table(console, table)
+    console.print(f'page: {args.output / "index.html"}', soft_wrap=True)
+    return 0

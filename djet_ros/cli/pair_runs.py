@@ -1,0 +1,115 @@
+"""What ``djet evaluate`` and ``djet ablate`` share: arguments, workers, progress, tables."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from itertools import groupby
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+
+from djet_ros.config import add_flags, flag_values
+from djet_ros.core.config import PRESETS
+from djet_ros.evaluation.entrants import check_methods, Entrant
+from djet_ros.evaluation.pairs import PairRecord
+from djet_ros.evaluation.runner import dask_workers, local_workers, run
+from djet_ros.evaluation.sources import open_sources, Selection, Source
+from djet_ros.evaluation.store import RecordStore
+from djet_ros.evaluation.tables import Table as ReadableTable
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+# Parameters that every method shares, so that changing them keeps the comparison fair.
+SHARED_PARAMETERS = ('estimator.max_features', 'estimator.fast_threshold',
+                     'estimator.ransac_threshold')
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every command needs that spreads pairs over workers."""
+    parser.add_argument('sources', nargs='+', type=Path, metavar='SOURCE',
+                        help='a KITTI sequence or a folder of them, a bag with ground truth, or a '
+                        'folder of TUM RGB-D, EuRoC or VAROS')
+    parser.add_argument('--output', type=Path, required=True, metavar='DIR',
+                        help='folder of the results')
+    parser.add_argument('--presets', metavar='LIST', default=','.join(PRESETS),
+                        help='parameters to run with (default: %(default)s)')
+    parser.add_argument('--start', type=int, default=0, metavar='N',
+                        help='first frame (default: %(default)s)')
+    parser.add_argument('--end', type=int, metavar='N',
+                        help='frame after the last one (default: all)')
+    parser.add_argument('--stride', type=int, default=1, metavar='N',
+                        help='frames from one to the other of a pair (default: %(default)s)')
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)), metavar='N',
+                         help='processes on this machine (default: %(default)s)')
+    workers.add_argument('--scheduler', metavar='ADDRESS',
+                         help='Dask scheduler that spreads the work instead, such as '
+                         'tcp://host:8786')
+    parser.add_argument('--overwrite', action='store_true',
+                        help='begin anew where the folder has results of other settings')
+    add_flags(parser, SHARED_PARAMETERS)
+
+
+def split(text: str) -> list[str]:
+    """Give the words of a comma-separated list."""
+    return [word.strip() for word in text.split(',') if word.strip()]
+
+
+def shared_values(args: argparse.Namespace) -> dict[str, Any]:
+    """Give the estimator's parameters that stand on the command line, by their plain names."""
+    return {name.rpartition('.')[2]: value for name, value in flag_values(args).items()}
+
+
+@contextmanager
+def evaluated(args: argparse.Namespace, competing: Sequence[Entrant]
+              ) -> Iterator[tuple[list[Source], list[PairRecord]]]:
+    """Run all pairs with a progress bar; sources and records are good within the context."""
+    check_methods(sorted({entrant.method for entrant in competing}))
+    selection = Selection(args.start, args.end, args.stride)
+    # Frames of bags are kept beside the results, where workers on other machines see them too.
+    workspace = (args.output / f'.frames-{os.getpid()}').resolve()
+    try:
+        sources = open_sources(args.sources, selection, workspace)
+        args.output.mkdir(parents=True, exist_ok=True)
+        with RecordStore(args.output, sources, competing, overwrite=args.overwrite) as store:
+            with _workers(args) as executor, _progress() as progress:
+                records = run(executor, sources, competing, store, progress)
+        yield sources, records
+    finally:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+def print_table(console: Console, table: ReadableTable) -> None:
+    """Print a table section by section; figures that are not ours are dim."""
+    for section, lines in groupby(table.lines, lambda line: line.cells[:table.sections]):
+        printed = Table(title=', '.join(section), title_justify='left', box=SIMPLE_HEAD,
+                        padding=0)
+        for column, title in enumerate(table.header[table.sections:], table.sections):
+            printed.add_column(title, justify='right' if column >= table.numeric else 'left')
+        for line in lines:
+            cells = [Text(cell, 'bold' if column in line.bold else '')
+                     for column, cell in enumerate(line.cells)]
+            printed.add_row(*cells[table.sections:], style='dim' if line.foreign else '')
+        console.print(printed)
+    console.print(Text(table.caption, 'italic'))
+
+
+@contextmanager
+def _workers(args: argparse.Namespace) -> Iterator[Executor]:
+    with dask_workers(args.scheduler) if args.scheduler else local_workers(args.workers) as pool:
+        yield pool
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
+                  TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+        task = bar.add_task('pairs', total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,0 +1,58 @@
+"""Standard trajectory metrics by the tool evo, called as its users call it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+import zipfile
+
+from djet_ros.data.text import one_line
+from djet_ros.errors import DjetError
+
+
+@dataclass(frozen=True)
+class TrajectoryMetrics:
+    """
+    Root mean squares over a trajectory whose lengths are the truth's.
+
+    ape_m: positions after alignment; rpe_m, rpe_deg: from frame to frame.
+    """
+
+    ape_m: float
+    rpe_m: float
+    rpe_deg: float
+
+
+def trajectory_metrics(truth: Path, estimate: Path) -> TrajectoryMetrics:
+    """Compare two TUM files; DjetError where evo is missing or refuses them."""
+    return TrajectoryMetrics(
+        _rmse('evo_ape', truth, estimate, '--align'),
+        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'trans_part'),
+        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'angle_deg'))
+
+
+def find_tool(name: str) -> str:
+    """Path of a command of evo, beside this Python or on the search path; else DjetError."""
+    beside = Path(sys.executable).parent / name
+    found = str(beside) if beside.exists() else shutil.which(name)
+    if found is None:
+        raise DjetError(f"the command '{name}' is not installed: pip install 'djet_ros[peers]'")
+    return found
+
+
+def _rmse(tool: str, truth: Path, estimate: Path, *options: str) -> float:
+    with TemporaryDirectory(prefix='djet-') as folder:
+        results = Path(folder) / 'results.zip'
+        answer = subprocess.run(
+            [find_tool(tool), 'tum', truth, estimate, *options, '--save_results', results],
+            capture_output=True, text=True, check=False)
+        if answer.returncode or not results.exists():
+            raise DjetError(f'{tool} could not compare {estimate} with {truth}: '
+                            f'{one_line(answer.stderr or answer.stdout)}')
+        with zipfile.ZipFile(results) as archive:
+            return float(json.loads(archive.read('stats.json'))['rmse'])

@@ -1,0 +1,71 @@
+"""Relative pose by other libraries, as their manuals show it, on the matches that ours get."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances, unit
+from djet_ros.core.hamming import match_distances
+from djet_ros.core.types import Array, RelativePose, Status, View
+import numpy as np
+from numpy.typing import NDArray
+
+# R (3, 3), t (3,) and the inliers (N,) bool, or None where nothing was found.
+Found = tuple[Array, Array, NDArray[np.bool_]] | None
+
+
+def opencv_ransac(K: Array, x: Array, y: Array, threshold: float) -> Found:
+    """Find the pose by findEssentialMat with plain RANSAC, and recoverPose."""
+    return _opencv(cv2.RANSAC, K, x, y, threshold)
+
+
+def usac_magsac(K: Array, x: Array, y: Array, threshold: float) -> Found:
+    """Find the pose by findEssentialMat with MAGSAC++, and recoverPose."""
+    return _opencv(cv2.USAC_MAGSAC, K, x, y, threshold)
+
+
+def poselib(K: Array, x: Array, y: Array, threshold: float) -> Found:
+    """Find the pose by PoseLib's LO-RANSAC with its non-linear refinement, at its defaults."""
+    import poselib as library
+
+    # The image size is part of a camera there, but not of this estimate.
+    camera = {'model': 'PINHOLE', 'width': int(2 * K[0, 2]), 'height': int(2 * K[1, 2]),
+              'params': [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+    pose, info = library.estimate_relative_pose(
+        x, y, camera, camera, {'max_epipolar_error': threshold}, {})
+    return np.asarray(pose.R), np.asarray(pose.t), np.asarray(info['inliers'], dtype=bool)
+
+
+ESTIMATORS: dict[str, Callable[[Array, Array, Array, float], Found]] = {
+    'opencv_ransac': opencv_ransac, 'usac_magsac': usac_magsac, 'poselib': poselib}
+
+
+def estimate(name: str, previous: View, current: View, x: Array, y: Array, threshold: float,
+             min_matches: int) -> RelativePose:
+    """
+    Estimate the pose of matches x, y (N, 2) in pixels by the peer of that name.
+
+    Matches end on their epipolar line at the place nearest to y, as with re-projection error.
+    """
+    if len(x) < min_matches:
+        return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+    found = ESTIMATORS[name](current.K, x, y, threshold)
+    if found is None or not (np.isfinite(found[0]).all() and found[1].any()):
+        return RelativePose(Status.DEGENERATE, x=x, y=y)
+    R, t, inliers = found[0], unit(found[1]), found[2]
+    lines = epipolar_lines(fundamental(current.K, R, t), x)
+    residuals = line_distances(lines, y)
+    y_opt = y - residuals[:, None] * unit(lines[:, :2])
+    return RelativePose(
+        Status.OK, R, t, x=x, y=y, y_opt=y_opt, inliers=inliers, residuals=residuals,
+        hamming=match_distances(previous.smoothed, x, current.smoothed, y_opt))
+
+
+def _opencv(method: int, K: Array, x: Array, y: Array, threshold: float) -> Found:
+    E, mask = cv2.findEssentialMat(x, y, K, method=method, prob=0.999, threshold=threshold)
+    if E is None or E.shape != (3, 3):
+        return None
+    inliers = mask.ravel() > 0
+    _, R, t, _ = cv2.recoverPose(E, x, y, K, mask=mask.copy())
+    return np.asarray(R, np.float64), np.asarray(t, np.float64).ravel(), inliers

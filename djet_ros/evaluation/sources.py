@@ -1,0 +1,135 @@
+"""What an evaluation runs on: sequences with ground truth, of any layout that can be opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+import hashlib
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from djet_ros.data.bags import BagSource
+from djet_ros.data.datasets import open_sequence
+from djet_ros.data.sequence import FrameSequence
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.recordings import extract, ExtractedSequence, is_extracted
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Frames start, start + stride, … of a sequence, below end; each two in a row are a pair."""
+
+    start: int = 0
+    end: int | None = None
+    stride: int = 1
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    A sequence that takes part.
+
+    name: what tables call it, unique in a run; benchmark: what it is publicly known as; folder:
+    where every worker can open its frames; frames: indices of those that are used; content: a
+    digest of camera, truth and some pixels.
+    """
+
+    name: str
+    benchmark: str
+    folder: Path
+    frames: range
+    content: str
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of frames that follow one another."""
+        return len(self.frames) - 1
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that decides the results, as plain values."""
+        frames = [self.frames.start, self.frames.stop, self.frames.step]
+        return {'name': self.name, 'frames': frames, 'content': self.content}
+
+
+def open_sources(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Source]:
+    """
+    Open datasets, those in a folder of KITTI sequences one by one, and check that all can be used.
+
+    The frames of bags are written into the workspace, because pairs must be had in any order.
+    Raises DjetError on what is no dataset, has no ground truth, or has not enough frames.
+    """
+    sources: list[Source] = []
+    for path in chain.from_iterable(map(_sequences, paths)):
+        name = _unused(_name(path), {source.name for source in sources})
+        sources.append(_source(path, name, selection, workspace))
+    return sources
+
+
+@lru_cache(maxsize=2)
+def opened(folder: Path) -> FrameSequence:
+    """Open the frames of a source, once in each process as long as chunks follow one another."""
+    if is_extracted(folder):
+        return ExtractedSequence(folder)
+    sequence = open_sequence(folder)
+    assert not isinstance(sequence, BagSource)  # bags are extracted when sources are opened
+    return sequence
+
+
+def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Source:
+    folder = path.resolve()
+    sequence = open_sequence(folder)
+    if isinstance(sequence, BagSource):
+        with sequence:
+            folder = extract(sequence, workspace / name)
+    sequence = opened(folder)
+    frames = _selected(path, sequence, selection)
+    if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):
+        raise DjetError(f'{path} has no ground truth for two frames in a row; errors need it '
+                        '(KITTI: ../../poses/NN.txt, TUM: groundtruth.txt, bags: a pose topic '
+                        'with ground_truth in its name)')
+    return Source(name, sequence.name, folder, frames, _digest(sequence, frames))
+
+
+def _sequences(path: Path) -> Iterator[Path]:
+    """Sequences of a whole benchmark folder, or the path itself."""
+    inner = sorted(image_folder.parent for image_folder in path.glob('sequences/*/image_0'))
+    yield from inner or [path]
+
+
+def _name(path: Path) -> str:
+    resolved = path.resolve()
+    return resolved.stem if resolved.is_file() else resolved.name
+
+
+def _unused(name: str, used: set[str]) -> str:
+    candidates = [name, *(f'{name}-{number}' for number in range(2, len(used) + 2))]
+    return next(candidate for candidate in candidates if candidate not in used)
+
+
+def _selected(path: Path, sequence: FrameSequence, selection: Selection) -> range:
+    end = len(sequence) if selection.end is None else min(selection.end, len(sequence))
+    if selection.start < 0 or selection.stride < 1:
+        raise DjetError(f'start is {selection.start} and stride {selection.stride}; start must '
+                        'be 0 or more, stride 1 or more')
+    frames = range(selection.start, end, selection.stride)
+    if len(frames) < 2:
+        raise DjetError(f'{path} has {len(sequence)} frames, of which {len(frames)} are chosen '
+                        'by start, end and stride; two are needed')
+    return frames
+
+
+def _has_true_pair(poses: np.ndarray[Any, Any]) -> bool:
+    known = np.isfinite(poses).all(axis=(1, 2))
+    return bool((known[1:] & known[:-1]).any())
+
+
+def _digest(sequence: FrameSequence, frames: range) -> str:
+    """Tell one recording from another of the same name."""
+    digest = hashlib.sha256()
+    for values in (sequence.K, sequence.poses, sequence.stamps_ns, sequence.image(frames[0]),
+                   sequence.image(frames[-1])):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()[:16]
