@@ -1,4 +1,4 @@
-"""Other public layouts as FrameSequence: TUM RGB-D and EuRoC (ASL); and finding out which."""
+"""Other public layouts as FrameSequence: TUM RGB-D and EuRoC (ASL); and which one a path has."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from djet_ros.data.text import (
     whole_nanoseconds,
 )
 from djet_ros.data.trajectories import poses_from_quaternions, read_tum
+from djet_ros.data.varos import varos_camera, VarosSequence
 from djet_ros.errors import DjetError
 import numpy as np
 from numpy.typing import NDArray
@@ -102,17 +103,19 @@ def euroc(folder: Path) -> UndistortedSequence:
 
 
 def open_sequence(path: Path) -> FrameSequence | BagSource:
-    """Open a bag or a folder in the layout of KITTI, TUM RGB-D or EuRoC, whichever it is."""
+    """Open a bag or a folder of KITTI, TUM RGB-D, EuRoC or VAROS, whichever it is."""
     if path.is_file() or (path.is_dir() and is_bag(path)):
         return BagSource(path)
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
+    if varos_camera(path) is not None:
+        return VarosSequence(path)
     if (path / 'mav0').is_dir() or (path / 'cam0').is_dir():
         return euroc(path)
     like_kitti = any(any(path.glob(f'{depth}image_0')) for depth in ('', '*/', 'sequences/*/'))
     if path.is_dir() and not like_kitti:
         raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0), TUM RGB-D '
-                        '(rgb.txt) or EuRoC (mav0)')
+                        '(rgb.txt), EuRoC (mav0) or VAROS (vehicle0)')
     return KittiSequence(path)
 
 

@@ -78,13 +78,18 @@ def read_poses(path: Path) -> Array:
     rows = number_rows(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
+    check_rigid(poses, path)
+    return poses
+
+
+def check_rigid(poses: Array, path: Path) -> None:
+    """Raise DjetError that names the file and the first of poses (N, 4, 4) that is no motion."""
     R = poses[:, :3, :3]
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     wrong = np.flatnonzero((error > 1e-3) | (np.linalg.det(R) < 0))
     if wrong.size:
         raise DjetError(f'{path}: pose {wrong[0]} is no rigid motion (its rotation part is off '
-                        f'by {error[wrong[0]]:.2g}); is it a KITTI pose file?')
-    return poses
+                        f'by {error[wrong[0]]:.2g}); is it a file of poses?')
 
 
 def _image_paths(folder: Path) -> list[Path]:

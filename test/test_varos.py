@@ -1,0 +1,65 @@
+"""VAROS folders, in the layout that public programs read (the data set itself is not at hand)."""
+
+from pathlib import Path
+
+import cv2
+from djet_ros.data.datasets import open_sequence
+from djet_ros.data.kitti import STAMP_OFFSET_NS
+from djet_ros.data.varos import SIZE, VarosSequence
+from djet_ros.errors import DjetError
+import numpy as np
+import pytest
+
+STAMPS = [4999936, 104999936, 205000000]
+
+
+@pytest.fixture
+def varos(tmp_path: Path) -> Path:
+    """Write three frames of a camera that looks along the world's x axis and flies along it."""
+    folder = tmp_path / '2021-08-17_SEQ1'
+    camera = folder / 'vehicle0' / 'cam0'
+    (camera / 'A').mkdir(parents=True)
+    (camera / 'camM0_poses').mkdir()
+    for index in range(3):
+        image = np.full((SIZE[1], SIZE[0], 3), (0, 50 * index, 0), np.uint8)
+        cv2.imwrite(str(camera / 'A' / f'seq01_veh0_camM0_A-{index:08d}.png'), image)
+    (camera / 'camM0_timestamps.csv').write_text('# timestamp [ns],A,B,C,D\n' + ''.join(
+        f'{stamp},a.png,b.png,c.png,d.png\n' for stamp in STAMPS))
+    (camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv').write_text(
+        '# timestamp [ns],r11,r12,r13,s_x_vw,r21,r22,r23,s_y_vw,r31,r32,r33,s_z_vw\n' + ''.join(
+            f'{stamp},0,0,1,{0.5 * index},-1,0,0,2,0,-1,0,3\n'
+            for index, stamp in enumerate(STAMPS[:2])))
+    return folder
+
+
+@pytest.mark.parametrize('inner', ['.', 'vehicle0', 'vehicle0/cam0'])
+def test_a_varos_folder_is_known_by_what_it_holds(varos, inner):
+    sequence = open_sequence(varos / inner)
+    assert isinstance(sequence, VarosSequence)
+    assert len(sequence) == 3
+    assert sequence.size == SIZE
+    assert sequence.stamps_ns.tolist() == [stamp + STAMP_OFFSET_NS for stamp in STAMPS]
+    assert sequence.image(1).shape == SIZE[::-1]
+    assert 0 < sequence.image(1)[0, 0] < sequence.image(2)[0, 0]
+
+
+def test_truth_is_that_of_the_camera_and_unknown_where_no_pose_has_the_stamp(varos):
+    poses = open_sequence(varos).poses
+    assert np.allclose(poses[0], np.eye(4))
+    # Along the camera's own z axis.
+    assert np.allclose(poses[1, :3, 3], [0, 0, 0.5])
+    assert np.isnan(poses[2]).all()
+
+
+def test_a_missing_stamp_is_named(varos):
+    file = varos / 'vehicle0' / 'cam0' / 'camM0_timestamps.csv'
+    file.write_text(file.read_text().rpartition('205000000')[0])
+    with pytest.raises(DjetError, match='camM0_timestamps.csv has 2 rows for 3 images'):
+        open_sequence(varos)
+
+
+def test_images_of_another_camera_are_refused(varos):
+    for image in (varos / 'vehicle0' / 'cam0' / 'A').glob('*.png'):
+        cv2.imwrite(str(image), np.zeros((60, 80), np.uint8))
+    with pytest.raises(DjetError, match='80x60, the known camera of VAROS is for 1280x720'):
+        open_sequence(varos)
