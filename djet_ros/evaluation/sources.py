@@ -15,6 +15,7 @@ from djet_ros.data.datasets import open_sequence
 from djet_ros.data.sequence import FrameSequence
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.recordings import extract, ExtractedSequence, is_extracted
+from djet_ros.scenes.sequence import rendered_scene
 import numpy as np
 
 
@@ -32,9 +33,9 @@ class Source:
     """
     A sequence that takes part.
 
-    name: what tables call it, unique in a run; benchmark: what it is publicly known as; folder:
-    where every worker can open its frames; frames: indices of those that are used; content: a
-    digest of camera, truth and some pixels.
+    name: what tables call it, unique in a run; benchmark: what it is publicly known as, or
+    empty; folder: where every worker can open its frames; frames: indices of those that are used;
+    content: a digest of camera, truth and some pixels.
     """
 
     name: str
@@ -90,7 +91,9 @@ def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Sou
         raise DjetError(f'{path} has no ground truth for two frames in a row; errors need it '
                         '(KITTI: ../../poses/NN.txt, TUM: groundtruth.txt, bags: a pose topic '
                         'with ground_truth in its name)')
-    return Source(name, sequence.name, folder, frames, _digest(sequence, frames))
+    # Rendered sequences have KITTI's layout and numbers, but nothing was published about them.
+    benchmark = '' if rendered_scene(folder) else sequence.name
+    return Source(name, benchmark, folder, frames, _digest(sequence, frames))
 
 
 def _sequences(path: Path) -> Iterator[Path]:
@@ -101,7 +104,7 @@ def _sequences(path: Path) -> Iterator[Path]:
 
 def _name(path: Path) -> str:
     resolved = path.resolve()
-    return resolved.stem if resolved.is_file() else resolved.name
+    return rendered_scene(resolved) or (resolved.stem if resolved.is_file() else resolved.name)
 
 
 def _unused(name: str, used: set[str]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 from djet_ros.core.types import Array
+from djet_ros.data.text import read_text
 from djet_ros.data.trajectories import KittiWriter
 from djet_ros.errors import DjetError
 from djet_ros.scenes.catalogue import find, make_scene, suggested_frames
@@ -53,6 +54,15 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
         for index, pose in enumerate(poses):
             writer.write(round(index * FRAME_PERIOD * 1e9), pose)
     return folder
+
+
+def rendered_scene(folder: Path) -> str | None:
+    """Name of the scene that a folder of images was rendered from; None for any other folder."""
+    label = folder / _LABEL
+    if not label.is_file():
+        return None
+    words = read_text(label).partition(':')[0].split()
+    return words[-1] if words[:2] == ['djet', 'render'] else None
 
 
 def _clear(folder: Path, truth: Path, overwrite: bool) -> None:
