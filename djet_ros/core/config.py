@@ -55,7 +55,7 @@ class EstimatorConfig:
         'geman_mcclure', 'robust loss over matches',
         choices=('none', 'huber', 'cauchy', 'geman_mcclure'))
     loss_scale: float = parameter(
-        1.0, 'where the loss bends, in robust standard deviations of the residuals',
+        3.0, 'where the loss bends, in robust standard deviations of the residuals',
         minimum=0.1, maximum=100.0)
     step: str = parameter(
         'full', 'how far a keypoint moves towards its optimum per iteration: full, share (of the '

@@ -110,9 +110,11 @@ class TwoViewEstimator:
         rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
         ahead, behind = (int(in_front(R, t, rays_x, rays_y).sum())
                          for t in (track.pose.t, -track.pose.t))
-        t = track.pose.t if ahead >= behind else -track.pose.t
+        flipped = behind > ahead
+        t = -track.pose.t if flipped else track.pose.t
 
-        covariance_5, covariance_6 = pose_covariance(track.residuals, track.loss)
+        covariance_5, covariance_6 = pose_covariance(
+            track.residuals, track.loss, x[track.voting], t, flipped)
         status = Status.OK
         if inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all():
             status = Status.DEGENERATE

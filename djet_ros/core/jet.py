@@ -35,15 +35,18 @@ class JetProblem:
     rays_x, rays_y: (3, N) viewing rays of x and of the paraboloids' minima y*;
     spread: (3, N) the entries 11, 12, 22 of K^-1 A'^-1 K^-T, so that g^T A'^-1 g is taken in
     viewing-ray units. Residuals are in pixels for a surface of typical sharpness.
+    blur: (N,) added to that variance, so that matches around the epipole count for little.
     """
 
     rays_x: Array
     rays_y: Array
     spread: Array
+    blur: Array
 
     def subset(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice) -> JetProblem:
         """Give the same problem on some of the matches."""
-        return JetProblem(self.rays_x[:, chosen], self.rays_y[:, chosen], self.spread[:, chosen])
+        return JetProblem(self.rays_x[:, chosen], self.rays_y[:, chosen],
+                          self.spread[:, chosen], self.blur[chosen])
 
 
 @dataclass(frozen=True)
@@ -92,21 +95,34 @@ class Loss:
             return self.scale**2 * np.where(u <= 1, u, 2 * root - 1), 1 / root
         raise ValueError(f"loss is '{self.name}'; choose none, huber, cauchy or geman_mcclure")
 
+    def curvature(self, squared: Array) -> Array:
+        """Give the second derivative rho''(r) / 2, (N,): what a residual adds to the Hessian."""
+        u = squared / self.scale**2
+        if self.name == 'cauchy':
+            return (1 - u) / (1 + u)**2
+        if self.name == 'geman_mcclure':
+            return (1 - 3 * u) / (1 + u)**3
+        return np.where(u <= 1, 1.0, 0.0) if self.name == 'huber' else np.ones_like(squared)
 
-def jet_problem(K: Array, x: Array, paraboloids: Paraboloids) -> JetProblem:
+
+def jet_problem(K: Array, x: Array, paraboloids: Paraboloids,
+                epipole_blur: float = 0.0) -> JetProblem:
     """
     Pose the problem for matches x (N, 2) with their paraboloids around y.
 
     Paraboloids are divided by their typical (median) curvature, which leaves the optimum where
-    it is and gives residuals in pixels, so that losses compare across surfaces.
+    it is and gives residuals in pixels, so that losses compare across surfaces. epipole_blur:
+    distance from the epipole, in pixels, within which lines are not trusted; 0 is as printed.
     """
     S = inverse_2x2(paraboloids.A)
     widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
     S = S / max(float(np.median(widths)), 1e-12) if len(S) else S
     G = np.linalg.inv(K)[:2, :2]
     M = G @ S @ G.T
+    # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
+    blur = epipole_blur**2 * np.linalg.det(G) * (M[:, 0, 0] + M[:, 1, 1]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, paraboloids.minima()).T.copy(),
-                      np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]))
+                      np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]), blur)
 
 
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
@@ -118,7 +134,7 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     e = y1 * l1 + y2 * l2 + y3 * l3
     Ml1, Ml2 = s11 * l1 + s12 * l2, s12 * l1 + s22 * l2
     variance = l1 * Ml1 + l2 * Ml2  # g^T A'^-1 g
-    size = np.maximum(np.abs(variance), 1e-24)
+    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
     root, pull = np.sqrt(size), e * np.sign(variance) / size
     # dr = w^T dl, with dl = t x (omega x m) for the rotation and dt x m for the translation.
     w = np.array([y1 - pull * Ml1, y2 - pull * Ml2, y3]) / root

@@ -26,6 +26,14 @@ from numpy.typing import NDArray
 # Residuals of perfect data must not shrink the loss to nothing, in pixels.
 _LEAST_SCALE = 0.02
 
+# Next to the epipole the direction of a line is noise: within about so many pixels a match that
+# fits by chance would hold the epipole where it is, and make it look far surer than it is.
+_EPIPOLE_BLUR = 5.0
+
+# Basins are told apart under a loss that bends already at this many standard deviations: a second
+# motion in the scene fits many matches loosely, the camera's own fits most of them closely.
+_TIGHT = 1.0
+
 # Steps after which the costs of several starts tell their basins apart.
 _STEPS_TO_COMPARE = 7
 
@@ -81,7 +89,7 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         if voting.sum() < config.min_matches:
             return None
         # Step 2: global pose optimisation.
-        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting))
+        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting), _EPIPOLE_BLUR)
         solution, loss = _cheapest(problem, poses, config)
         pose = Pose(solution.R, solution.t)
         # Keypoints go towards their optimum on the epipolar line of the new pose.
@@ -108,12 +116,11 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 
 def _cheapest(problem: JetProblem, starts: list[Pose],
               config: EstimatorConfig) -> tuple[Solution, Loss]:
-    """Refine every start under one loss, whose scale the best start's residuals give."""
+    """Refine every start, and the cheapest of them to the end."""
     scale = min(_scale(epipolar_residuals(problem, s.R, s.t)) for s in starts)
-    loss = Loss(config.loss, config.loss_scale * scale)
-    best = min((minimise(problem, s.R, s.t, loss, _STEPS_TO_COMPARE) for s in starts),
+    tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
+    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts),
                key=lambda solution: solution.cost)
-    # The scale came from an unrefined pose; take it again from the refined one.
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
 

@@ -73,8 +73,8 @@ class RelativePose:
 
     R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be told
     (status NO_PARALLAX and all failures). covariance_5: (5, 5) over (rotation vector in rad,
-    two tangent coordinates of t on the sphere); covariance_6: (6, 6) over (rotation vector, t),
-    of rank 5 because the length of t is fixed.
+    two coordinates of t in the basis ``sphere_tangents(t)``); covariance_6: (6, 6) over
+    (rotation vector, t), of rank 5 because the length of t is fixed.
 
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
     the place of y after its final step onto the epipolar line; inliers: (N,) bool;
