@@ -10,6 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from djet_ros.core.types import Array
 from djet_ros.data.bags import BagSource
 from djet_ros.data.datasets import open_sequence
 from djet_ros.data.sequence import FrameSequence
@@ -17,6 +18,7 @@ from djet_ros.errors import DjetError
 from djet_ros.evaluation.recordings import extract, ExtractedSequence, is_extracted
 from djet_ros.scenes.sequence import rendered_scene
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,26 @@ def opened(folder: Path) -> FrameSequence:
     return sequence
 
 
+def pair_of_frames(path: Path, index: int, workspace: Path
+                   ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
+    """Images (H, W) of frames index and index + 1 of any dataset, and their camera matrix."""
+    sequence = opened(_readable(path, workspace / 'frames'))
+    if not 0 <= index < len(sequence) - 1:
+        raise DjetError(f'pair {index} was asked for, {path} has pairs 0 to {len(sequence) - 2}')
+    return sequence.image(index), sequence.image(index + 1), sequence.K
+
+
+def _readable(path: Path, place: Path) -> Path:
+    """Folder in which frames can be had in any order: a bag's are written to a place for it."""
+    sequence = open_sequence(path)
+    if not isinstance(sequence, BagSource):
+        return path.resolve()
+    with sequence:
+        return extract(sequence, place)
+
+
 def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Source:
-    folder = path.resolve()
-    sequence = open_sequence(folder)
-    if isinstance(sequence, BagSource):
-        with sequence:
-            folder = extract(sequence, workspace / name)
+    folder = _readable(path, workspace / name)
     sequence = opened(folder)
     frames = _selected(path, sequence, selection)
     if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):
@@ -124,8 +140,8 @@ def _selected(path: Path, sequence: FrameSequence, selection: Selection) -> rang
     return frames
 
 
-def _has_true_pair(poses: np.ndarray[Any, Any]) -> bool:
-    known = np.isfinite(poses).all(axis=(1, 2))
+def _has_true_pair(poses: Array) -> bool:
+    known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     return bool((known[1:] & known[:-1]).any())
 
 

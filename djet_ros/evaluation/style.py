@@ -16,7 +16,7 @@ COLOURS = {'djet': '#0072B2', 'rpe': '#D55E00', 'pjet': '#009E73', 'five_point':
 DASHES = {'djet': '-', 'rpe': '--', 'pjet': '-.', 'five_point': ':',
           'opencv_ransac': (0, (1, 1)), 'usac_magsac': (0, (5, 1)), 'poselib': (0, (3, 1, 1, 1))}
 
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     'font.size': 10, 'axes.titlesize': 11, 'axes.labelsize': 10, 'legend.fontsize': 9,
     'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
     'grid.color': '#dddddd', 'grid.linewidth': 0.6, 'lines.linewidth': 1.3,
@@ -28,7 +28,7 @@ _STYLE: dict[Any, Any] = {
 def figure(path: Path, width: float, height: float) -> Iterator[Figure]:
     """Give an empty figure of some inches, saved as PNG at the end; the folder is made."""
     # A Figure of its own needs no window system and leaves pyplot's state alone.
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         empty = Figure(figsize=(width, height), layout='constrained')
         yield empty
         path.parent.mkdir(parents=True, exist_ok=True)

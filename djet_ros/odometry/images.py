@@ -126,7 +126,11 @@ def _compressed(message: Any) -> Gray:
     if 'compressedDepth' in message.format:
         raise BadMessage('unknown_encoding', f"image format '{message.format:.40}' holds depths, "
                          'not brightness')
-    data = _bytes(message.data)
+    return decoded(_bytes(message.data))
+
+
+def decoded(data: NDArray[np.uint8]) -> Gray:
+    """Gray image (H, W) uint8 of the bytes (N,) of a PNG or JPEG file. Raises BadMessage."""
     width, height = _declared_size(data.tobytes())
     _check_size(width, height)
     try:

@@ -1,0 +1,69 @@
+"""``djet similarity``: the paper's Figure 1, for one image or between two."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from djet_ros.config import add_flags, flag_values, from_flat
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.similarity import (
+    cross_similarity,
+    draw_similarity,
+    read_image,
+    self_similarity,
+)
+import numpy as np
+
+DESCRIPTION = """\
+Draw how alike the descriptors of keypoints are to those of all pixels around them: in the same
+image, or, with a second image, around their matches in that one. The first row shows the patches,
+the second the Hamming distances as heat maps, with the fitted paraboloids and their minima.
+"""
+
+_LARGEST_RADIUS = 100
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser('similarity', description=DESCRIPTION)
+    parser.add_argument('image', type=Path, metavar='IMAGE', help='PNG or JPEG')
+    parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2',
+                        help='second image of the same place (default: the first)')
+    parser.add_argument('--output', type=Path, default=Path('similarity.png'), metavar='FILE',
+                        help='PNG to write (default: %(default)s)')
+    parser.add_argument('--points', nargs='+', metavar='X,Y',
+                        help='pixels in the first image (default: the strongest keypoints)')
+    parser.add_argument('--count', type=int, default=6, metavar='N',
+                        help='how many keypoints without --points (default: %(default)s)')
+    parser.add_argument('--radius', type=int, default=20, metavar='PIXELS',
+                        help='of the heat maps (default: %(default)s)')
+    add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_features',
+                       'estimator.fast_threshold'))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw the figure, and say where it is."""
+    gray = read_image(args.image)
+    other = gray if args.other is None else read_image(args.other)
+    points = None if args.points is None else np.array([_point(text) for text in args.points])
+    config = from_flat(flag_values(args)).estimator
+    if not config.window // 2 <= args.radius <= _LARGEST_RADIUS or args.count < 1:
+        raise DjetError(f'--radius is {args.radius} and --count {args.count}; the radius must lie '
+                        f'between {config.window // 2} and {_LARGEST_RADIUS}, the count above 0')
+    if args.other is None:
+        similarity = self_similarity(gray, points, args.count, args.radius, config)
+    else:
+        similarity = cross_similarity(gray, other, points, args.count, args.radius, config)
+    draw_similarity(args.output, gray, other, similarity)
+    print(f'figure: {args.output}')
+    return 0
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(word) for word in text.split(','))
+    except ValueError:
+        raise DjetError(f"point '{text}' is not of the form X,Y in pixels") from None
+    return x, y

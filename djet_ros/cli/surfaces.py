@@ -1,0 +1,84 @@
+"""``djet surfaces``: one correspondence through the rounds of Algorithm 1."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from djet_ros.config import add_flags, flag_values, from_flat
+from djet_ros.core.config import PRESETS
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.similarity import read_image
+from djet_ros.evaluation.sources import pair_of_frames
+from djet_ros.evaluation.surface_steps import animate_course, draw_course, follow, telling_match
+import numpy as np
+from numpy.typing import NDArray
+
+DESCRIPTION = """\
+Show one match on its Hamming surface, round by round of D-JET: the sampled window, the fitted
+paraboloid and its minimum, the epipolar line of the pose, and the optimum on it.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser('surfaces', description=DESCRIPTION)
+    parser.add_argument('source', type=Path, metavar='SOURCE',
+                        help='a sequence or a bag, or the first of two images')
+    parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2', help='the second image')
+    parser.add_argument('--output', type=Path, default=Path('surfaces.png'), metavar='FILE',
+                        help='PNG, or GIF for an animation (default: %(default)s)')
+    parser.add_argument('--camera', metavar='FX,FY,CX,CY',
+                        help='camera of two images, in pixels')
+    parser.add_argument('--pair', type=int, default=0, metavar='I',
+                        help='frames I and I + 1 of a sequence (default: %(default)s)')
+    parser.add_argument('--match', type=int, metavar='K',
+                        help='number of the match (default: one that agrees and moves far)')
+    parser.add_argument('--preset', choices=PRESETS, default='paper',
+                        help='parameters; paper moves in small steps (default: %(default)s)')
+    add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_iterations',
+                       'estimator.step', 'estimator.step_share'))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw the figure, and say where it is."""
+    draw = {'.png': draw_course, '.gif': animate_course}.get(args.output.suffix.lower())
+    if draw is None:
+        raise DjetError(f"--output is '{args.output}'; its name must end in .png or .gif")
+    config = from_flat(flag_values(args)).estimator
+    first, second, K = _images(args)
+    estimator = TwoViewEstimator(config)
+    previous, current = estimator.view(first, K), estimator.view(second, K)
+    x, y = estimator.match(previous, current)
+    if len(x) < config.min_matches:
+        raise DjetError(f'the two images have {len(x)} matches, {config.min_matches} are needed')
+    course = follow(previous, current, x, y, config)
+    match = telling_match(course, config.window) if args.match is None else args.match
+    draw(args.output, course, match, config.window)
+    print(f'match {match} of {len(course.y)}, {len(course.rounds)} rounds')
+    print(f'figure: {args.output}')
+    return 0
+
+
+def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
+    """Two images (H, W) and their camera matrix (3, 3)."""
+    if args.other is None:
+        with TemporaryDirectory(prefix='djet-') as workspace:
+            return pair_of_frames(args.source, args.pair, Path(workspace))
+    if args.camera is None:
+        raise DjetError('two images need --camera FX,FY,CX,CY')
+    return read_image(args.source), read_image(args.other), _camera(args.camera)
+
+
+def _camera(text: str) -> Array:
+    try:
+        fx, fy, cx, cy = (float(word) for word in text.split(','))
+    except ValueError:
+        raise DjetError(f"--camera is '{text}'; give FX,FY,CX,CY in pixels") from None
+    if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
+        raise DjetError(f"--camera is '{text}'; focal lengths must be positive numbers")
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
