@@ -22,6 +22,8 @@ COMMANDS = {
     'bench': 'measure the speed, as ratios against OpenCV from one run',
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
+    'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",
+    'surfaces': 'draw one match on its Hamming surface, round by round',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
 }
 
