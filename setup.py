@@ -41,6 +41,10 @@ setup(
         'cluster': [
             'distributed>=2024.5,<2027',
         ],
+        # `djet live`, `djet play`, `djet echo`
+        'dds': [
+            'cyclonedds>=11.0.1,<12',
+        ],
         # what `djet evaluate` compares with
         'peers': [
             'evo>=1.38,<2',
@@ -48,6 +52,7 @@ setup(
         ],
         'test': [
             'colcon-common-extensions>=0.3,<0.4',
+            'cyclonedds>=11.0.1,<12',
             'hypothesis>=6.98,<7',
             'pytest>=7.4,<10',
             'pytest-xdist>=3.4,<4',

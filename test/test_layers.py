@@ -17,7 +17,7 @@ PACKAGE = Path(djet_ros.__file__).parent
 MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
 ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
-FLOORS = {'cli': 3, 'ros': 3, 'core': 1, '__init__': 1}
+FLOORS = {'cli': 3, 'dds': 3, 'ros': 3, 'core': 1, '__init__': 1}
 ALL_OTHERS = 2
 
 CORE_LIBRARIES = {'cv2', 'djet_ros', 'numpy', 'scipy'}

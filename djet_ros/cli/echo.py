@@ -1,0 +1,137 @@
+"""``djet echo``: what a live odometry says, in a terminal."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from threading import Event
+from typing import Any
+
+from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
+from djet_ros.config import NODE_NAME
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+DESCRIPTION = f"""\
+Show the integrated poses of a live odometry (djet live, or vo_node under ROS), a line each; with
+--diagnostics its state, rate, latency and path length, as a view that changes or, where the
+output is no terminal, as lines.
+{ENVIRONMENT}"""
+
+# Of the diagnostics, what is worth a glance.
+_SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames received',
+          'frames processed', 'frames dropped', 'frames rejected', 'frames lost on the way',
+          'matches', 'inliers', 'median residual (px)')
+
+_COLOURS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        'echo', help='what a live odometry says, in the terminal', description=DESCRIPTION)
+    parser.add_argument('--diagnostics', action='store_true',
+                        help='state, rate, latency and path length instead of poses')
+    parser.add_argument('--node', default=NODE_NAME, metavar='NAME',
+                        help='name of the node (default: %(default)s)')
+    add_remappings(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show what comes until SIGINT or SIGTERM."""
+    stop = stop_by_signal()
+
+    from djet_ros.dds.graph import Graph
+    from djet_ros.dds.names import Names
+    graph, names = Graph(), Names(args.node, args.remap)
+    view = View(names.full_node.strip('/'))
+    graph.listen(names.resolve('~/odometry'), 'nav_msgs/msg/Odometry',
+                 view.odometry if args.diagnostics else lambda message: print(
+                     pose_line(message), flush=True))
+    if args.diagnostics:
+        graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
+                     view.diagnostics)
+        _show(view, graph, stop)
+    while not stop.is_set():
+        graph.spin(0.1)
+    return 0
+
+
+@dataclass
+class View:
+    """What is known of the odometry, from its messages so far."""
+
+    node: str
+    path_length: float = 0.0
+    poses: int = 0
+    summary: str = 'nothing heard yet'
+    level: int = 3
+    values: dict[str, str] = field(default_factory=dict)
+    news: bool = False
+    _last: Any = None
+
+    def odometry(self, message: Any) -> None:
+        """Add a step to the path; a pose back at the origin begins a new one."""
+        at = message.pose.pose.position
+        position = np.array([at.x, at.y, at.z])
+        self.poses += 1
+        if self._last is None or not position.any():
+            self.path_length = 0.0
+        else:
+            self.path_length += float(np.linalg.norm(position - self._last))
+        self._last = position
+
+    def diagnostics(self, message: Any) -> None:
+        """Take the status of the node, if it is its."""
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            if 'frames processed' in values:
+                self.summary, self.values, self.news = status.message, values, True
+                self.level = int(status.level)
+
+    @property
+    def length(self) -> str:
+        """Length of the path, in metres where they are known."""
+        unit = 'm' if self.values.get('scale') == 'known' else 'steps of unit length'
+        return f'{self.path_length:.1f} {unit}'
+
+    def table(self) -> Table:
+        """Show it all."""
+        table = Table(title=self.node, show_header=False, min_width=48)
+        table.add_row('state', f'[{_COLOURS.get(self.level, "red")}]{self.summary}')
+        table.add_row('path', self.length)
+        for name in _SHOWN:
+            table.add_row(name, self.values.get(name, '–'))
+        return table
+
+    def line(self) -> str:
+        """Say it all in a line."""
+        shown = '; '.join(f'{name}: {self.values[name]}' for name in _SHOWN if name in self.values)
+        return f'{self.summary}; path: {self.length}; {shown}'
+
+
+def pose_line(message: Any) -> str:
+    """Stamp, position and orientation as in a TUM file."""
+    stamp, pose = message.header.stamp, message.pose.pose
+    at, turn = pose.position, pose.orientation
+    return (f'{stamp.sec}.{stamp.nanosec:09d} {at.x:.6f} {at.y:.6f} {at.z:.6f} '
+            f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}')
+
+
+def _show(view: View, graph: Any, stop: Event) -> None:
+    """Keep a terminal up to date, or print a line for each diagnostics message."""
+    console = Console()
+    if console.is_terminal:
+        with Live(view.table(), console=console, auto_refresh=False) as live:
+            while not stop.is_set():
+                graph.spin(0.2)
+                live.update(view.table(), refresh=True)
+        return
+    while not stop.is_set():
+        graph.spin(0.2)
+        if view.news:
+            view.news = False
+            print(view.line(), flush=True)

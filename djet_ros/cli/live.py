@@ -1,0 +1,61 @@
+"""``djet live``: the odometry on a ROS 2 graph, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
+from djet_ros.config import Config, flat, load_yaml, NODE_NAME, parse_value, with_values
+from djet_ros.errors import DjetError
+
+DESCRIPTION = f"""\
+Do on a ROS 2 graph, where no ROS is installed, what 'ros2 run djet_ros vo_node' does where it is:
+the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/odometry, ~/path,
+~/debug_image, /diagnostics, /tf), services (~/reset, ~/pause, ~/resume) and parameters.
+{ENVIRONMENT}"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        'live', help='the odometry on a ROS 2 graph, without ROS', description=DESCRIPTION)
+    parser.add_argument('--params', type=Path, metavar='FILE',
+                        help='parameters as YAML, in the layout of ROS or plain')
+    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
+                        help='a parameter, such as ros.queue_policy:=every, or '
+                        'use_sim_time:=true; on top of the file; may be repeated')
+    add_remappings(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Work until SIGINT or SIGTERM."""
+    stop = stop_by_signal()
+    config, use_sim_time = _configuration(args)
+
+    from djet_ros.dds.graph import Graph
+    from djet_ros.dds.live_node import LiveNode
+    from djet_ros.dds.names import Names
+    names = Names(NODE_NAME, args.remap)
+    return LiveNode(Graph(), config, names, use_sim_time).run(stop)
+
+
+def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:
+    """Read file and command line; the boolean is use_sim_time."""
+    config = load_yaml(args.params) if args.params else Config()
+    known = flat(config)
+    values: dict[str, Any] = {}
+    use_sim_time = False
+    for given in args.param:
+        name, mark, text = given.partition(':=')
+        if not mark:
+            raise DjetError(f"'{given}' is no parameter; write it as name:=value")
+        if name == 'use_sim_time':
+            if text not in ('true', 'false'):
+                raise DjetError(f"use_sim_time is '{text}'; it must be true or false")
+            use_sim_time = text == 'true'
+        else:
+            values[name] = parse_value(known[name], text) if name in known else text
+    return with_values(config, values), use_sim_time

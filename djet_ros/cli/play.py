@@ -1,0 +1,63 @@
+"""``djet play``: a recording onto a ROS 2 graph, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+import sys
+from typing import Any
+
+from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
+from djet_ros.data.sources import open_source
+from djet_ros.errors import DjetError
+
+DESCRIPTION = f"""\
+Publish the images of a recording, their CameraInfo and the ground truth, at the pace of the
+recording. It begins when somebody subscribes to the images. All is offered reliably: for a
+subscriber that asks for it, the player rather waits than loses an image; CameraInfo is latched.
+{ENVIRONMENT}"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        'play', help='a recording onto a ROS 2 graph, without ROS', description=DESCRIPTION)
+    parser.add_argument('source', type=Path, metavar='BAG',
+                        help='rosbag2, ROS 1 bag, or folder in KITTI, TUM RGB-D or EuRoC layout')
+    parser.add_argument('--rate', type=float, default=1.0, metavar='R',
+                        help='times the recorded pace (default: %(default)s)')
+    parser.add_argument('--loop', action='store_true', help='begin again at the end')
+    parser.add_argument('--clock', action='store_true',
+                        help='publish the time of recording on /clock')
+    for what in ('image', 'info'):
+        parser.add_argument(f'--{what}-topic', metavar='TOPIC',
+                            help='needed where the bag has several')
+    add_remappings(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play until the end, SIGINT or SIGTERM, and say how many images that was."""
+    if not (args.rate > 0 and math.isfinite(args.rate)):
+        raise DjetError(f'--rate is {args.rate}; it must be a positive number')
+    stop = stop_by_signal()
+
+    from djet_ros.dds.graph import Graph
+    from djet_ros.dds.names import Names
+    from djet_ros.dds.player import Player
+    names = Names('player', args.remap)
+    source = open_source(args.source, args.image_topic, args.info_topic)
+    try:
+        player = Player(Graph(), source, names, args.rate, args.clock)
+        print(f'waiting for a subscriber to {player.image_topic}', file=sys.stderr, flush=True)
+        player.wait_for_listener(stop)
+        while not stop.is_set():
+            player.play(stop)
+            if not args.loop:
+                break
+    finally:
+        source.close()
+    late = f', the last {player.played.late:.1f} s late' if player.played.late > 0.1 else ''
+    print(f'{player.played.images} images sent on {player.image_topic}{late}')
+    return 0

@@ -1,0 +1,269 @@
+"""Publishers and subscriptions of ROS topics on DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import os
+from typing import Any
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import DDSException, ReadCondition, WaitSet
+from cyclonedds.core import InstanceState, SampleState, ViewState
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+from djet_ros.data.decoding import jazzy
+from djet_ros.dds.wire import dds_type_name, decode, encode, sample_type
+from djet_ros.errors import DjetError
+
+# A write holds Python's interpreter lock; whoever has to wait longer asks again.
+_MAX_BLOCKING = duration(milliseconds=20)
+
+# Samples that who keeps all may hold, at either end, before the publisher has to wait.
+_KEEP_ALL_ROOM = 32
+
+_ANY = ViewState.Any | InstanceState.Any | SampleState.NotRead
+
+# As ROS does, and datagrams as large as loopback takes them: an image is then 8 and not 300.
+_LOCALHOST = """\
+<CycloneDDS><Domain>
+  <General>
+    <AllowMulticast>false</AllowMulticast>
+    <MaxMessageSize>65500B</MaxMessageSize><FragmentSize>60000B</FragmentSize>
+  </General>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+    <Peers><Peer address="localhost"/>{peers}</Peers>
+  </Discovery>
+</Domain></CycloneDDS>,"""
+
+_SUBNET = """\
+<CycloneDDS><Domain><Discovery>
+  <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+  <Peers>{peers}</Peers>
+</Discovery></Domain></CycloneDDS>,"""
+
+_OFF = """\
+<CycloneDDS><Domain>
+  <General><AllowMulticast>false</AllowMulticast></General>
+  <Discovery>
+    <ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{pid}</Tag>
+  </Discovery>
+</Domain></CycloneDDS>,"""
+
+_RANGES = {'LOCALHOST': _LOCALHOST, 'SUBNET': _SUBNET, 'OFF': _OFF, 'SYSTEM_DEFAULT': ''}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Quality of service; depth None keeps all, which makes a reliable publisher wait."""
+
+    reliable: bool = True
+    depth: int | None = 10
+    latched: bool = False
+
+    def __str__(self) -> str:
+        """Say it in ROS's words."""
+        return (f'{"reliable" if self.reliable else "best_effort"}, '
+                f'{"transient_local" if self.latched else "volatile"}')
+
+    def qos(self, user_data: str = '') -> Qos:
+        """Say it in DDS's words; user_data is what ROS tells its peers in addition."""
+        return Qos(
+            Policy.Reliability.Reliable(_MAX_BLOCKING) if self.reliable
+            else Policy.Reliability.BestEffort,
+            Policy.History.KeepAll if self.depth is None else Policy.History.KeepLast(self.depth),
+            Policy.Durability.TransientLocal if self.latched else Policy.Durability.Volatile,
+            Policy.ResourceLimits(max_samples=-1 if self.depth else _KEEP_ALL_ROOM),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(user_data.encode()))
+
+    def incompatible_with(self, offered: Profile) -> bool:
+        """Tell whether a subscription of this profile refuses a publisher."""
+        return self.reliable > offered.reliable or self.latched > offered.latched
+
+
+class Publisher:
+    """Publishes messages of one type on one topic; may be used from any thread."""
+
+    def __init__(self, writer: DataWriter, sample: Any) -> None:
+        self._writer = writer
+        self._sample = sample
+
+    def publish(self, message: Any) -> bool:
+        """Send a message; False where the subscriptions left no room for it for a moment."""
+        return self.send(encode(message))
+
+    def send(self, data: bytes) -> bool:
+        """Send a message in CDR; see ``publish``."""
+        try:
+            self._writer.write(self._sample(data))
+        except DDSException as error:
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
+                raise
+            return False
+        return True
+
+    @property
+    def listeners(self) -> int:
+        """Count the subscriptions."""
+        return len(self._writer.get_matched_subscriptions())
+
+    def listens(self, user_data: str) -> bool:
+        """Tell whether a subscription says this of itself."""
+        return any(user_data in _user_data(self._writer.get_matched_subscription_data(handle))
+                   for handle in self._writer.get_matched_subscriptions())
+
+    def wait_until_taken(self, seconds: float) -> bool:
+        """Wait until all reliable subscriptions have everything."""
+        return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+
+
+class Subscription:
+    """Hands messages of one topic to a callback; the callbacks are called by Graph.spin."""
+
+    def __init__(self, reader: DataReader, topic: str, profile: Profile, batch: int,
+                 callback: Callable[[Any, Any], None]) -> None:
+        self.topic = topic
+        self.profile = profile
+        self._reader = reader
+        self._batch = batch
+        self._callback = callback
+        self._refused = 0
+        self.condition = ReadCondition(reader, _ANY)
+
+    def dispatch(self) -> None:
+        """Hand out what has come, up to the size of a batch."""
+        for sample in self._reader.take(self._batch, self.condition):
+            if sample.sample_info.valid_data:
+                self._callback(sample.data, sample.sample_info)
+
+    def new_losses(self) -> int:
+        """Count the messages that were lost on the way since the last call."""
+        return int(self._reader.get_sample_lost_status().total_count_change)
+
+    def new_refusals(self) -> int:
+        """Count the publishers that turned up since the last call and do not fit."""
+        return int(self._reader.get_requested_incompatible_qos_status().total_count_change)
+
+    def user_data_of(self, info: Any) -> str:
+        """Give what the publisher of a sample says of itself."""
+        return _user_data(self._reader.get_matched_publication_data(info.publication_handle))
+
+
+class Graph:
+    """
+    A participant in the ROS graph, with the domain and range that the environment asks for.
+
+    Reads ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and CYCLONEDDS_URI, as
+    ROS does with Cyclone DDS. Raises DjetError where one of them can't be used.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        domain = _domain_id(environment)
+        try:
+            self._domain = Domain(domain, _configuration(environment))
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise DjetError(f'no DDS participant in domain {domain}: {error.msg}; check '
+                            'CYCLONEDDS_URI and the network interfaces') from None
+        self._subscriptions: list[Subscription] = []
+        self._waiting = WaitSet(self._participant)
+        self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+
+    def advertise(self, topic: str, ros_type: str, profile: Profile = Profile()) -> Publisher:
+        """Publish on a topic from now on."""
+        return self.advertise_raw(f'rt{topic}', dds_type_name(ros_type), profile,
+                                  _type_hash(ros_type))
+
+    def advertise_raw(self, dds_topic: str, dds_type: str, profile: Profile,
+                      user_data: str) -> Publisher:
+        """Publish on a topic under its DDS names."""
+        sample = sample_type(dds_type)
+        writer = DataWriter(self._participant, Topic(self._participant, dds_topic, sample),
+                            profile.qos(user_data))
+        return Publisher(writer, sample)
+
+    def listen(self, topic: str, ros_type: str, callback: Callable[[Any], None],
+               profile: Profile = Profile(), *, batch: int = 100,
+               garbage: Callable[[str], None] = lambda reason: None) -> Subscription:
+        """
+        Hand the messages on a topic to a callback.
+
+        batch: how many at most before it is the turn of other topics; garbage: is told of each
+        sample that is no such message, and why.
+        """
+        def take(data: bytes, _: Any) -> None:
+            try:
+                message = decode(data, ros_type)
+            except DjetError as error:
+                garbage(f'a message on {topic} could not be read: {error}')
+                return
+            callback(message)
+
+        subscription = self.listen_raw(f'rt{topic}', dds_type_name(ros_type), take, profile,
+                                       _type_hash(ros_type), batch)
+        subscription.topic = topic
+        return subscription
+
+    def listen_raw(self, dds_topic: str, dds_type: str, callback: Callable[[Any, Any], None],
+                   profile: Profile, user_data: str, batch: int = 100) -> Subscription:
+        """Hand CDR and sample information on a topic, under its DDS names, to a callback."""
+        reader = DataReader(self._participant,
+                            Topic(self._participant, dds_topic, sample_type(dds_type)),
+                            profile.qos(user_data))
+        subscription = Subscription(reader, dds_topic, profile, batch, callback)
+        self._waiting.attach(subscription.condition)
+        self._subscriptions.append(subscription)
+        return subscription
+
+    def spin(self, seconds: float) -> None:
+        """Wait for messages, at most for some time, and hand them out in order of listening."""
+        self._waiting.wait(duration(seconds=seconds))
+        for subscription in list(self._subscriptions):
+            subscription.dispatch()
+
+    def offers(self, topic: str) -> list[tuple[str, Profile]]:
+        """Give who publishes a topic, as an identifier, and with which quality of service."""
+        return [(str(one.participant_key), _profile(one.qos))
+                for one in self._publications.read(1000)
+                if one.topic_name == f'rt{topic}' and
+                one.sample_info.instance_state == InstanceState.Alive]
+
+
+def _domain_id(environment: Mapping[str, str]) -> int:
+    text = environment.get('ROS_DOMAIN_ID') or '0'
+    if not text.isdecimal() or int(text) > 232:
+        raise DjetError(f"ROS_DOMAIN_ID is '{text}'; it must be a number from 0 to 232")
+    return int(text)
+
+
+def _configuration(environment: Mapping[str, str]) -> str:
+    name = environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
+    if name not in _RANGES:
+        raise DjetError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{name}'; choose from "
+                        f'{", ".join(_RANGES)}')
+    peers = ''.join(f'<Peer address="{peer}"/>'
+                    for peer in environment.get('ROS_STATIC_PEERS', '').split(';') if peer)
+    # What the user says comes last and counts.
+    return (_RANGES[name].format(peers=peers, pid=os.getpid())
+            + environment.get('CYCLONEDDS_URI', ''))
+
+
+def _type_hash(ros_type: str) -> str:
+    return f'typehash={jazzy().hash_rihs01(ros_type)};'
+
+
+def _profile(qos: Qos) -> Profile:
+    return Profile(reliable=isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable),
+                   latched=qos[Policy.Durability] != Policy.Durability.Volatile)
+
+
+def _user_data(endpoint: Any) -> str:
+    if endpoint is None or Policy.Userdata not in endpoint.qos:
+        return ''
+    return bytes(endpoint.qos[Policy.Userdata].data).decode(errors='replace')

@@ -1,0 +1,52 @@
+"""Names of topics and services, resolved and remapped as ROS does for a node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import re
+
+from djet_ros.errors import DjetError
+
+_NAME = re.compile(r'~?[A-Za-z_/][A-Za-z0-9_/]*')
+
+
+class Names:
+    """
+    Resolves the names that one node uses.
+
+    rules: remappings 'from:=to', of which the first that fits counts; __node and __ns name the
+    node and its namespace. Raises DjetError on what is no such rule.
+    """
+
+    def __init__(self, node: str, rules: Sequence[str] = ()) -> None:
+        pairs = [_parse(rule) for rule in rules]
+        special = dict(pairs)
+        self.node = special.get('__node', node)
+        self.namespace = '/' + special.get('__ns', '').strip('/')
+        self._rules = [(self.expand(old), self.expand(new)) for old, new in pairs
+                       if not old.startswith('__')]
+
+    @property
+    def full_node(self) -> str:
+        """Name of the node with its namespace."""
+        return f'{self.namespace.rstrip("/")}/{self.node}'
+
+    def expand(self, name: str) -> str:
+        """Give the full name, without remapping."""
+        if name.startswith('/'):
+            return name
+        if name.startswith('~'):
+            return self.full_node + name[1:]
+        return f'{self.namespace.rstrip("/")}/{name}'
+
+    def resolve(self, name: str) -> str:
+        """Give the full name, remapped."""
+        full = self.expand(name)
+        return next((new for old, new in self._rules if old == full), full)
+
+
+def _parse(rule: str) -> tuple[str, str]:
+    old, mark, new = rule.partition(':=')
+    if not (mark and _NAME.fullmatch(old) and _NAME.fullmatch(new)):
+        raise DjetError(f"'{rule}' is no remapping; write it as image:=/camera/image_raw")
+    return old, new

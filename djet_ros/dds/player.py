@@ -1,0 +1,101 @@
+"""Plays a recording onto the graph, as fast as it was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from threading import Event
+from time import monotonic
+
+from djet_ros.data.bags import BagMessage
+from djet_ros.data.decoding import message_type
+from djet_ros.data.sources import Source
+from djet_ros.dds.graph import Graph, Profile, Publisher
+from djet_ros.dds.names import Names
+
+# All that is sent waits for reliable subscriptions; best-effort ones take what they get.
+_STREAM = Profile(depth=None)
+# A CameraInfo is also for who comes late.
+_LATCHED = Profile(depth=1, latched=True)
+
+# Seconds between a subscription's appearance here and this publisher's appearance there.
+_SETTLE = 0.5
+
+
+@dataclass
+class Played:
+    """What was sent; late: seconds by which the last message was behind its time."""
+
+    images: int = 0
+    messages: int = 0
+    late: float = 0.0
+
+
+class Player:
+    """Publishes the messages of a source, at rate times their recorded pace."""
+
+    def __init__(self, graph: Graph, source: Source, names: Names, rate: float = 1.0,
+                 clock: bool = False) -> None:
+        """Advertise the images at once; other topics once they have a message."""
+        self._graph = graph
+        self._source = source
+        self._names = names
+        self._rate = rate
+        self._publishers: dict[str, Publisher] = {}
+        self._clock = graph.advertise('/clock', 'rosgraph_msgs/msg/Clock') if clock else None
+        self.played = Played()
+        self._advertise()
+
+    def _advertise(self) -> None:
+        """Advertise all topics before the first message, so that none is lost."""
+        source = self._source
+        missing = {source.image_topic, source.info_topic, source.ground_truth_topic} - {None}
+        for one in source.messages():
+            if one.topic in missing:
+                missing.discard(one.topic)
+                self._publishers[one.topic] = self._graph.advertise(
+                    self._names.resolve(one.topic), one.message.__msgtype__,
+                    _LATCHED if one.topic == source.info_topic else _STREAM)
+            if not missing:
+                return
+
+    @property
+    def image_topic(self) -> str:
+        """Resolved name of the topic of the images."""
+        return self._names.resolve(self._source.image_topic)
+
+    def wait_for_listener(self, stop: Event) -> None:
+        """Wait until somebody subscribes to the images."""
+        images = self._publishers[self._source.image_topic]
+        while not images.listeners:
+            if stop.wait(0.05):
+                return
+        stop.wait(_SETTLE)
+
+    def play(self, stop: Event) -> None:
+        """Play once, and wait until reliable subscriptions have everything."""
+        start: float | None = None
+        first = 0
+        for one in self._source.messages():
+            if one.topic not in self._publishers:
+                continue
+            if start is None:
+                start, first = monotonic(), one.stamp_ns
+            due = start + (one.stamp_ns - first) / 1e9 / self._rate
+            if stop.wait(max(0.0, due - monotonic())):
+                return
+            self._send(one, stop)
+            self.played.late = monotonic() - due
+        for publisher in self._publishers.values():
+            while not (stop.is_set() or publisher.wait_until_taken(0.2)):
+                pass
+
+    def _send(self, one: BagMessage, stop: Event) -> None:
+        if self._clock is not None:
+            seconds, rest = divmod(one.stamp_ns, 10**9)
+            time = message_type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest)
+            self._clock.publish(message_type('rosgraph_msgs/msg/Clock')(clock=time))
+        while not self._publishers[one.topic].publish(one.message):
+            if stop.wait(0.005):
+                return
+        self.played.messages += 1
+        self.played.images += one.topic == self._source.image_topic
