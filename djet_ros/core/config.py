@@ -68,8 +68,9 @@ class EstimatorConfig:
         1e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
         minimum=1e-12, maximum=1.0)
     min_parallax: float = parameter(
-        0.25, 'median parallax below which the direction of translation is not told '
-        '(NO_PARALLAX), in pixels', minimum=0.0, maximum=100.0)
+        0.5, 'parallax that three quarters of the matches stay below when the direction of '
+        'translation is not to be told (NO_PARALLAX), in pixels; noise raises it by itself',
+        minimum=0.0, maximum=100.0)
 
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""

@@ -10,7 +10,14 @@ from time import perf_counter
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.features import detect_orb, match_features
-from djet_ros.core.geometry import epipolar_lines, fundamental, in_front, line_distances, rays
+from djet_ros.core.geometry import (
+    epipolar_lines,
+    fit_rotation,
+    fundamental,
+    in_front,
+    line_distances,
+    rays,
+)
 from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.starts import five_point, Pose, several
 from djet_ros.core.surfaces import (
@@ -23,6 +30,9 @@ from djet_ros.core.tracking import hold, Track, track_jointly
 from djet_ros.core.types import Array, Features, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
+
+# Parallax has to exceed the noise of the matches by this factor to be believed.
+_OUT_OF_NOISE = 3.0
 
 
 class TwoViewEstimator:
@@ -117,9 +127,13 @@ class TwoViewEstimator:
             track.residuals, track.loss, x[track.voting], t, flipped)
         status = Status.OK
         if inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all():
-            status = Status.DEGENERATE
-        elif _parallax(K, R, x, track.minima, inliers) < self.config.min_parallax:
-            status, t = Status.NO_PARALLAX, np.zeros(3)
+            status, t = Status.DEGENERATE, np.zeros(3)
+        else:
+            # Where a rotation alone explains the matches, any direction of t would do.
+            R_alone = fit_rotation(rays_x, rays_y)
+            parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
+            if parallax < max(self.config.min_parallax, _OUT_OF_NOISE * track.scale()):
+                status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
         return RelativePose(
             status, R, t, covariance_5, covariance_6, x=x, y=y, y_opt=track.y_opt,
@@ -134,10 +148,10 @@ def _pose(prior: RelativePose | None) -> Pose | None:
     return Pose(prior.R, prior.t) if prior is not None and prior.t.any() else None
 
 
-def _parallax(K: Array, R: Array, x: Array, y: Array, chosen: NDArray[np.bool_]) -> float:
-    """Median distance in pixels of y from where rotation alone would bring x."""
-    rotated = rays(K, x[chosen]) @ (K @ R).T
-    return float(np.median(np.linalg.norm(y[chosen] - rotated[:, :2] / rotated[:, 2:], axis=1)))
+def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
+    """Upper quartile of the distances in pixels of y from where rotation alone would bring x."""
+    rotated = rays_x @ (K @ R).T
+    return float(np.quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75))
 
 
 @contextmanager

@@ -76,6 +76,22 @@ def line_distances(lines: Array, y: Array) -> Array:
     return np.asarray((homogeneous(y) * lines).sum(1) / np.maximum(norm, 1e-12))
 
 
+def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
+    """
+    Rotation R (3, 3) that alone brings rays x (N, 3) to rays y (N, 3), robustly.
+
+    Least squares over directions (Wahba's problem), reweighted by a Cauchy loss at the median
+    deviation, so that what moves or is near in part of the image does not turn it.
+    """
+    x, y = unit(rays_x), unit(rays_y)
+    weights = np.ones(len(x))
+    for _ in range(rounds):
+        rotation, _ = Rotation.align_vectors(y, x, weights)
+        deviation = np.linalg.norm(y - rotation.apply(x), axis=1)
+        weights = 1 / (1 + (deviation / max(float(np.median(deviation)), 1e-9))**2)
+    return np.asarray(rotation.as_matrix())
+
+
 def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:
     """
     Tell, (N,) bool, which points have positive depth in both cameras (chirality).

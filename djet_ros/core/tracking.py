@@ -61,9 +61,13 @@ class Track:
     indefinite: int
     iterations: int
 
+    def scale(self) -> float:
+        """Give the robust standard deviation of the residuals, in pixels of a typical surface."""
+        return _scale(self.residuals)
+
     def inliers(self) -> NDArray[np.bool_]:
         """Tell, (N,) bool, which matches voted and agree with the pose."""
-        agree = np.abs(self.residuals.r) < _INLIER * _scale(self.residuals)
+        agree = np.abs(self.residuals.r) < _INLIER * self.scale()
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers
