@@ -61,13 +61,14 @@ class VoNode(Node):
                                 {'image': image, 'camera_info': info})
         self._outputs: dict[str, Publisher] = {}
         self._speed_inputs: list[Subscription] = []
+        self._info_topic = info
+        self._latched_input: Subscription | None = None
         self._connect(config)
 
         # Those that nothing fits to, by topic: reported once they are known by name.
         self._mismatched: dict[str, Subscription] = {}
         # CameraInfo first: of two that wait, it is to be taken before its image.
         self._listen(CameraInfo, info, self._session.camera_info, _qos(config))
-        self._listen_for_latched(info)
         self._listen(CompressedImage if config.ros.image_transport == 'compressed' else Image,
                      image, self._session.image, _qos(config), self._session.count_lost)
         for name, action in (('reset', self._session.reset), ('pause', self._session.pause),
@@ -151,14 +152,18 @@ class VoNode(Node):
             qos_overriding_options=QoSOverridingOptions(QOS_PARAMETERS))
         return subscription
 
-    def _listen_for_latched(self, info: str) -> None:
-        """Hear a CameraInfo that was sent before this node was there, if it was latched."""
-        # A second subscription, because asked of the first this would keep it from all publishers
-        # that do not latch. They do not fit this one, and that is no news.
-        self.create_subscription(
-            CameraInfo, info, self._session.camera_info, QoSProfile(
-                depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+    def _listen_for_latched(self) -> None:
+        """Hear a CameraInfo that was sent before this node was there, where it was latched."""
+        # To ask everybody for it would keep those away that do not latch.
+        if self._latched_input is None:
+            for publisher in self.get_publishers_info_by_topic(self._info_topic):
+                latched = publisher.qos_profile
+                if latched.durability is QoSDurabilityPolicy.TRANSIENT_LOCAL:
+                    self._latched_input = self.create_subscription(
+                        CameraInfo, self._info_topic, self._session.camera_info, QoSProfile(
+                            depth=1, durability=latched.durability,
+                            reliability=latched.reliability))
+                    return
 
     def _apply(self, config: Config) -> None:
         self._connect(config)
@@ -167,6 +172,7 @@ class VoNode(Node):
     def _tick(self) -> None:
         while self._mismatched:
             self._report_mismatch(*self._mismatched.popitem())
+        self._listen_for_latched()
         self._session.tick()
 
     def _report_mismatch(self, topic: str, subscription: Subscription) -> None:

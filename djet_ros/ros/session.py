@@ -85,7 +85,7 @@ class Session:
         self._speeds: deque[Any] = deque(maxlen=_WAITING_SPEEDS)
         self._counted_drops = self._lost = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
-        self._started = self._last_image = self._last_diagnostics = -np.inf
+        self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
         self._logged: dict[str, float] = {}
         self._stopping = False
         self._worker = Thread(target=self._work, name='odometry', daemon=True)
@@ -136,12 +136,13 @@ class Session:
     def reset(self) -> None:
         """Forget all images, poses, speeds and counts, those that still wait included."""
         with self._between_images():
+            # An image that has left the queue may wait for the lock just now.
+            self._forgotten = monotonic()
             self._queue.clear()
             self._speeds.clear()
             self._latencies.clear()
             self._logged.clear()
             self._counted_drops, self._lost = self._queue.dropped, 0
-            self._tracker.face_values.clear()
             self._tracker.reset()
             self._say()
 
@@ -209,7 +210,8 @@ class Session:
                 with self._turnstile:
                     pass
                 with self._lock:
-                    self._process(received)
+                    if received.at > self._forgotten:
+                        self._process(received)
         finally:
             # Nobody may wait for room that no one will make.
             self._queue.close()
@@ -231,8 +233,10 @@ class Session:
         new = self._queue.dropped - self._counted_drops
         if new:
             self._counted_drops += new
+            counts = self._tracker.counts
             self._tracker.count_dropped('queue_full', new)
-            self._log_throttled('queue_full', f'{new} images dropped: they come faster than they '
+            self._log_throttled('queue_full', f'{counts.dropped["queue_full"]} of '
+                                f'{counts.received} images dropped: they come faster than they '
                                 'are worked on')
 
     def _take_info(self, info: Any) -> None:
@@ -258,6 +262,7 @@ class Session:
         self._wiring.publish(outgoing)
 
     def _say(self) -> None:
+        self._tracker.face_values = self._face_values()
         self._publish([self._tracker.diagnostics(time_ns())])
 
     def _log_trouble(self) -> None:

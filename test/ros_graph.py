@@ -1,0 +1,140 @@
+"""Processes on a ROS graph of their own: the node under test, and peers that talk with it."""
+
+from __future__ import annotations
+
+from base64 import b64decode, b64encode
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from threading import Condition, Thread
+from time import monotonic
+from typing import Any
+
+from ros_messages import serialised, STORE
+
+HERE = Path(__file__).parent
+NODE = '/vo_node'
+PATIENCE = 30.0
+
+# Not the graph of a robot that happens to be near.
+ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
+               'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'OMP_NUM_THREADS': '1',
+               'PYTHONPATH': os.pathsep.join(filter(None, [
+                   str(HERE.parent), os.environ.get('PYTHONPATH', '')]))}
+
+
+class Peer:
+    """A process that publishes, subscribes or calls; see ros_peer.py."""
+
+    def __init__(self, name: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, str(HERE / 'ros_peer.py'), name], env=ENVIRONMENT, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._changed = Condition()
+        self._answers: list[dict[str, Any]] = []
+        self._ended = False
+        self.heard: dict[str, list[Any]] = defaultdict(list)
+        self._types: dict[str, str] = {}
+        Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self._process.stdout or ():
+            said = json.loads(line)
+            with self._changed:
+                if 'topic' in said:
+                    kind = self._types[said['topic']]
+                    self.heard[said['topic']].append(
+                        STORE.deserialize_cdr(b64decode(said['data']), kind))
+                else:
+                    self._answers.append(said)
+                self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def ask(self, do: str, **arguments: Any) -> Any:
+        """Have a function of the peer called, and give its answer."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({'do': do, **arguments}) + '\n')
+        self._process.stdin.flush()
+        with self._changed:
+            assert self._changed.wait_for(lambda: self._answers or self._ended, PATIENCE)
+            assert self._answers, f'the peer ended on {do}'
+            said = self._answers.pop(0)
+        assert 'answer' in said, f'{do} {arguments}: {said}'
+        return said['answer']
+
+    def advertise(self, topic: str, kind: str, listeners: int = 1, **qos: Any) -> None:
+        """Publish from now on, and wait until so many listen."""
+        self.ask('advertise', topic=topic, kind=kind, **qos)
+        self.ask('matched', topic=topic, count=listeners)
+
+    def send(self, topic: str, message: Any) -> None:
+        """Publish a message."""
+        self.ask('send', topic=topic, data=b64encode(serialised(message)).decode())
+
+    def listen(self, topic: str, kind: str, **qos: Any) -> None:
+        """Collect in ``heard`` what is published."""
+        self._types[topic] = kind
+        self.ask('subscribe', topic=topic, kind=kind, **qos)
+
+    def wait(self, what: str, condition: Callable[[dict[str, list[Any]]], Any],
+             seconds: float = PATIENCE) -> Any:
+        """Wait until a condition holds of what was heard, and give its value."""
+        with self._changed:
+            value = self._changed.wait_for(lambda: condition(self.heard), seconds)
+            counts = {topic: len(messages) for topic, messages in self.heard.items()}
+            said = self.heard.get('/diagnostics', [])[-1:]
+            assert value, f'{what} did not come; heard {counts}, last {said}'
+        return value
+
+    def call(self, service: str) -> Any:
+        """Call a service of the node under test."""
+        return self.ask('call', service=f'{NODE}/{service}', kind='std_srvs/srv/Trigger')
+
+    def kill(self) -> None:
+        """End the process as a crash would."""
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.poll() is not None:
+            return
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+
+class NodeProcess:
+    """The node under test in a process of its own, with its log."""
+
+    def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any]) -> None:
+        """Start it with words for ROS, such as remappings, and with parameters by name."""
+        self.path = log
+        values = [word for name, value in parameters.items()
+                  for word in ('-p', f'{name}:={json.dumps(value)}')]
+        with log.open('w') as file:
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', 'djet_ros.ros.vo_node', '--ros-args', *words, *values],
+                env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
+
+    @property
+    def log(self) -> str:
+        """Give what the node has said so far."""
+        return self.path.read_text()
+
+    def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
+        """Send a signal; gives the exit code and the seconds until the end."""
+        start = monotonic()
+        self.process.send_signal(number)
+        code = self.process.wait(10)
+        return code, monotonic() - start

@@ -1,0 +1,557 @@
+"""The node on a real ROS graph: publisher, node and subscriber are processes of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from threading import Thread
+from time import monotonic, sleep
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+import cv2
+from djet_ros.data.bag_writers import write_kitti_bag
+from djet_ros.data.bags import Bag, BagSource
+from djet_ros.odometry.messages import stamp_ns
+import numpy as np
+import pytest
+from ros_graph import ENVIRONMENT, NODE, NodeProcess, Peer
+from ros_messages import camera_info, compressed, header, image, message_type, roi, serialised
+
+pytestmark = [pytest.mark.ros, pytest.mark.skipif(
+    find_spec('rclpy') is None, reason='rclpy is missing: no ROS 2 is sourced here')]
+
+IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
+IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+RELATIVE = f'{NODE}/relative_pose'
+TYPES = {
+    RELATIVE: 'geometry_msgs/msg/PoseStamped',
+    f'{NODE}/relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    f'{NODE}/odometry': 'nav_msgs/msg/Odometry',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+FAST = {'estimator.max_features': 600}
+EVERY = {**FAST, 'ros.queue_policy': 'every'}
+PERIOD = 100_000_000
+START = 50 * 10**9
+
+
+@pytest.fixture(scope='module')
+def drive() -> list[Any]:
+    cards, here, images = Cards(), np.eye(4), []
+    for _ in range(12):
+        images.append(cards.gray(here))
+        here = here @ pose(x=0.25, z=0.15, yaw=0.01)
+    return images
+
+
+@pytest.fixture(scope='module')
+def subscriber() -> Iterator[Peer]:
+    peer = Peer('subscriber')
+    for topic, kind in TYPES.items():
+        peer.listen(topic, kind)
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def publisher() -> Iterator[Peer]:
+    peer = Peer('camera_driver')
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def node(tmp_path: Path, subscriber: Peer) -> Iterator[Callable[..., NodeProcess]]:
+    """Give a function that starts the node; it has ended, with a clean log, after the test."""
+    started: list[NodeProcess] = []
+
+    def start(*words: str, **parameters: Any) -> NodeProcess:
+        one = NodeProcess(tmp_path / f'node_{len(started)}.log',
+                          [*words, '-r', f'image:={IMAGE}'], parameters)
+        started.append(one)
+        for topic in TYPES:
+            subscriber.ask('published', topic=topic)
+        subscriber.heard.clear()
+        return one
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.end()
+        assert 'Traceback' not in one.log, one.log
+    for topic in TYPES:
+        subscriber.ask('published', topic=topic, count=0)
+
+
+def camera(publisher: Peer, **qos: Any) -> None:
+    """Advertise a camera with its CameraInfo, and send the latter well before any image."""
+    publisher.advertise(INFO, INFO_TYPE, **qos)
+    publisher.advertise(IMAGE, IMAGE_TYPE, **qos)
+    # Nothing orders the messages of different topics.
+    for _ in range(3):
+        publisher.send(INFO, camera_info(K, SIZE))
+        sleep(0.1)
+
+
+def stamp(index: int) -> int:
+    return START + index * PERIOD
+
+
+def play(publisher: Peer, images: list[Any], first: int = 0, pause: float = 0.0) -> None:
+    for i, gray in enumerate(images, first):
+        publisher.send(IMAGE, image(gray, stamp_ns=stamp(i)))
+        sleep(pause)
+
+
+def paired(index: int) -> Callable[[dict[str, list[Any]]], bool]:
+    """Make the condition that an image came out with a pair."""
+    return lambda heard: any(stamp_ns(m.header) == stamp(index) for m in heard[RELATIVE])
+
+
+def said(text: str) -> Callable[[dict[str, list[Any]]], Any]:
+    """Make the condition that diagnostics say something; its value is what they have."""
+    return lambda heard: next((values(m) for m in reversed(heard['/diagnostics'])
+                               if m.status[0].message == text), None)
+
+
+def values(diagnostics: Any) -> dict[str, str]:
+    return {pair.key: pair.value for pair in diagnostics.status[0].values}
+
+
+def wait_for_log(node: NodeProcess, text: str, seconds: float = 15) -> str:
+    """Wait for a line in the node's log, and give it."""
+    end = monotonic() + seconds
+    while monotonic() < end:
+        for line in node.log.splitlines():
+            if text in line:
+                return line
+        sleep(0.05)
+    raise AssertionError(f'{text!r} is not in the log:\n{node.log}')
+
+
+class Drive:
+    """The images as a sequence that can be written as a bag."""
+
+    name, K, size, poses = 'cards', K, SIZE, None
+
+    def __init__(self, images: list[Any]) -> None:
+        self._images = images
+        self.stamps_ns = np.array([stamp(i) for i in range(len(images))])
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def image(self, index: int) -> Any:
+        return self._images[index]
+
+
+def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+        node, publisher, subscriber, drive, tmp_path):
+    write_kitti_bag(Drive(drive), tmp_path / 'bag')
+    parameters = tmp_path / 'fast.yaml'
+    parameters.write_text('/**: {ros__parameters: {estimator: {max_features: 600}}}')
+    replay = subprocess.run(
+        [sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())',
+         'replay', tmp_path / 'bag', '--output', tmp_path / 'out', '--config', parameters],
+        env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert replay.returncode == 0, replay.stderr
+    poses = [topic for topic in TYPES if topic != '/diagnostics']
+    with Bag(tmp_path / 'out' / 'bag') as bag:
+        expected = {topic: [serialised(m.message) for m in bag.messages({topic})]
+                    for topic in poses}
+
+    node('-r', 'image:=/camera/image_rect', '--params-file', str(parameters),
+         **{'ros.queue_policy': 'every'})
+    with BagSource(tmp_path / 'bag') as source:
+        publisher.advertise(source.info_topic, INFO_TYPE)
+        publisher.advertise(source.image_topic, IMAGE_TYPE)
+        # Until the node knows both publishers, as they know the node.
+        sleep(0.5)
+        for message in source:
+            publisher.send(message.topic, message.message)
+    subscriber.wait('the last pair', paired(len(drive) - 1))
+    subscriber.wait('all odometry', lambda heard: len(heard[poses[2]]) == len(drive))
+    assert len(expected[RELATIVE]) == len(drive) - 1
+    for topic in poses:
+        assert [serialised(m) for m in subscriber.heard[topic]] == expected[topic]
+
+
+# The camera
+
+def test_only_the_images_need_a_name(node, publisher, subscriber, drive):
+    one = node('-r', 'image:=/robot/left/image_raw', **EVERY)
+    wait_for_log(one, 'images from /robot/left/image_raw, camera_info from '
+                      '/robot/left/camera_info')
+
+
+def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
+    one = node('-r', 'camera_info:=/elsewhere/info', **FAST)
+    wait_for_log(one, f'waiting for image on {IMAGE}: nobody publishes it')
+    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: nobody publishes it')
+    publisher.advertise('/elsewhere/info', INFO_TYPE)
+    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publish it, none sends')
+
+
+def test_a_latched_camera_info_from_before_the_node_is_heard(
+        node, publisher, subscriber, drive):
+    publisher.advertise(INFO, INFO_TYPE, listeners=0, durability='transient_local', depth=1)
+    publisher.send(INFO, camera_info(K, SIZE))
+    node(**EVERY)
+    publisher.advertise(IMAGE, IMAGE_TYPE)
+    subscriber.wait('readiness', said('waiting for an image'))
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+
+
+def test_a_late_camera_info_and_then_a_periodic_one(node, publisher, subscriber, drive):
+    node(**EVERY)
+    publisher.advertise(INFO, INFO_TYPE)
+    publisher.advertise(IMAGE, IMAGE_TYPE)
+    play(publisher, drive[:3])
+    subscriber.wait('a complaint', said('waiting for camera_info'))
+    for i in range(3, 8):
+        publisher.send(INFO, camera_info(K, SIZE, stamp_ns=stamp(i)))
+        play(publisher, drive[i:i + 1], first=i, pause=0.1)
+    subscriber.wait('a pair', paired(7))
+    last = subscriber.wait('tracking', said('tracking'))
+    assert last['frames dropped: waiting_for_camera_info'] == '3'
+    assert 'status: SIZE_CHANGED' not in last
+
+
+def test_camera_and_camera_info_may_be_killed_and_come_again(
+        node, publisher, subscriber, drive):
+    one = node(**EVERY)
+    for i, victim in enumerate((publisher, Peer('camera_driver'))):
+        camera(victim)
+        play(victim, drive[4 * i:4 * i + 4], first=4 * i)
+        subscriber.wait('a pair', paired(4 * i + 3))
+        victim.kill()
+        subscriber.wait('silence', said('waiting for an image'))
+        wait_for_log(one, f'waiting for image on {IMAGE}: nobody publishes it')
+        subscriber.heard.clear()
+    again = Peer('camera_driver')
+    camera(again)
+    play(again, drive[8:10], first=8)
+    subscriber.wait('a pair', paired(9))
+    last = subscriber.wait('tracking', said('tracking'))
+    again.close()
+    # The gaps were no longer than max_gap in the images' own time.
+    assert (last['status: FIRST_FRAME'], last['status: OK']) == ('1', '9')
+
+
+def test_compressed_images_are_tracked(node, publisher, subscriber, drive):
+    node(**EVERY, **{'ros.image_transport': 'compressed'})
+    publisher.advertise(f'{IMAGE}/compressed', 'sensor_msgs/msg/CompressedImage')
+    publisher.advertise(INFO, INFO_TYPE)
+    publisher.send(INFO, camera_info(K, SIZE))
+    for i, gray in enumerate(drive[:3]):
+        jpeg = cv2.imencode('.jpg', gray)[1].tobytes()
+        publisher.send(f'{IMAGE}/compressed', compressed(jpeg, 'jpeg', stamp(i)))
+    subscriber.wait('a pair', paired(2))
+
+
+def test_a_camera_that_sends_with_best_effort_is_heard(node, publisher, subscriber, drive):
+    node(**FAST)
+    camera(publisher, reliability='best_effort')
+    play(publisher, drive[:4], pause=0.3)
+    subscriber.wait('a pair', paired(3))
+
+
+def test_a_qos_that_does_not_fit_is_said_with_both_sides(
+        node, publisher, subscriber, drive):
+    one = node(**FAST, **{f'qos_overrides.{IMAGE}.subscription.reliability': 'reliable'})
+    publisher.advertise(IMAGE, IMAGE_TYPE, listeners=0, reliability='best_effort')
+    line = wait_for_log(one, f'incompatible QoS on {IMAGE}')
+    assert '/camera_driver offers best_effort, volatile' in line
+    assert '/vo_node asks for reliable, volatile' in line
+    assert 'set ros.qos_reliability' in line
+    publisher.advertise(INFO, INFO_TYPE)
+    assert one.log.count('incompatible QoS') == 1
+
+
+# Bad messages
+
+BAD_IMAGES = {
+    'unknown_encoding': lambda gray: image(gray, 'sepia', stamp_ns=stamp(3)),
+    'short_data': lambda gray: image(gray, stamp_ns=stamp(3), data=np.zeros(9, np.uint8)),
+    'short_step': lambda gray: image(gray, stamp_ns=stamp(3), step=3),
+    'too_large': lambda gray: image(gray, stamp_ns=stamp(3), height=2**31),
+    'too_small': lambda gray: image(gray[:8], stamp_ns=stamp(3)),
+    'empty': lambda gray: image(gray, stamp_ns=stamp(3), width=0),
+    'size_mismatch': lambda gray: image(gray[:100], stamp_ns=stamp(3)),
+}
+
+
+def test_each_bad_image_is_said_once_and_the_next_good_pair_is_tracked(
+        node, publisher, subscriber, drive):
+    one = node(**EVERY)
+    camera(publisher)
+    for reason, make in BAD_IMAGES.items():
+        subscriber.heard.clear()
+        # The bag begins anew each time.
+        play(publisher, drive[:3])
+        for _ in range(3):
+            publisher.send(IMAGE, make(drive[3]))
+        play(publisher, drive[4:6], first=4)
+        subscriber.wait(f'a pair after {reason}', paired(5))
+        assert paired(4)(subscriber.heard)
+        bad, = (m for m in subscriber.heard['/diagnostics']
+                if m.status[0].message == f'message rejected: {reason}')
+        assert bad.status[0].level == 2
+        subscriber.wait('tracking', said('tracking'))
+        assert one.log.count(f'message rejected: {reason}: ') == 1
+
+
+def test_black_and_noisy_images_end_in_lost_and_good_ones_end_that(
+        node, publisher, subscriber, drive):
+    node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:2])
+    play(publisher, [np.zeros_like(drive[0])] * 4, first=2)
+    subscriber.wait('lost', said('lost: TOO_FEW_MATCHES'))
+    play(publisher, drive[2:4], first=6)
+    subscriber.wait('a pair', paired(7))
+
+
+def test_bad_camera_infos_are_said_and_a_good_one_ends_that(
+        node, publisher, subscriber, drive):
+    one = node(**EVERY)
+    publisher.advertise(INFO, INFO_TYPE)
+    publisher.advertise(IMAGE, IMAGE_TYPE)
+    bad = {
+        'uncalibrated': camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12)),
+        'bad_calibration': camera_info(K * np.nan, SIZE),
+        'unknown_distortion': camera_info(K, SIZE, d=np.ones(5), distortion_model='fancy'),
+    }
+    for i, (reason, info) in enumerate(bad.items()):
+        publisher.send(INFO, info)
+        publisher.send(INFO, info)
+        sleep(0.1)
+        play(publisher, drive[i:i + 1], first=i)
+        subscriber.wait(reason, said(f'message rejected: {reason}'))
+        wait_for_log(one, f'message rejected: {reason}: ')
+    publisher.send(INFO, camera_info(K, SIZE))
+    sleep(0.1)
+    play(publisher, drive[3:5], first=3)
+    subscriber.wait('a pair', paired(4))
+    publisher.send(INFO, camera_info(K, SIZE, roi=roi(0, 0, 160, 120)))
+    sleep(0.1)
+    play(publisher, drive[5:6], first=5)
+    subscriber.wait('a complaint', said('message rejected: size_mismatch'))
+
+
+# Time
+
+def test_a_bag_that_loops_begins_anew(node, publisher, subscriber, drive):
+    node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:4])
+    play(publisher, drive[:4])
+    subscriber.wait('two rounds', lambda heard: len(heard[f'{NODE}/odometry']) == 8)
+    odometry = [serialised(m) for m in subscriber.heard[f'{NODE}/odometry']]
+    assert odometry[:4] == odometry[4:]
+    assert said('restarted: TIME_JUMP')(subscriber.heard)
+
+
+def test_stamps_are_the_images_and_diagnostics_follow_simulated_time(
+        node, publisher, subscriber, drive):
+    node(**EVERY, use_sim_time=True)
+    publisher.advertise('/clock', 'rosgraph_msgs/msg/Clock')
+    time = header(777 * 10**9).stamp
+    publisher.send('/clock', message_type('rosgraph_msgs/msg/Clock')(clock=time))
+    camera(publisher)
+    sleep(0.5)
+    subscriber.heard.clear()
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+    subscriber.wait('diagnostics', said('tracking'))
+    assert {m.header.stamp.sec for m in subscriber.heard['/diagnostics']} == {777}
+    assert [stamp_ns(m.header) for m in subscriber.heard[RELATIVE]] == [stamp(1), stamp(2)]
+
+
+# Services
+
+def test_pause_and_resume(node, publisher, subscriber, drive):
+    node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+    assert publisher.call('pause')['success']
+    play(publisher, drive[3:6], first=3)
+    sleep(0.5)
+    assert publisher.call('resume')['success']
+    play(publisher, drive[6:8], first=6)
+    subscriber.wait('a pair', paired(7))
+    last = subscriber.wait('tracking', said('tracking'))
+    assert not any(paired(i)(subscriber.heard) for i in (3, 4, 5))
+    assert said('paused')(subscriber.heard)
+    assert last['frames dropped: paused'] == '3'
+
+
+def test_a_reset_in_mid_stream_forgets_everything(node, publisher, subscriber, drive):
+    node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:6])
+    subscriber.wait('a pair', paired(3))
+    assert publisher.call('reset')['success']
+    subscriber.heard.clear()
+    play(publisher, drive[8:12], first=100)
+    subscriber.wait('a pair', paired(103))
+    first = next(m for m in subscriber.heard[f'{NODE}/odometry']
+                 if stamp_ns(m.header) >= stamp(100))
+    assert first.pose.pose.position.x == first.pose.pose.position.z == 0
+    assert first.pose.pose.orientation.w == 1
+    last = subscriber.wait('tracking', said('tracking'))
+    assert int(last['frames received']) <= 6
+    assert last['status: FIRST_FRAME'] == '1'
+
+
+# Parameters
+
+def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
+        node, publisher, tmp_path):
+    path = tmp_path / 'own.yaml'
+    path.write_text('vo_node: {ros__parameters: {preset: paper, odometry: {max_gap: 3, '
+                    'rectified: true}, estimator: {windw: 5}, name_of_robot: r2}}')
+    one = node('--params-file', str(path), **{'estimator.loss': 'cauchy'})
+    assert publisher.ask('configured', node=NODE, names=[
+        'preset', 'estimator.starts', 'estimator.loss', 'odometry.max_gap',
+        'odometry.rectified']) == ['paper', 'five_point', 'cauchy', 3.0, 'true']
+    assert "unknown parameter 'estimator.windw'; did you mean 'estimator.window'?" in one.log
+    assert "unknown parameter 'name_of_robot'" in one.log
+
+
+def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
+        node, publisher, subscriber, drive):
+    node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+    answers = publisher.ask('configure', node=NODE, values={
+        'odometry.odom_frame': 'world', 'odometry.max_gap': 2, 'estimator.window': 4,
+        'estimator.max_features': 10**6, 'estimator.loss': 'hubber', 'ros.queue_size': 3,
+        'odometry.scale': 'ground_truth', 'odometry.max_lost': 'many', 'ros.publish_tf': True,
+        'ros.publish_path': True})
+    assert [good for good, _ in answers] == [True, True] + [False] * 6 + [True, True]
+    reasons = [reason for _, reason in answers]
+    assert 'Max: 20000' in reasons[3]
+    assert reasons[4].startswith("loss is 'hubber'; choose from none, huber, cauchy")
+    assert 'read-only' in reasons[5]
+    assert 'only a recording has' in reasons[6]
+    play(publisher, drive[3:5], first=3)
+    subscriber.wait('all odometry', lambda heard: len(heard[f'{NODE}/odometry']) == 5)
+    frames = [m.header.frame_id for m in subscriber.heard[f'{NODE}/odometry']]
+    assert frames == ['odom'] * 3 + ['world'] * 2
+    assert publisher.ask('configured', node=NODE, names=[
+        'odometry.max_gap', 'estimator.window']) == [2.0, 5]
+
+
+def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
+    node()
+    answers = publisher.ask('configure', node=NODE, values={'preset': 'paper'})
+    assert answers == [[True, '']]
+    assert publisher.ask('configured', node=NODE, names=['preset', 'estimator.starts']) == [
+        'paper', 'five_point']
+
+
+def test_a_wrong_value_at_the_start_ends_it_in_one_line(tmp_path):
+    for wrong, reason in (('estimator.window:=4', 'window is 4; it must be odd'),
+                          ('odometry.scale:=ground_truth', 'only a recording has')):
+        done = subprocess.run(
+            [sys.executable, '-m', 'djet_ros.ros.vo_node', '--ros-args', '-p', wrong],
+            env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2
+        line, = done.stderr.splitlines()
+        assert line.startswith('vo_node: error: ')
+        assert reason in line
+
+
+# Outputs on demand
+
+def test_path_transform_and_debug_image_come_on_demand(
+        node, publisher, subscriber, drive):
+    node(**EVERY, **{'ros.publish_path': True, 'ros.path_period': 0.0,
+                     'ros.publish_tf': True})
+    camera(publisher)
+    extra = {'/tf': 'tf2_msgs/msg/TFMessage', f'{NODE}/path': 'nav_msgs/msg/Path',
+             f'{NODE}/debug_image': IMAGE_TYPE}
+    viewer = Peer('viewer')
+    for topic, kind in extra.items():
+        viewer.listen(topic, kind)
+        viewer.ask('published', topic=topic)
+    sleep(0.5)
+    play(publisher, drive[:4])
+    viewer.wait('pictures', lambda heard: len(heard[f'{NODE}/debug_image']) == 3)
+    picture = viewer.heard[f'{NODE}/debug_image'][-1]
+    assert (picture.width, picture.height, picture.encoding) == (*SIZE, 'bgr8')
+    assert [len(m.poses) for m in viewer.heard[f'{NODE}/path']] == [1, 2, 3, 4]
+    transform = viewer.heard['/tf'][-1].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera')
+    viewer.ask('unsubscribe', topic=f'{NODE}/debug_image')
+    sleep(0.5)
+    play(publisher, drive[4:6], first=4)
+    subscriber.wait('a pair', paired(5))
+    assert len(viewer.heard[f'{NODE}/debug_image']) == 3
+    viewer.close()
+
+
+def test_speeds_on_the_graph_give_the_length(node, publisher, subscriber, drive):
+    node('-r', 'speed_odometry:=/wheels/odom', **EVERY, **{'odometry.scale': 'speed'})
+    camera(publisher)
+    publisher.advertise('/wheels/odom', TYPES[f'{NODE}/odometry'])
+    vector = message_type('geometry_msgs/msg/Vector3')
+    twist = message_type('geometry_msgs/msg/Twist')(
+        linear=vector(x=2.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    play(publisher, drive[:1])
+    subscriber.wait('odometry', lambda heard: heard[f'{NODE}/odometry'])
+    message = subscriber.heard[f'{NODE}/odometry'][0]
+    for i in range(3):
+        message.header = header(stamp(i))
+        message.twist.twist = twist
+        publisher.send('/wheels/odom', message)
+    sleep(0.3)
+    play(publisher, drive[1:3], first=1)
+    subscriber.wait('a pair', paired(2))
+    way = subscriber.heard[RELATIVE][-1].pose.position
+    assert np.linalg.norm([way.x, way.y, way.z]) == pytest.approx(0.2)
+
+
+# Load and end
+
+def test_every_image_is_accounted_for_under_load(node, publisher, subscriber, drive):
+    node(**{'estimator.max_features': 5000, 'estimator.fast_threshold': 2,
+            'ros.qos_reliability': 'reliable', 'ros.qos_depth': 1000})
+    camera(publisher)
+    for round_ in range(4):
+        play(publisher, drive, first=100 * round_)
+    last = subscriber.wait('all', lambda heard: next(
+        (values(m) for m in heard['/diagnostics'] if values(m)['frames received'] == '48'),
+        None))
+    assert int(last['frames dropped: queue_full']) > 0
+    assert int(last['frames processed']) + int(last['frames dropped']) == 48
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_a_signal_in_mid_stream_ends_it_cleanly_within_a_second(
+        node, publisher, subscriber, drive, number, policy):
+    one = node(**FAST, **{'ros.queue_policy': policy, 'ros.queue_size': 1})
+    camera(publisher)
+    stream = Thread(target=play, args=[publisher, drive * 3], kwargs={'pause': 0.03})
+    stream.start()
+    subscriber.wait('a pair', lambda heard: heard[RELATIVE])
+    code, seconds = one.end(number)
+    stream.join()
+    assert code == 0
+    assert seconds < 1
+    sleep(0.3)
+    # Whole or not at all.
+    assert len({len(subscriber.heard[topic]) for topic in (
+        RELATIVE, f'{NODE}/relative_pose_cov')}) == 1
+    assert not [line for line in one.log.splitlines()
+                if not line.startswith(('[INFO]', '[WARN]'))]

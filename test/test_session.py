@@ -1,0 +1,378 @@
+"""The live session: a real tracker, real threads, and a graph that only writes down what comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from threading import Condition, Event, Thread
+from time import monotonic, sleep
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+from djet_ros.config import from_flat, with_values
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.tracker import Outgoing, Tracker
+from djet_ros.ros import session as sessions
+from djet_ros.ros.session import Session
+import numpy as np
+import pytest
+from ros_messages import camera_info, image, message_type, serialised
+
+PERIOD = 100_000_000
+POSES = ('relative_pose', 'relative_pose_cov', 'odometry')
+TOPICS = {'image': '/left/image_raw', 'camera_info': '/left/camera_info'}
+
+
+class Graph:
+    """Writes down what a session publishes and logs; publishing can be made slow, or fail."""
+
+    def __init__(self) -> None:
+        self.batches: list[list[Outgoing]] = []
+        self.lines: list[str] = []
+        self.debug_image_wanted = False
+        self.delay = 0.0
+        self.broken = False
+        # Publishing stops in the middle of a batch until this is set.
+        self.open = Event()
+        self.open.set()
+        self._changed = Condition()
+
+    def publish(self, outgoing: Any) -> None:
+        sleep(self.delay)
+        if self.broken:
+            raise RuntimeError('the graph is gone')
+        batch: list[Outgoing] = []
+        self.batches.append(batch)
+        for one in outgoing:
+            batch.append(one)
+            self.open.wait()
+        with self._changed:
+            self._changed.notify_all()
+
+    def log(self, level: str, text: str) -> None:
+        self.lines.append(f'{level}: {text}')
+
+    def count_publishers(self, topic: str) -> int:
+        return 2 if topic == '/left/camera_info' else 0
+
+    def wants_debug_image(self) -> bool:
+        return self.debug_image_wanted
+
+    def heard(self, *topics: str) -> list[Any]:
+        """Messages of some topics, in the order of publication."""
+        return [one.message for batch in list(self.batches) for one in batch
+                if one.topic in topics]
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        with self._changed:
+            assert self._changed.wait_for(condition, 20)
+
+    def said(self) -> dict[str, str]:
+        """Give the values of the last diagnostics."""
+        return {pair.key: pair.value
+                for pair in self.heard('/diagnostics')[-1].status[0].values}
+
+
+class Live:
+    """A session at work, with its tracker and its graph."""
+
+    def __init__(self, **parameters: Any) -> None:
+        config = from_flat({'estimator.max_features': 500, 'ros.queue_policy': 'every',
+                            **parameters})
+        self.graph = Graph()
+        self.tracker = Tracker(config, message_type, image_topic=TOPICS['image'])
+        self.session = Session(self.tracker, self.graph, TOPICS)
+        self.session.camera_info(camera_info(K, SIZE))
+
+    def send(self, images: list[Any], first: int = 0) -> None:
+        for i, gray in enumerate(images, first):
+            self.session.image(image(gray, stamp_ns=i * PERIOD))
+
+    def wait_for_images(self, received: int) -> None:
+        """Wait until so many images are done with."""
+        end = monotonic() + 20
+        while self.tracker.counts.received < received and monotonic() < end:
+            sleep(0.005)
+        # Whoever meddles in between is let in after the image in work.
+        self.session.configure(self.tracker.config)
+        assert self.tracker.counts.received == received
+
+
+@pytest.fixture
+def live() -> Iterator[Callable[..., Live]]:
+    """Give a function that starts a session; all are stopped in the end."""
+    started: list[Live] = []
+
+    def start(**parameters: Any) -> Live:
+        one = Live(**parameters)
+        one.session.start()
+        started.append(one)
+        return one
+
+    yield start
+    for one in started:
+        one.graph.open.set()
+        one.session.stop(10)
+
+
+@pytest.fixture(scope='module')
+def drive() -> list[Any]:
+    cards, here, images = Cards(), np.eye(4), []
+    for _ in range(12):
+        images.append(cards.gray(here))
+        here = here @ pose(x=0.25, z=0.15, yaw=0.01)
+    return images
+
+
+def offline(images: list[Any], **parameters: Any) -> list[bytes]:
+    """Poses of the same images without thread and queue, as on the wire."""
+    tracker = Tracker(from_flat({'estimator.max_features': 500, **parameters}), message_type,
+                      image_topic=TOPICS['image'])
+    tracker.camera_info(camera_info(K, SIZE))
+    return [serialised(one.message) for i, gray in enumerate(images)
+            for one in tracker.image(image(gray, stamp_ns=i * PERIOD)) if one.topic in POSES]
+
+
+def test_every_gives_the_poses_of_the_tracker_to_the_last_bit(live, drive):
+    one = live()
+    one.send(drive)
+    one.wait_for_images(len(drive))
+    assert [serialised(message) for message in one.graph.heard(*POSES)] == offline(drive)
+    assert not one.tracker.counts.dropped
+
+
+def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live, drive):
+    one = live(**{'ros.queue_policy': 'latest'})
+    one.graph.delay = 0.05
+    one.send(drive)
+    one.wait_for_images(len(drive))
+    counts = one.tracker.counts
+    assert counts.dropped['queue_full'] >= len(drive) // 2
+    assert counts.processed + counts.dropped.total() == counts.received
+    # The newest is never the one that is dropped.
+    assert stamp_ns(one.graph.heard('odometry')[-1].header) == (len(drive) - 1) * PERIOD
+    assert 'images dropped: they come faster than they are worked on' in one.graph.lines[0]
+
+
+def test_a_camera_info_holds_for_the_images_after_it(live, drive):
+    one = live(**{'ros.queue_size': 12})
+    one.graph.open.clear()
+    one.send(drive[:4])
+    one.session.camera_info(camera_info(K * [[1.05], [1.05], [1]], SIZE))
+    one.send(drive[4:8], first=4)
+    one.graph.open.set()
+    one.wait_for_images(8)
+    assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'SIZE_CHANGED': 1, 'OK': 6}
+    stamps = [stamp_ns(message.header) for message in one.graph.heard('relative_pose')]
+    assert 4 * PERIOD not in stamps
+
+
+# Reset, pause, stop
+
+def test_nothing_of_before_a_reset_comes_after_it(live, drive):
+    one = live(**{'ros.queue_size': 12})
+    one.send(drive[:4])
+    one.graph.wait(lambda: one.graph.heard('relative_pose'))
+    one.session.reset()
+    before = len(one.graph.batches)
+    one.send(drive, first=20)
+    one.wait_for_images(len(drive))
+    after = [serialised(now.message) for batch in one.graph.batches[before:] for now in batch
+             if now.topic == 'odometry']
+    assert len(after) == len(drive)
+    fresh = live()
+    fresh.send(drive, first=20)
+    fresh.wait_for_images(len(drive))
+    assert after == [serialised(message) for message in fresh.graph.heard('odometry')]
+    assert one.tracker.counts == fresh.tracker.counts
+
+
+def test_a_reset_does_not_wait_for_more_than_the_image_in_work(live, drive):
+    one = live(**{'ros.queue_size': 1000})
+    one.graph.delay = 0.05
+    for _ in range(40):
+        one.send(drive)
+    start = monotonic()
+    for _ in range(5):
+        one.session.configure(one.tracker.config)
+    assert monotonic() - start < 5 * 0.4
+    assert one.tracker.counts.received < 40
+
+
+def test_a_pause_drops_and_counts_and_a_resume_goes_on(live, drive):
+    one = live()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    one.session.pause()
+    assert one.graph.heard('/diagnostics')[-1].status[0].message == 'paused'
+    one.send(drive[3:6], first=3)
+    one.wait_for_images(6)
+    assert one.tracker.counts.dropped == {'paused': 3}
+    one.session.resume()
+    one.send(drive[6:8], first=6)
+    one.wait_for_images(8)
+    assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'OK': 4}
+    assert stamp_ns(one.graph.heard('relative_pose')[-1].header) == 7 * PERIOD
+
+
+def test_a_stop_publishes_an_image_as_a_whole_or_not_at_all(live, drive):
+    one = live()
+    one.send(drive[:2])
+    one.graph.wait(lambda: one.graph.heard('relative_pose'))
+    one.graph.open.clear()
+    before = len(one.graph.batches)
+    one.send(drive[2:4], first=2)
+    while len(one.graph.batches) == before:
+        sleep(0.001)
+    assert [now.topic for now in one.graph.batches[before]] == ['relative_pose']
+    Thread(target=lambda: (sleep(0.1), one.graph.open.set())).start()
+    one.session.stop(5)
+    assert [now.topic for now in one.graph.batches[before]] == list(POSES)
+    assert len(one.graph.batches) == before + 1
+    one.send(drive[4:6], first=4)
+    one.session.pause()
+    assert len(one.graph.batches) == before + 1
+
+
+def test_a_stop_does_not_wait_for_ever(live, drive):
+    one = live()
+    one.graph.open.clear()
+    one.send(drive[:1])
+    start = monotonic()
+    one.session.stop(0.2)
+    assert monotonic() - start < 1
+
+
+def test_images_that_wait_for_room_do_not_hold_up_a_stop(live, drive):
+    one = live(**{'ros.queue_size': 1})
+    one.graph.open.clear()
+    sender = Thread(target=one.send, args=[drive])
+    sender.start()
+    one.session.stop(0.1)
+    sender.join(5)
+    assert not sender.is_alive()
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+def test_an_error_in_the_thread_is_no_silent_stall(live, drive):
+    one = live()
+    assert not one.session.failed
+    one.graph.broken = True
+    one.send(drive[:3])
+    end = monotonic() + 5
+    while not one.session.failed and monotonic() < end:
+        sleep(0.01)
+    assert one.session.failed
+
+
+# What is said
+
+def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(live, drive):
+    one = live()
+    one.send(drive[:2])
+    for i in range(10):
+        one.session.image(image(drive[2], 'sepia', stamp_ns=(2 + i) * PERIOD))
+    one.wait_for_images(12)
+    line, = one.graph.lines
+    assert line.startswith("warning: message rejected: unknown_encoding: image encoding 'sepia'")
+    assert one.graph.heard('/diagnostics')[-1].status[0].level == 2
+    one.send(drive[3:4], first=3)
+    one.wait_for_images(13)
+    assert one.graph.heard('/diagnostics')[-1].status[0].message == 'tracking'
+    assert one.graph.lines == [line]
+
+
+def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatch):
+    monkeypatch.setattr(sessions, 'SILENCE', 0.05)
+    one = live()
+    one.session.camera_info(None)
+    one.session.tick()
+    assert one.graph.lines == []
+    sleep(0.1)
+    for _ in range(3):
+        one.session.tick()
+    assert one.graph.lines == [
+        'warning: waiting for image on /left/image_raw: nobody publishes it',
+        'warning: waiting for camera_info on /left/camera_info: 2 publish it, none sends']
+
+
+def test_a_camera_that_falls_silent_is_said_in_the_diagnostics(live, drive, monkeypatch):
+    monkeypatch.setattr(sessions, 'SILENCE', 0.2)
+    one = live()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    assert one.graph.heard('/diagnostics')[-1].status[0].message == 'tracking'
+    assert 'rate (Hz)' in one.graph.said()
+    sleep(1.2)
+    one.session.tick()
+    status = one.graph.heard('/diagnostics')[-1].status[0]
+    assert (status.level, status.message) == (1, 'waiting for an image')
+    assert 'rate (Hz)' not in one.graph.said()
+
+
+def test_diagnostics_are_not_said_twice_a_second(live, drive):
+    one = live()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    count = len(one.graph.heard('/diagnostics'))
+    for _ in range(5):
+        one.session.tick()
+    assert len(one.graph.heard('/diagnostics')) == count
+
+
+def test_an_uncalibrated_camera_is_said_before_any_image_comes(live, monkeypatch):
+    monkeypatch.setattr(sessions, 'SILENCE', 0.05)
+    one = live()
+    one.session.camera_info(camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12)))
+    sleep(0.1)
+    one.session.tick()
+    status = one.graph.heard('/diagnostics')[-1].status[0]
+    assert (status.level, status.message) == (2, 'message rejected: uncalibrated')
+    assert any('calibrate it' in line for line in one.graph.lines)
+
+
+def test_diagnostics_tell_the_latency_and_what_was_lost_on_the_way(live, drive):
+    one = live()
+    one.graph.delay = 0.03
+    one.session.count_lost(2)
+    one.send([*drive, *drive[::-1]])
+    one.wait_for_images(24)
+    said = one.graph.said()
+    assert said['frames lost on the way'] == '2'
+    assert 30 < float(said['latency, median (ms)']) <= float(said['latency, 95 % (ms)']) < 5000
+
+
+def test_a_debug_image_is_drawn_only_while_somebody_looks(live, drive):
+    one = live()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    assert not one.graph.heard('debug_image')
+    one.graph.debug_image_wanted = True
+    one.send(drive[3:5], first=3)
+    one.wait_for_images(5)
+    stamps = [stamp_ns(message.header) for message in one.graph.heard('debug_image')]
+    assert stamps == [3 * PERIOD, 4 * PERIOD]
+
+
+def test_new_parameters_hold_from_the_next_image(live, drive):
+    one = live()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    one.session.configure(with_values(one.tracker.config, {'odometry.odom_frame': 'world'}))
+    one.send(drive[3:4], first=3)
+    one.wait_for_images(4)
+    frames = [message.header.frame_id for message in one.graph.heard('odometry')]
+    assert frames == ['odom', 'odom', 'odom', 'world']
+
+
+def test_speeds_give_the_length(live, drive):
+    one = live(**{'odometry.scale': 'speed'})
+    vector = message_type('geometry_msgs/msg/Vector3')
+    for i, gray in enumerate(drive[:3]):
+        header = image(gray, stamp_ns=i * PERIOD).header
+        one.session.speed(message_type('geometry_msgs/msg/TwistStamped')(
+            header=header, twist=message_type('geometry_msgs/msg/Twist')(
+                linear=vector(x=3.0, y=0.0, z=4.0), angular=vector(x=0.0, y=0.0, z=0.0))))
+        one.send([gray], first=i)
+    one.wait_for_images(3)
+    assert one.tracker.last.scale_known
+    assert np.linalg.norm(one.tracker.last.motion[:3, 3]) == pytest.approx(0.5)

@@ -1,0 +1,24 @@
+"""What a user meets who starts the node where no ROS is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+# Of a sourced ROS, the rest of this Python stays.
+PATHS = [path for path in sys.path if not (Path(path) / 'rclpy').exists()]
+
+
+@pytest.mark.parametrize('words', [[], ['--help'], ['--ros-args', '-r', 'image:=/camera/image']])
+def test_the_node_says_in_one_line_what_is_missing(tmp_path: Path, words: list[str]) -> None:
+    program = (f'import sys; sys.path[:] = {json.dumps(PATHS)}; '
+               'from djet_ros.ros.vo_node import main; sys.exit(main())')
+    done = subprocess.run([sys.executable, '-c', program, *words], capture_output=True, text=True,
+                          check=False, cwd=tmp_path)
+    assert done.returncode == 2
+    line, = done.stderr.splitlines()
+    assert line.startswith('vo_node: error: rclpy is missing: install ROS 2')
