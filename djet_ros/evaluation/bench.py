@@ -7,11 +7,7 @@ measured in turn, pair by pair, in the same process.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-import multiprocessing
-import os
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -37,30 +33,29 @@ WINDOWS = (3, 5, 7, 9, 11, 13, 15)
 QUOTED_POINTS = 1000
 
 _REPEATS = 7
-_THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
 def bench(source: Path, pairs: int,
           progress: Callable[[str], None] = lambda stage: None) -> dict[str, Any]:
     """
-    Measure the first pairs of a sequence with one thread, then with all cores.
+    Measure the first pairs of a sequence with one thread, then with all that OpenCV takes.
 
     Gives the figures of the single-threaded run, and those of the other under 'all_cores'.
     Raises DjetError where the source is no sequence of at least two frames.
     """
+    sequence = _open(source)
     progress('one thread')
-    with _threads(1):
-        figures = _in_fresh_process(measure, source, pairs, 1)
+    cv2.setNumThreads(1)
+    figures = measure(sequence, pairs)
     progress('all cores')
-    with _threads(None):
-        figures['all_cores'] = _in_fresh_process(measure_pipeline, source, pairs, None)
+    cv2.setNumThreads(-1)
+    figures['all_cores'] = measure_pipeline(sequence, pairs)
     return figures
 
 
-def measure(source: Path, pairs: int, threads: int | None) -> dict[str, Any]:
+def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     """Measure everything: pipeline, D-JET stage, kernel, growth with points and window, memory."""
-    figures = measure_pipeline(source, pairs, threads)
-    sequence = _open(source)
+    figures = measure_pipeline(sequence, pairs)
     previous, current, x, y = _crowded_pair(sequence)
     figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
     by_points = {n: _stage_ms(previous, current, x[:n], y[:n], 'best')
@@ -74,11 +69,8 @@ def measure(source: Path, pairs: int, threads: int | None) -> dict[str, Any]:
     return figures
 
 
-def measure_pipeline(source: Path, pairs: int, threads: int | None) -> dict[str, Any]:
+def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     """Time decoding to pose, ours and OpenCV's plain chain, in turn on each new frame."""
-    if threads is not None:
-        cv2.setNumThreads(threads)
-    sequence = _open(source)
     ours, plain = _Pipeline(sequence), _PlainChain(sequence)
     times: dict[str, list[float]] = {'ours': [], 'plain': []}
     for index in range(min(pairs + 1, len(sequence))):
@@ -217,24 +209,3 @@ def _open(source: Path) -> FrameSequence:
     if len(sequence) < 2:
         raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
     return sequence
-
-
-@contextmanager
-def _threads(number: int | None) -> Iterator[None]:
-    """Set how many threads BLAS takes in processes that start now; None leaves it to BLAS."""
-    saved = {name: os.environ.pop(name, None) for name in _THREAD_VARIABLES}
-    if number is not None:
-        os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(number)))
-    try:
-        yield
-    finally:
-        for name, value in saved.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
-
-
-def _in_fresh_process(function: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    """BLAS fixes its threads when it is loaded, so each setting needs a process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
-        return pool.submit(function, *arguments).result()

@@ -8,6 +8,8 @@ import signal
 import sys
 from threading import Event
 
+from djet_ros.threads import one_blas_thread
+
 EPILOG = """\
 Topics, parameters and the rest are given as to every ROS node:
   vo_node --ros-args -r image:=/camera/image_raw --params-file vo.yaml
@@ -16,6 +18,7 @@ Topics, parameters and the rest are given as to every ROS node:
 
 def main() -> int:
     """Run the node until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
+    one_blas_thread()
     stop = Event()
     # First of all: the imports take their time, and end no worse than anything later.
     for number in (signal.SIGINT, signal.SIGTERM):
