@@ -1,0 +1,110 @@
+"""Launch files and what they configure: read without ROS, described and started with it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from time import monotonic, sleep
+from typing import Any
+
+from djet_ros.config import from_flat, load_yaml
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
+
+ARGUMENTS = {
+    'vo.launch.py': {'image', 'camera_info', 'params_file', 'use_sim_time', 'rviz'},
+    'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'rviz'},
+}
+
+
+def topics(rviz: Any) -> list[str]:
+    return [display['Topic']['Value'] for display in rviz['Visualization Manager']['Displays']
+            if 'Topic' in display]
+
+
+def test_every_launch_file_is_python() -> None:
+    assert {path.name for path in FILES} == ARGUMENTS.keys()
+    for path in FILES:
+        compile(path.read_text(), path, 'exec')
+
+
+def test_the_parameters_of_a_replay_are_the_defaults_without_loss_and_with_a_path() -> None:
+    assert load_yaml(ROOT / 'config' / 'replay.yaml') == from_flat(
+        {'ros.queue_policy': 'every', 'ros.publish_path': True})
+
+
+def test_rviz_shows_what_the_node_publishes() -> None:
+    shown = topics(yaml.safe_load((ROOT / 'config' / 'vo.rviz').read_text()))
+    assert shown == ['/vo_node/odometry', '/vo_node/path', '/vo_node/debug_image']
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
+def test_the_arguments_are_listed_and_explained(path: Path) -> None:
+    pytest.importorskip('launch_ros', reason='launch comes with ROS 2')
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+    description = get_launch_description_from_python_launch_file(str(path))
+    arguments = description.get_launch_arguments()
+    assert {argument.name for argument in arguments} == ARGUMENTS[path.name]
+    assert all(argument.description for argument in arguments)
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """Give the environment of an installed package: its share, and the node where ROS looks."""
+    pytest.importorskip('rclpy', reason='rclpy is missing: no ROS 2 is sourced here')
+    index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'djet_ros').touch()
+    share = tmp_path / 'share' / 'djet_ros'
+    for folder in ('config', 'launch'):
+        shutil.copytree(ROOT / folder, share / folder)
+    node = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
+    node.parent.mkdir(parents=True)
+    node.write_text(f'#!/bin/sh\nexec {sys.executable} -m djet_ros.ros.vo_node "$@"\n')
+    node.chmod(0o755)
+    return {**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}',
+            'AMENT_PREFIX_PATH': f'{tmp_path}:{os.environ["AMENT_PREFIX_PATH"]}',
+            'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_LOG_DIR': str(tmp_path / 'log')}
+
+
+def launched(environment: dict[str, str], log: Path, *words: str, until: str) -> str:
+    """Run ros2 launch until a text is in its output, then end it by Ctrl-C; gives the output."""
+    with log.open('w') as file:
+        process = subprocess.Popen(['ros2', 'launch', 'djet_ros', *words], env=environment,
+                                   stdout=file, stderr=subprocess.STDOUT)
+    end = monotonic() + 30
+    while until not in log.read_text() and monotonic() < end and process.poll() is None:
+        sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    process.wait(20)
+    return log.read_text()
+
+
+@pytest.mark.ros
+def test_vo_launch_starts_the_node_on_the_topics_given(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'image:=/left/image_raw',
+                    until='queue policy')
+    assert 'images from /left/image_raw, camera_info from /left/camera_info' in said
+    assert 'queue policy latest' in said
+    assert re.search(r'vo_node-1\]: process has finished cleanly', said)
+
+
+@pytest.mark.ros
+def test_replay_launch_plays_a_bag_into_a_node_that_drops_nothing(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    # Where ros2 bag is not installed, or the bag is no bag, the player says so and ends.
+    said = launched(environment, tmp_path / 'out', 'replay.launch.py', 'bag:=/no/bag',
+                    'loop:=true', until='queue policy')
+    assert 'images from /camera/image_rect, camera_info from /camera/camera_info' in said
+    assert 'queue policy every' in said
+    assert re.search(r'bag_player-\d\]: process (started|has died)', said)
+    assert re.search(r'vo_node-\d\]: process has finished cleanly', said)
