@@ -50,9 +50,14 @@ setup(
             'evo>=1.38,<2',
             'poselib>=2.0.5,<3',
         ],
+        # `djet slam`
+        'slam': [
+            'gtsam>=4.2.1,<5',
+        ],
         'test': [
             'colcon-common-extensions>=0.3,<0.4',
             'cyclonedds>=11.0.1,<12',
+            'gtsam>=4.2.1,<5',
             'hypothesis>=6.98,<7',
             'pytest>=7.4,<10',
             'pytest-xdist>=3.4,<4',

@@ -56,7 +56,7 @@ def test_equal_poses_give_equal_bytes_and_zero_has_no_sign(tmp_path):
 def test_the_quaternion_has_no_negative_real_part(vector):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(vector).as_matrix()
-    line = TumWriter.line(None, 0, pose)
+    line = TumWriter.line(0, pose)
     assert float(line.split()[-1]) >= 0
 
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 SUMMARY = 'summary.json'
 PLOT = 'trajectory.png'
-_BAG = 'bag'
+BAG = 'bag'
 _FILES = (SUMMARY, PLOT, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv', 'errors.csv',
           'config.yaml')
 
@@ -65,7 +65,7 @@ class ResultsFolder:
         self._row(COLUMNS)
         self._trajectories = [TumWriter(path / 'trajectory_tum.txt'),
                               KittiWriter(path / 'trajectory_kitti.txt')]
-        self._bag = ResultBag(path / _BAG)
+        self._bag = ResultBag(path / BAG)
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
         """Write what became of a processed image, and how long it took; counted from 0."""
@@ -166,14 +166,23 @@ def _make_room(path: Path, overwrite: bool) -> None:
                                 'replace them with --overwrite')
             for name in _FILES:
                 (path / name).unlink(missing_ok=True)
-            if (path / _BAG).is_dir():
-                shutil.rmtree(path / _BAG)
+            if (path / BAG).is_dir():
+                shutil.rmtree(path / BAG)
     path.mkdir(parents=True, exist_ok=True)
 
 
 def _blame(path: Path, error: OSError) -> DjetError:
     return DjetError(f'{path} could not be written: {error.strerror or error}; what it holds so '
                      'far is readable')
+
+
+def _widen(axes: Any) -> None:
+    """Give a straight way some room at its sides, so that its deviations can be seen."""
+    limits = [np.array(axes.get_xlim()), np.array(axes.get_ylim())]
+    longest = max(float(np.ptp(limit)) for limit in limits)
+    for limit, widen in zip(limits, (axes.set_xlim, axes.set_ylim)):
+        half = max(float(np.ptp(limit)), longest / 2) / 2 * 1.1
+        widen(limit.mean() - half, limit.mean() + half)
 
 
 def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str,
@@ -193,9 +202,9 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str
     axes.plot(estimate[:, 0], estimate[:, 2], color='tab:blue', linewidth=1.2, label='estimate')
     axes.plot(*estimate[0, [0, 2]], 'o', color='black', markersize=5, label='start')
     axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
-    axes.margins(0.1)
+    _widen(axes)
     axes.grid(color='0.9')
-    axes.legend()
+    axes.legend(loc='best')
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:

@@ -33,8 +33,9 @@ class TrajectoryWriter(ABC):
         except OSError as error:
             raise DjetError(f'{path} could not be created: {error.strerror}') from error
 
+    @staticmethod
     @abstractmethod
-    def line(self, stamp_ns: int, pose: Array) -> str:
+    def line(stamp_ns: int, pose: Array) -> str:
         """Text of one pose (4, 4)."""
 
     def write(self, stamp_ns: int, pose: Array) -> None:
@@ -62,19 +63,20 @@ class TrajectoryWriter(ABC):
 class TumWriter(TrajectoryWriter):
     """Lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres, qw >= 0."""
 
-    def line(self, stamp_ns: int, pose: Array) -> str:
+    @staticmethod
+    def line(stamp_ns: int, pose: Array) -> str:
         """Text of one pose (4, 4)."""
         seconds, rest = divmod(stamp_ns, 10**9)
-        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-        return f'{seconds}.{rest:09d} {_digits((*pose[:3, 3], *quaternion))}'
+        return f'{seconds}.{rest:09d} {digits(position_and_quaternion(pose))}'
 
 
 class KittiWriter(TrajectoryWriter):
     """Lines of the 12 numbers of a 3x4 matrix, row by row; the stamp is not part of the format."""
 
-    def line(self, stamp_ns: int, pose: Array) -> str:
+    @staticmethod
+    def line(stamp_ns: int, pose: Array) -> str:
         """Text of one pose (4, 4)."""
-        return _digits(pose[:3].ravel())
+        return digits(pose[:3].ravel())
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], Array]:
@@ -97,6 +99,13 @@ def poses_from_quaternions(positions: Array, quaternions: Array, path: Path) -> 
     return poses
 
 
-def _digits(values: Iterable[float]) -> str:
+def position_and_quaternion(pose: Array) -> tuple[float, ...]:
+    """Give the numbers x y z qx qy qz qw, with qw >= 0, of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return (*pose[:3, 3].tolist(), *quaternion.tolist())
+
+
+def digits(values: Iterable[float]) -> str:
+    """Write numbers with the fewest digits that read back to the same doubles."""
     # Adding zero turns -0.0 into 0.0.
     return ' '.join(repr(float(value) + 0.0) for value in values)

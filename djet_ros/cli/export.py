@@ -1,0 +1,41 @@
+"""``djet export``: the pose graph of a replay, for a SLAM backend."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from djet_ros.data.pose_graph import read_results
+from djet_ros.data.pose_graph_files import FORMATS, write_graph
+
+DESCRIPTION = """\
+Write the pose graph of a replay: a vertex for each tracked frame, and an edge for each pair with
+its relative pose and information matrix (inverse covariance). Where the scale is unknown, the
+information along the translation is weak. g2o files are read by GTSAM and g2o; csv has the
+covariances; tum and kitti have the poses alone.
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser('export', description=DESCRIPTION)
+    parser.add_argument('results', type=Path, metavar='RESULTS',
+                        help="folder that 'djet replay' wrote")
+    parser.add_argument('--format', choices=tuple(FORMATS), default='g2o',
+                        help='default: %(default)s')
+    parser.add_argument('--output', type=Path, required=True, metavar='FILE')
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the file, and say what is in it."""
+    graph = read_results(args.results)
+    write_graph(graph, args.output, args.format)
+    kinds = Counter(edge.kind for edge in graph.edges)
+    unscaled = sum(not edge.scale_known for edge in graph.edges)
+    print(f'{args.output}: {len(graph.poses)} poses, {len(graph.edges)} edges ('
+          + ', '.join(f'{count} {kind}' for kind, count in kinds.items())
+          + (f'; {unscaled} of unknown length' if unscaled else '') + ')')
+    return 0
