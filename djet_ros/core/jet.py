@@ -120,7 +120,7 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids,
     G = np.linalg.inv(K)[:2, :2]
     M = G @ S @ G.T
     # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
-    blur = epipole_blur**2 * np.linalg.det(G) * (M[:, 0, 0] + M[:, 1, 1]) / 2
+    blur = epipole_blur**2 * np.linalg.det(G) * np.abs(M[:, 0, 0] + M[:, 1, 1]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, paraboloids.minima()).T.copy(),
                       np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]), blur)
 
