@@ -27,7 +27,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     and (6, 6) over (rotation vector, t), of rank 5 because t keeps its length. The sandwich
     H^-1 (sum over cells of s s^T) H^-1, with s the summed gradients of a cell's matches, takes
     the noise from the residuals themselves (cluster-robust, Liang and Zeger, Biometrika 1986).
-    All NaN where the matches do not determine the pose.
+    All NaN where the matches do not determine the pose, or lie in too few cells.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -35,12 +35,15 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
     flattening = loss.curvature(squared).mean() / weights.mean() if len(squared) else 0.0
     H = flattening * (J * weights) @ J.T
+    unknown = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e14:
-        return np.full((5, 5), np.nan), np.full((6, 6), np.nan)
+        return unknown
     scores, cells = _summed_by_cell(J * (weights * residuals.r), places)
+    if cells <= 5:  # the gradients sum to zero, so these leave some direction without any noise
+        return unknown
     H_inverse = np.linalg.inv(H)
     covariance = H_inverse @ (scores @ scores.T) @ H_inverse
-    covariance *= _INFLATION * cells / max(cells - 5, 1)
+    covariance *= _INFLATION * cells / (cells - 5)
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = _blocks(-residuals.tangents if flipped else residuals.tangents)
