@@ -6,6 +6,7 @@ from djet_ros.core.geometry import (
     direction_angle,
     epipolar_lines,
     essential,
+    fit_rotation,
     fundamental,
     homogeneous,
     in_front,
@@ -118,6 +119,17 @@ def test_chirality_is_told_for_each_point_by_itself():
     far_away = rays(K, seen.x) @ seen.R.T
     rays_y[behind] = 2 * far_away[behind] - rays_y[behind]
     assert np.array_equal(in_front(seen.R, seen.t, rays(K, seen.x), rays_y), ~behind)
+
+
+def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():
+    rng = np.random.default_rng(5)
+    seen = two_views(rng, count=200)
+    rays_x = rays(K, seen.x)
+    turned = rays_x @ seen.R.T * rng.uniform(0.5, 2, (200, 1))  # the length of a ray says nothing
+    assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-9
+    turned[:60] += (0.05, 0.01, 0)  # a lorry passes by
+    turned += rng.normal(0, 1e-4, turned.shape)
+    assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-4
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-6, 0.3, np.pi - 1e-6])

@@ -49,12 +49,12 @@ def random_pose(rng):
 
 @pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
 @pytest.mark.parametrize('camera', [K, SKEWED])
-@given(seed=st.integers(0, 2**32 - 1))
+@given(seed=st.integers(0, 2**32 - 1), blur=st.sampled_from([0.0, 20.0]))
 @settings(max_examples=25, deadline=None)
-def test_the_jacobian_is_that_of_central_differences(camera, kind, seed):
+def test_the_jacobian_is_that_of_central_differences(camera, kind, seed, blur):
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, 1000, (2, 30, 2))
-    problem = jet_problem(camera, x, random_surfaces(rng, y, kind))
+    problem = jet_problem(camera, x, random_surfaces(rng, y, kind), epipole_blur=blur)
     R, t = random_pose(rng)
     residuals = epipolar_residuals(problem, R, t)
     tangents, step = residuals.tangents, 1e-6
@@ -104,6 +104,18 @@ def test_residuals_of_circles_are_the_distances_to_the_epipolar_lines_in_pixels(
     assert np.allclose(residuals.r, distances, rtol=1e-9)
 
 
+def test_near_the_epipole_a_residual_counts_the_less_the_nearer():
+    # straight ahead the epipole is the principal point, and lines run outwards from it
+    across = np.array([1.0, 5.0, 30.0, 400.0])
+    x = K[:2, 2] + across[:, None] * (1, 0)
+    y = x + np.array([7.0, 2.0])
+    ahead = np.eye(3), np.array([0, 0, -1.0])
+    sharp = epipolar_residuals(jet_problem(K, x, circles(y)), *ahead)
+    assert np.allclose(np.abs(sharp.r), 2)
+    blurred = epipolar_residuals(jet_problem(K, x, circles(y), epipole_blur=5.0), *ahead)
+    assert np.allclose(blurred.r / sharp.r, across / np.hypot(across, 5))
+
+
 def test_a_surface_without_any_curvature_has_no_say():
     seen = two_views(np.random.default_rng(5))
     surfaces = circles(seen.y + 0.5)
@@ -145,6 +157,15 @@ def test_the_weight_of_a_loss_is_its_derivative_by_the_squared_residual(name, sc
     numeric = (loss(squared * (1 + 1e-6))[0] - loss(squared * (1 - 1e-6))[0]) / (2e-6 * squared)
     bend = np.isclose(squared, scale**2, rtol=1e-5)
     assert np.allclose(weights[~bend], numeric[~bend], rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize('name', LOSSES)
+def test_the_curvature_of_a_loss_is_half_its_second_derivative(name):
+    loss, step = Loss(name, 1.3), 1e-4
+    r = np.linspace(0.01, 8, 300)
+    r = r[np.abs(r - 1.3) > 0.01]  # where Huber's bends
+    low, middle, high = (loss((r + d)**2)[0] for d in (-step, 0, step))
+    assert np.allclose(loss.curvature(r**2), (low - 2 * middle + high) / (2 * step**2), atol=1e-5)
 
 
 @pytest.mark.parametrize('name', LOSSES)
@@ -205,18 +226,22 @@ def test_without_noise_the_exact_pose_is_found_from_some_degrees_away(camera, t,
         assert direction_angle(found.t, seen.t) < 1e-9
 
 
+@pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
 @pytest.mark.parametrize('name', LOSSES)
-def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name):
+def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name, kind):
     rng = np.random.default_rng(9)
     seen = two_views(rng)
-    problem = jet_problem(K, seen.x, circles(seen.y + rng.normal(0, 0.5, seen.y.shape)))
+    surfaces = circles(seen.y + rng.normal(0, 0.5, seen.y.shape))
+    if kind == 'indefinite':
+        surfaces.A[::10] *= -0.5  # some peaks, which push
+    problem = jet_problem(K, seen.x, surfaces)
     loss = Loss(name, 1.0)
     found = minimise(problem, *moved_pose(seen.R, seen.t, 0.01, rng), loss, 100)
 
     def cost(step):
         there = epipolar_residuals(problem, *moved(found.R, found.t, found.residuals.tangents,
                                                    step))
-        return loss(there.r**2)[0].sum()
+        return (there.sign * loss(there.r**2)[0]).sum()
 
     gradient = approx_fprime(np.zeros(5), cost, 1e-7)
     uphill = approx_fprime(np.full(5, 1e-3), cost, 1e-7)

@@ -175,7 +175,7 @@ def test_the_minimum_of_the_photometric_surface_is_the_shift_of_a_smooth_image(s
 def test_the_photometric_surface_needs_its_windows_inside_both_images(pair):
     width, height = SIZE
     inside = [(5, 5), (width - 6, height - 6), (60, 60)]
-    outside = [(2, 60), (60, height - 3), (width + 9, 60), (-3, -3)]
+    outside = [(2, 60), (60, height - 3), (width - 4.5, 60), (-3, -3)]
     config = EstimatorConfig(method='pjet', window=7)
     places = np.array(inside + outside, float)
     middle = np.full_like(places, 60.0)

@@ -1,0 +1,480 @@
+"""The two-view estimator: how near it comes to what is true, to what is possible, and no crash."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+import pickle
+
+import cv2
+from djet_ros.core.config import EstimatorConfig, METHODS, preset
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import (
+    direction_angle,
+    epipolar_lines,
+    fundamental,
+    line_distances,
+    rotation_angle,
+    sphere_tangents,
+)
+from djet_ros.core.hamming import dense_descriptors
+from djet_ros.core.starts import Pose, several
+from djet_ros.core.surfaces import DescriptorSurface
+from djet_ros.core.tracking import track_jointly
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.scenes import make_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from two_view import (
+    BACKWARD,
+    FORWARD,
+    K,
+    project,
+    SIDEWAYS,
+    SIZE,
+    textured,
+    TURN,
+    two_views,
+    uniform_view,
+)
+
+MOTIONS = {'sideways': SIDEWAYS, 'forward': FORWARD, 'backward': BACKWARD}
+NOISE = 0.5  # pixels, in each coordinate of y
+TRIALS = 200
+
+# The factor by which the covariance is meant to exceed what independent matches would give.
+CAUTION = 4.0
+
+
+def errors_of(result, R, t):
+    """Angles in degrees between an estimate and the true motion."""
+    return np.rad2deg([rotation_angle(result.R, R), direction_angle(result.t, t)])
+
+
+# Synthetic points, exact geometry.
+
+def cramer_rao(seen):
+    """
+    Find the least covariance (5, 5) that an unbiased estimator of the pose can have.
+
+    Inverse of the Fisher information about the pose and every point's depth, with the depths
+    eliminated; from projected points alone, by numeric derivatives, with no epipolar line in it.
+    Coordinates: rotation vector from the left, tangents of t.
+    """
+    step, tangents = 1e-6, sphere_tangents(seen.t)
+
+    def pixels(parameters):
+        omega, along, stretch = parameters[:3], parameters[3:5], parameters[5]
+        t = seen.t + tangents @ along
+        R = Rotation.from_rotvec(omega).as_matrix() @ seen.R
+        return project(K, (1 + stretch) * seen.points @ R.T + t / np.linalg.norm(t))[0]
+
+    J = np.stack([(pixels(step * e) - pixels(-step * e)) / (2 * step) for e in np.eye(6)], 2)
+    information = np.zeros((5, 5))
+    for J_k in J:
+        full = J_k.T @ J_k / NOISE**2
+        information += full[:5, :5] - np.outer(full[:5, 5], full[5, :5]) / full[5, 5]
+    return np.linalg.inv(information)
+
+
+@cache
+def trials(motion, loss):
+    """Re-estimate one geometry under fresh noise, over and over, by re-projection error."""
+    seen = two_views(np.random.default_rng(41), count=300, t=MOTIONS[motion])
+    view = uniform_view()
+    estimator = TwoViewEstimator(preset('best', method='rpe', loss=loss))
+    rng = np.random.default_rng(42)
+    results = [estimator.estimate_matched(view, view, seen.x,
+                                          seen.y + rng.normal(0, NOISE, seen.y.shape))
+               for _ in range(TRIALS)]
+    return seen, results
+
+
+@pytest.mark.parametrize('motion', MOTIONS)
+def test_reprojection_error_comes_as_near_to_the_true_pose_as_the_cramer_rao_bound_lets_it(motion):
+    seen, results = trials(motion, 'none')
+    tangents = sphere_tangents(seen.t)
+    errors = np.array([np.concatenate([
+        Rotation.from_matrix(r.R @ seen.R.T).as_rotvec(), tangents.T @ r.t / (seen.t @ r.t)])
+        for r in results])
+    bound = cramer_rao(seen)
+    ratios = np.sqrt((errors**2).mean(0) / np.diag(bound))
+    overall = np.sqrt(np.einsum('ni,ij,nj->n', errors, np.linalg.inv(bound), errors).mean() / 5)
+    assert 0.9 < overall < 1.15
+    assert ratios.min() > 0.85 and ratios.max() < 1.2
+    assert np.abs(errors.mean(0) / np.sqrt(np.diag(bound) / TRIALS)).max() < 4  # no bias
+
+
+@pytest.mark.parametrize(('motion', 'loss'), [
+    *((motion, 'none') for motion in MOTIONS), ('sideways', 'geman_mcclure'),
+    ('forward', 'cauchy'), ('backward', 'geman_mcclure')])
+def test_the_covariance_tells_how_the_pose_scatters(motion, loss):
+    """In all five directions alike, also where the sign of t was found only at the end."""
+    seen, results = trials(motion, loss)
+    whitened, squares = [], []
+    for r in results:
+        error = np.concatenate([Rotation.from_matrix(seen.R @ r.R.T).as_rotvec(),
+                                sphere_tangents(r.t).T @ seen.t / (seen.t @ r.t)])
+        whitened.append(np.linalg.solve(np.linalg.cholesky(r.covariance_5), error))
+        lifted = np.concatenate([error[:3], seen.t - r.t])
+        squares.append(lifted @ np.linalg.pinv(r.covariance_6, rcond=1e-9) @ lifted)
+    scatter = np.cov(np.transpose(whitened), bias=True)
+    low, high = chi2.ppf([0.0005, 0.9995], 5 * TRIALS) / TRIALS
+    for mean_square in (np.mean(squares), np.mean(np.square(whitened).sum(1))):
+        # 300 matches leave the covariance itself uncertain by a tenth
+        assert low < CAUTION * mean_square < 1.1 * high
+    directions = CAUTION * np.linalg.eigvalsh(scatter)
+    assert directions[0] > 0.5 and directions[-1] < 1.8
+
+
+def test_matches_in_a_handful_of_places_do_not_pretend_to_know_how_sure_the_pose_is():
+    """Neighbours err together: five groups of them are no more than five witnesses."""
+    rng = np.random.default_rng(56)
+    seen = two_views(rng, count=4000)
+    middle = (seen.x % 32 > 1).all(1) & (seen.x % 32 < 31).all(1)
+    cells = np.unique(seen.x[middle] // 32, axis=0)[::37]
+    for count, status in ((5, Status.DEGENERATE), (10, Status.OK)):
+        here = middle & (seen.x[:, None] // 32 == cells[:count]).all(2).any(1)
+        y = seen.y[here] + rng.normal(0, 0.1, (here.sum(), 2))
+        result = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
+            uniform_view(), uniform_view(), seen.x[here], y)
+        assert here.sum() > 20 and result.status == status
+
+
+@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('method', ['rpe', 'five_point'])
+@pytest.mark.parametrize('motion', MOTIONS)
+def test_without_noise_the_pose_is_exact(motion, method, preset_name):
+    seen = two_views(np.random.default_rng(43), t=MOTIONS[motion])
+    result = TwoViewEstimator(preset(preset_name, method=method)).estimate_matched(
+        uniform_view(), uniform_view(), seen.x, seen.y)
+    assert result.status == Status.OK
+    assert errors_of(result, seen.R, seen.t).max() < 1e-4
+    assert np.abs(result.residuals).max() < 1e-3
+    assert result.inliers.all()
+
+
+def test_a_third_of_wrong_matches_is_told_from_the_others():
+    rng = np.random.default_rng(44)
+    seen = two_views(rng, count=300)
+    y = seen.y + rng.normal(0, 0.2, seen.y.shape)
+    wrong = np.arange(300) % 3 == 0
+    y[wrong] = rng.uniform((0, 0), SIZE, (100, 2))
+    result = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
+        uniform_view(), uniform_view(), seen.x, y)
+    assert errors_of(result, seen.R, seen.t)[0] < 0.05
+    assert result.inliers[~wrong].mean() > 0.97
+    assert result.inliers[wrong].mean() < 0.1
+
+
+def test_the_five_point_method_is_opencvs_with_the_sign_of_depth_for_chirality():
+    seen = two_views(np.random.default_rng(45), near=4, far=12)
+    rng = np.random.default_rng(46)
+    y = seen.y + rng.normal(0, 0.3, seen.y.shape)
+    y[::5] += 40
+    result = TwoViewEstimator(preset('paper', method='five_point')).estimate_matched(
+        uniform_view(), uniform_view(), seen.x, y)
+    E, mask = cv2.findEssentialMat(seen.x, y, K, method=cv2.RANSAC, prob=0.999, threshold=1.0)
+    kept = mask.ravel() > 0
+    assert np.array_equal(result.x, seen.x[kept]) and np.array_equal(result.y, y[kept])
+    _, R, t, _ = cv2.recoverPose(E, seen.x, y, K, mask=mask)
+    assert np.allclose(result.R, R, atol=1e-12) and np.allclose(result.t, t.ravel(), atol=1e-12)
+
+
+def test_the_starting_poses_are_the_known_ones_and_driving_straight_ahead_at_each_of_their_turns():
+    turn = Rotation.from_rotvec(TURN).as_matrix()
+    robust, prior = Pose(turn, np.array([1.0, 0, 0])), Pose(turn.T, np.array([0, 1.0, 0]))
+    ahead = np.array([0, 0, -1.0])
+    for known in ([], [robust], [robust, prior]):
+        starts = several(*(*known, None, None)[:2])
+        assert starts[:len(known)] == known
+        assert all(np.array_equal(start.t, ahead) for start in starts[len(known):])
+        turns = [*(pose.R for pose in known), np.eye(3)]
+        assert np.array_equal([start.R for start in starts[len(known):]], turns)
+
+
+@pytest.mark.parametrize('count', [0, 7, 19])
+@pytest.mark.parametrize('method', METHODS)
+def test_too_few_matches_have_a_status_of_their_own(method, count):
+    seen = two_views(np.random.default_rng(47), count=count)
+    result = TwoViewEstimator(EstimatorConfig(method=method, min_matches=20)).estimate_matched(
+        uniform_view(), uniform_view(), seen.x, seen.y)
+    assert result.status == Status.TOO_FEW_MATCHES
+    assert np.array_equal(result.R, np.eye(3)) and not result.t.any()
+
+
+def test_turning_on_the_spot_is_told_from_going():
+    seen = two_views(np.random.default_rng(48), near=1e5, far=1e6)  # as good as without t
+    y = seen.y + np.random.default_rng(49).normal(0, 0.1, seen.y.shape)
+    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
+    result = estimator.estimate_matched(uniform_view(), uniform_view(), seen.x, y)
+    assert result.status == Status.NO_PARALLAX
+    assert not result.t.any()
+    assert errors_of(result, seen.R, seen.t)[0] < 0.02
+
+
+class WatchedSurface(DescriptorSurface):
+    """A descriptor surface that remembers at which keypoints it was asked for."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.asked = []
+
+    def around(self, y):
+        self.asked.append(y)
+        return super().around(y)
+
+
+class Wall:
+    """
+    A wall seen two pixels further to the left, tracked from where it was, round by round.
+
+    tracks: what Algorithm 1 gives after 1, 2, ... rounds; keypoints: (N, 2) where each looked.
+    """
+
+    def __init__(self, step: str) -> None:
+        image = textured(np.random.default_rng(52), (240, 160))
+        camera = np.array([[200.0, 0, 120], [0, 200, 80], [0, 0, 1]])
+        views = [TwoViewEstimator().view(gray, camera)
+                 for gray in (image, np.roll(image, -2, axis=1))]
+        grid = np.stack(np.meshgrid(np.arange(16, 220, 8), np.arange(20, 140, 8)), -1)
+        x = grid.reshape(-1, 2).astype(float)
+        sideways = Pose(np.eye(3), np.array([-1.0, 0, 0]))
+        self.tracks, self.keypoints = [], []
+        for rounds in range(1, 6):
+            config = preset('best', step=step, step_share=0.2, max_iterations=rounds,
+                            epsilon=1e-12, cull_outside=False)
+            surface = WatchedSurface(*views, x, config)
+            self.tracks.append(track_jointly(surface, camera, x, [sideways], config))
+            self.keypoints.append(surface.asked[-1])
+            assert len(surface.asked) == self.tracks[-1].iterations == rounds
+
+
+@pytest.mark.parametrize('step', ['share', 'pixel'])
+def test_keypoints_step_towards_their_optimum_by_a_share_of_the_way_or_a_pixel_at_most(step):
+    wall, lengths = Wall(step), []
+    for n, (before, after) in enumerate(pairwise(wall.keypoints)):
+        way = wall.tracks[n].y_opt - before
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        share = 0.2 if step == 'share' else 1 / np.maximum(length, 1)
+        stays = ~wall.tracks[n].voting[:, None]
+        assert np.allclose(after - before, np.where(stays, 0, share * way), atol=1e-9)
+        lengths.append(length)
+    assert np.min(lengths) < 1 < np.max(lengths)
+
+
+def test_culled_matches_keep_the_loss_they_had_last():
+    """Keypoints at the left border walk on towards their optimum until they have no surface."""
+    wall = Wall('pixel')
+    lost = wall.tracks[0].voting & ~wall.tracks[-1].voting
+    assert 3 <= lost.sum() < len(lost) / 4
+    assert (wall.keypoints[0][lost, 0] == 16).all()
+    for before, after in pairwise(wall.tracks):
+        assert not (after.voting & ~before.voting).any()  # a culled match stays out
+        out = ~after.voting
+        assert np.array_equal(before.losses[out], after.losses[out])
+        assert not np.isclose(before.losses[~out], after.losses[~out]).all()
+    assert np.isfinite(wall.tracks[-1].losses[lost]).all()
+
+
+# Rendered frames.
+
+@cache
+def drive(name, frames, first=0, size=(1241, 376)):
+    """Camera, frames and true motions (R, t) of a rendered scene."""
+    scene = make_scene(name, seed=0, size=size)
+    poses = scene.trajectory(first + frames)[first:]
+    steps = [np.linalg.inv(b) @ a for a, b in pairwise(poses)]
+    return (scene.K, [scene.render(pose, first + i) for i, pose in enumerate(poses)],
+            [(step[:3, :3], step[:3, 3]) for step in steps])
+
+
+def pair_errors(config, K, frames, motions):
+    """Rotation and direction errors (N, 2) in degrees over consecutive frames."""
+    estimator = TwoViewEstimator(config)
+    views = [estimator.view(frame, K) for frame in frames]
+    results, prior = [], None
+    for a, b in pairwise(views):
+        prior = estimator.estimate(a, b, prior)
+        results.append(prior)
+    assert all(result.status == Status.OK for result in results)
+    return np.array([errors_of(result, *motion) for result, motion in zip(results, motions)])
+
+
+def test_descriptors_recover_rotation_to_a_hundredth_of_a_degree_on_rendered_frames():
+    """With ten thousand features; with the preset's two thousand, noise leaves more."""
+    camera, frames, motions = drive('road', 8)
+    errors = pair_errors(preset('best', max_features=10_000), camera, frames[:6], motions[:5])
+    assert np.median(errors[:, 0]) < 0.01
+    assert errors[:, 0].max() < 0.03
+
+
+def test_descriptors_do_better_than_points_with_the_same_matches_on_rendered_frames():
+    errors = {method: pair_errors(preset('best', method=method), *drive('road', 8))
+              for method in ('djet', 'rpe', 'five_point')}
+    points, descriptors = errors['rpe'].mean(0), errors['djet'].mean(0)
+    assert (descriptors < 0.7 * points).all()
+    assert (points < errors['five_point'].mean(0)).all()
+
+
+@pytest.mark.parametrize('scene', ['rotation', 'standstill'])
+@pytest.mark.parametrize('method', ['djet', 'rpe', 'pjet'])
+def test_a_rendered_camera_that_stays_on_the_spot_has_no_parallax(scene, method):
+    K, frames, motions = drive(scene, 3)
+    estimator = TwoViewEstimator(preset('best', method=method))
+    views = [estimator.view(frame, K) for frame in frames]
+    for (a, b), (R, _) in zip(pairwise(views), motions):
+        result = estimator.estimate(a, b)
+        assert result.status == Status.NO_PARALLAX
+        assert not result.t.any()
+        assert np.rad2deg(rotation_angle(result.R, R)) < 0.05
+
+
+@pytest.fixture(scope='module')
+def pair():
+    """Two frames of the road as views, and the motion between them."""
+    K, frames, motions = drive('road', 8)
+    estimator = TwoViewEstimator()
+    return estimator.view(frames[3], K), estimator.view(frames[4], K), motions[3]
+
+
+@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('method', METHODS)
+def test_the_same_frames_give_the_same_bytes(pair, method, preset_name):
+    previous, current, _ = pair
+    config = preset(preset_name, method=method)
+    results = []
+    for _ in range(2):
+        estimator = TwoViewEstimator(config)
+        views = [estimator.view(view.gray.copy(), view.K) for view in (previous, current)]
+        results.append(pickle.dumps(replace(estimator.estimate(*views), timings={})))
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_the_final_step_ends_on_the_epipolar_line(pair, method):
+    previous, current, _ = pair
+    result = TwoViewEstimator(preset('best', method=method)).estimate(previous, current)
+    lines = epipolar_lines(fundamental(current.K, result.R, result.t), result.x)
+    assert np.abs(line_distances(lines, result.y_opt)).max() < 1e-9
+    assert np.allclose(np.abs(result.residuals), np.abs(line_distances(lines, result.y)))
+    assert set(result.timings) == {'matching', 'starts', 'jet', 'result'}
+
+
+def test_the_result_tells_the_hamming_distances_at_the_final_places(pair):
+    previous, current, _ = pair
+    result = TwoViewEstimator().estimate(previous, current)
+    known = np.flatnonzero(np.isfinite(result.hamming))
+    assert len(known) > 0.9 * len(result.x)
+    for k in known[::40]:
+        a, b = (dense_descriptors(view.smoothed, np.rint(place[None]).astype(int))
+                for view, place in ((previous, result.x[k]), (current, result.y_opt[k])))
+        assert result.hamming[k] == cv2.norm(a, b, cv2.NORM_HAMMING)
+
+
+@pytest.mark.parametrize('changes', [{'step': 'share', 'step_share': 0.1},
+                                     {'step': 'share', 'step_share': 0.3}, {'step': 'pixel'}])
+def test_stepping_keypoints_towards_their_optimum_lowers_their_descriptor_distance(pair, changes):
+    previous, current, _ = pair
+    distances = []
+    for rounds in (1, 3, 10):
+        config = preset('paper', max_iterations=rounds, epsilon=1e-9, **changes)
+        result = TwoViewEstimator(config).estimate(previous, current)
+        distances.append(np.nanmean(result.hamming))
+    assert distances[1] < distances[0]
+    assert distances[2] < 0.9 * distances[0]
+
+
+def test_a_prior_helps_or_does_no_harm(pair):
+    previous, current, (R, t) = pair
+    estimator = TwoViewEstimator()
+    alone = estimator.estimate(previous, current)
+    wrong = Rotation.from_rotvec([0, 0.3, 0]).as_matrix()
+    for prior in (RelativePose(Status.OK, R, t / np.linalg.norm(t)),
+                  RelativePose(Status.OK, wrong, np.array([1.0, 0, 0])),
+                  RelativePose(Status.NO_PARALLAX, R), RelativePose(Status.TOO_FEW_MATCHES)):
+        result = estimator.estimate(previous, current, prior)
+        assert rotation_angle(result.R, alone.R) < 1e-4
+        assert direction_angle(result.t, alone.t) < 1e-3
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_black_frame_is_a_status_and_no_crash(pair, method):
+    previous, current, _ = pair
+    estimator = TwoViewEstimator(EstimatorConfig(method=method))
+    black = estimator.view(np.zeros_like(current.gray), current.K)
+    for views in ((previous, black), (black, current), (black, black)):
+        result = estimator.estimate(*views)
+        assert result.status == Status.TOO_FEW_MATCHES
+        assert not result.t.any()
+
+
+# Real frames.
+
+@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_name):
+    sequence = KittiSequence(kitti / 'sequences/06', start=20, end=29)
+    frames = [sequence.image(i) for i in range(len(sequence))]
+    steps = [np.linalg.inv(b) @ a for a, b in pairwise(sequence.poses)]
+    motions = [(step[:3, :3], step[:3, 3]) for step in steps]
+    errors = {method: pair_errors(preset(preset_name, method=method), sequence.K, frames, motions)
+              for method in ('djet', 'rpe', 'five_point')}
+    points, descriptors = errors['rpe'].mean(0), errors['djet'].mean(0)
+    assert (descriptors < points).all()
+    assert (points < errors['five_point'].mean(0)).all()
+    assert errors['djet'][:, 0].max() < 0.1
+
+
+# Anything else.
+
+def degenerate(kind, rng, count):
+    """Make matches (x, y) of sorts that no camera would give, and of some that one would."""
+    x, y = rng.uniform((0, 0), (160, 120), (2, count, 2))
+    one, right = np.tile(x[:1], (count, 1)), np.array([5.0, 0.0])
+    level = np.column_stack([x[:, 0], np.full(count, 60.0)])
+    grid = np.rint(x / 40) * 40
+    odd = np.arange(count)[:, None] % 2
+    return {'by chance': (x, y), 'all one': (one, one), 'from one': (one, y), 'to one': (x, one),
+            'nearly one': (one, one + 1e-9 * y), 'standing still': (x, x),
+            'all alike': (x, x + right), 'on a line': (level, level + right),
+            'on a grid': (grid, grid + right), 'half still': (x, x + odd * right),
+            'far outside': (x * 1e6, y - 1e6)}[kind]
+
+
+SORTS = ('by chance', 'all one', 'from one', 'to one', 'nearly one', 'standing still', 'all alike',
+         'on a line', 'on a grid', 'half still', 'far outside')
+
+
+@cache
+def small_views():
+    estimator = TwoViewEstimator()
+    camera = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
+    noise = textured(np.random.default_rng(53), (160, 120))
+    return [estimator.view(image, camera)
+            for image in (noise, np.roll(noise, 3, 1), np.full_like(noise, 128))]
+
+
+@given(kind=st.sampled_from(SORTS), count=st.integers(1, 60), seed=st.integers(0, 2**32 - 1),
+       method=st.sampled_from(METHODS), preset_name=st.sampled_from(['best', 'paper']),
+       images=st.tuples(*2 * [st.integers(0, 2)]),
+       indefinite=st.sampled_from(['project', 'drop', 'keep']))
+@settings(max_examples=200, deadline=None)
+def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, preset_name, images,
+                                                   indefinite):
+    x, y = degenerate(kind, np.random.default_rng(seed), count)
+    views = [small_views()[i] for i in images]
+    config = preset(preset_name, method=method, min_matches=8, indefinite=indefinite)
+    result = TwoViewEstimator(config).estimate_matched(*views, x, y)
+    assert np.allclose(result.R @ result.R.T, np.eye(3), atol=1e-9)
+    assert np.linalg.norm(result.t) == pytest.approx(float(result.status == Status.OK))
+    assert np.isfinite(result.y_opt).all()
+    if result.status == Status.OK:
+        variances = np.linalg.eigvalsh(result.covariance_5)
+        assert variances[0] > -1e-12 * variances[-1] and variances[-1] > 0
