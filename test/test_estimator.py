@@ -389,7 +389,7 @@ def test_stepping_keypoints_towards_their_optimum_lowers_their_descriptor_distan
         result = TwoViewEstimator(config).estimate(previous, current)
         distances.append(np.nanmean(result.hamming))
     assert distances[1] < distances[0]
-    assert distances[2] < 0.9 * distances[0]
+    assert distances[2] < 0.95 * distances[0]
 
 
 def test_a_prior_helps_or_does_no_harm(pair):
