@@ -24,6 +24,7 @@ COMMANDS = {
     'live': 'the odometry on a ROS 2 graph, without ROS',
     'play': 'a recording onto a ROS 2 graph, without ROS',
     'echo': 'what a live odometry says, in the terminal',
+    'slam': 'close loops offline and optimise the trajectory with GTSAM',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',

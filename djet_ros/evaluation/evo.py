@@ -28,12 +28,17 @@ class TrajectoryMetrics:
     rpe_deg: float
 
 
-def trajectory_metrics(truth: Path, estimate: Path) -> TrajectoryMetrics:
-    """Compare two TUM files; DjetError where evo is missing or refuses them."""
+def trajectory_metrics(truth: Path, estimate: Path, scaled: bool = True) -> TrajectoryMetrics:
+    """
+    Compare two TUM files; DjetError where evo is missing or refuses them.
+
+    Not scaled: the estimate's scale is unknown and is aligned as well.
+    """
+    scale = () if scaled else ('--align', '--correct_scale')
     return TrajectoryMetrics(
-        _rmse('evo_ape', truth, estimate, '--align'),
-        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'trans_part'),
-        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'angle_deg'))
+        _rmse('evo_ape', truth, estimate, *(scale or ['--align'])),
+        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'trans_part', *scale),
+        _rmse('evo_rpe', truth, estimate, '--pose_relation', 'angle_deg', *scale))
 
 
 def find_tool(name: str) -> str:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 MessageType = Callable[[str], Any]
 
 # The first pose is exact by definition, but filters divide by what they are told.
-_LEAST_COVARIANCE = np.eye(6) * 1e-9
+LEAST_COVARIANCE = np.eye(6) * 1e-9
 
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -107,7 +107,7 @@ class Messages:
             twist=self._type('geometry_msgs/msg/TwistWithCovariance')(
                 twist=self._type('geometry_msgs/msg/Twist')(
                     linear=self._vector(velocity[:3]), angular=self._vector(velocity[3:])),
-                covariance=(covariance + _LEAST_COVARIANCE).ravel()))
+                covariance=(covariance + LEAST_COVARIANCE).ravel()))
 
     def pose_stamped(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the integrated pose in the odom frame."""
@@ -161,7 +161,7 @@ class Messages:
 
     def _pose_with_covariance(self, pose: Array, covariance: Array) -> Any:
         return self._type('geometry_msgs/msg/PoseWithCovariance')(
-            pose=self._pose(pose), covariance=(covariance + _LEAST_COVARIANCE).ravel())
+            pose=self._pose(pose), covariance=(covariance + LEAST_COVARIANCE).ravel())
 
     def _pose(self, pose: Array) -> Any:
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()

@@ -1,0 +1,178 @@
+"""``djet slam``: loops closed and the trajectory optimised, by GTSAM."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from djet_ros.config import add_flags, Config, flag_values, load_yaml, with_values
+from djet_ros.core.parameter import describe
+from djet_ros.data.bags import is_bag
+from djet_ros.data.pose_graph import read_results
+from djet_ros.data.replay import Replay
+from djet_ros.data.results import ResultsFolder
+from djet_ros.data.results import SUMMARY as REPLAY_SUMMARY
+from djet_ros.data.sources import open_source, pose_of, Source
+from djet_ros.data.text import read_yaml
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.ground_truth import GroundTruth
+from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.report import FILES, PLOT, write_report
+from djet_ros.slam.run import run_slam
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+DESCRIPTION = """\
+Close loops offline: choose keyframes, propose places seen before by their ORB descriptors, verify
+them with the two-view estimator, and optimise the graph of odometry and loops with GTSAM. Writes
+the trajectory before and after, the graph (g2o, csv), a plot and slam.json. Loops get their
+length from the depths that the odometry gives to the points they share; how well the odometry's
+own lengths are known (--scale, --scale-uncertainty) decides what loops may change.
+"""
+
+_REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
+                 'odometry.scale_uncertainty')
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser: argparse.ArgumentParser = subparsers.add_parser('slam', description=DESCRIPTION)
+    parser.add_argument('input', type=Path, metavar='RESULTS_OR_RECORDING',
+                        help="folder that 'djet replay' wrote, or what it can replay")
+    parser.add_argument('--output', type=Path, default=Path('slam'), metavar='DIR',
+                        help='folder of what is written (default: %(default)s)')
+    parser.add_argument('--overwrite', action='store_true',
+                        help='replace what an earlier run left in the output folder')
+    parser.add_argument('--source', type=Path, metavar='RECORDING',
+                        help='where the recording of RESULTS is now, if it was moved')
+    parser.add_argument('--poses', type=Path, metavar='FILE',
+                        help="ground truth instead of the recording's own")
+    for what in ('image', 'info', 'speed'):
+        parser.add_argument(f'--{what}-topic', metavar='TOPIC',
+                            help='needed where the bag has several')
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help='parameters of the odometry as YAML; for a recording, as the next '
+                        'five')
+    add_flags(parser, _REPLAY_FLAGS)
+    slam = parser.add_argument_group('keyframes and loops')
+    for name, description in describe(SlamConfig()).items():
+        default = getattr(SlamConfig(), name)
+        slam.add_argument('--' + name.replace('_', '-'), type=type(default), default=default,
+                          metavar=type(default).__name__.upper(),
+                          help=f'{description.text} (default: %(default)s)')
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run, with progress on stderr, and show what came of it."""
+    try:
+        parameters = SlamConfig(**{field.name: getattr(args, field.name)
+                                   for field in fields(SlamConfig)})
+    except ValueError as error:
+        raise DjetError(str(error)) from None
+    _make_room(args.output, args.overwrite)
+    results = args.input
+    if (results / 'frames.csv').is_file():
+        if args.config or flag_values(args):
+            raise DjetError(f'{results} holds results, which have their parameters already; give '
+                            'the recording itself, to replay it with others')
+    else:
+        results = _replayed(args)
+    source, name = _source(results, args)
+    try:
+        config, frames = load_yaml(results / 'config.yaml'), read_results(results)
+        with _bar('keyframes') as progress:
+            slam = run_slam(frames, source, config, parameters, progress)
+        truth = _truth(source).at(slam.frames.stamps_ns)
+    finally:
+        source.close()
+    summary = write_report(args.output, slam, truth, name, config, parameters)
+    Console().print(_table(summary))
+    print(f'results: {args.output}\nplot: {args.output / PLOT}')
+    return 0
+
+
+def _make_room(folder: Path, overwrite: bool) -> None:
+    """Make the folder; of an earlier run only its own files are removed."""
+    present = [folder / name for name in FILES if (folder / name).exists()]
+    if present and not overwrite:
+        raise DjetError(f'{present[0]} exists already; choose another --output, or replace it '
+                        'with --overwrite')
+    for file in present:
+        file.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _replayed(args: argparse.Namespace) -> Path:
+    """Replay the recording into the output folder, and give the folder of the results."""
+    config = with_values(load_yaml(args.config) if args.config else Config(), flag_values(args))
+    source = open_source(args.input, args.image_topic, args.info_topic, args.poses,
+                         speed=config.odometry.scale == 'speed', speed_topic=args.speed_topic)
+    path: Path = args.output / 'replay'
+    try:
+        with ResultsFolder(path, config, args.overwrite) as folder, _bar('replay') as progress:
+            done = count(1)
+            outcome = Replay(source, config, folder, str(args.input)).run(
+                lambda: progress(next(done), len(source)))
+    finally:
+        source.close()
+    if outcome.problem:
+        raise DjetError(outcome.problem)
+    return path
+
+
+def _source(results: Path, args: argparse.Namespace) -> tuple[Source, str]:
+    """Open the recording that results are of, and give its name too."""
+    summary = read_yaml(results / REPLAY_SUMMARY)
+    if not isinstance(summary, dict) or not isinstance(summary.get('source'), str):
+        raise DjetError(f'{results / REPLAY_SUMMARY} does not say which recording was replayed')
+    path = args.source or Path(summary['source'])
+    if not path.exists():
+        raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
+                        '--source where it is')
+    recorded = path.is_file() or is_bag(path)
+    topic = args.image_topic or (str(summary.get('image_topic')) if recorded else None)
+    return open_source(path, topic, args.info_topic, args.poses), summary['source']
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar; give the function that moves it, to (done, of how many)."""
+    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
+                  TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _truth(source: Source) -> GroundTruth:
+    truth = GroundTruth()
+    if source.ground_truth_topic is not None:
+        for message in source.messages({source.ground_truth_topic}):
+            truth.add(*pose_of(message.message))
+    return truth
+
+
+def _table(summary: dict[str, Any]) -> Table:
+    table = Table(title=f"{Path(summary['source']).name}: scale {summary['scale']}")
+    for heading in ('', 'before', 'after'):
+        table.add_column(heading, justify='right' if heading else 'left')
+    table.add_row('keyframes', '', f"{summary['keyframes']} of {summary['frames']}")
+    for kind, number in sorted(summary['edges'].items()):
+        rejected = summary['rejected'].get(kind, 0)
+        table.add_row(f'edges: {kind}', '',
+                      f'{number}, {rejected} not trusted' if rejected else str(number))
+    if 'errors' in summary:
+        before, after = summary['errors']['before'], summary['errors']['after']
+        for name in before:
+            table.add_row(_TITLES[name], f'{before[name]:.4f}', f'{after[name]:.4f}')
+    return table
+
+
+_TITLES = {'ape_m': 'positions, rmse in m', 'evo_ape_m': 'evo: APE, rmse in m',
+           'evo_rpe_m': 'evo: RPE, rmse in m', 'evo_rpe_deg': 'evo: RPE, rmse in deg'}

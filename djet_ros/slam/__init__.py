@@ -1,0 +1,1 @@
+"""Offline SLAM: keyframes, loops between them, and a graph optimised by GTSAM."""

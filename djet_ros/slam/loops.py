@@ -1,0 +1,165 @@
+"""Edges between keyframes that are no neighbours: links over a few, and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import rays, unit
+from djet_ros.core.hamming import smooth
+from djet_ros.core.types import Array, Features, RelativePose, Status, View
+from djet_ros.data.pose_graph import Edge, PoseGraph
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.messages import LEAST_COVARIANCE
+from djet_ros.odometry.scale import Length, unknown
+from djet_ros.odometry.uncertainty import motion_covariance
+from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
+from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.places import PlaceIndex
+import numpy as np
+from numpy.typing import NDArray
+
+# A place is seen again from beside, from nearer or from farther off: its features are sought in
+# a wider circle than those of the next frame.
+_SEARCH_RADIUS = 0.4
+
+# Points that two pairs of views must share, for the one to tell the other its length.
+_LEAST_SHARED = 20
+
+# Parallax in rad below which a depth is noise (about a pixel of a car's camera).
+_LEAST_PARALLAX = 1.5e-3
+
+
+class EdgeFinder:
+    """
+    Estimates edges between keyframes from their images.
+
+    frames: one for each keyframe of the graph. The images are all kept.
+    """
+
+    def __init__(self, graph: PoseGraph, frames: Iterator[Frame], estimator: EstimatorConfig,
+                 config: SlamConfig) -> None:
+        """Read the images and find their features."""
+        self._graph, self._config = graph, config
+        self._near = TwoViewEstimator(estimator)
+        self._wide = TwoViewEstimator(replace(
+            estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
+        self._frames: list[Frame] = []
+        self._features: list[Features] = []
+        for frame in frames:
+            self._frames.append(frame)
+            self._features.append(self._near.features(frame.gray))
+        self._places = PlaceIndex(self._features)
+        # The neighbour before each keyframe: the motion to it has a length.
+        self._before = {edge.target: edge for edge in graph.edges if edge.kind == 'odometry'}
+
+    def links(self, current: int) -> Iterator[Edge]:
+        """
+        Link a keyframe to the last few before it, but for its neighbour, by direct estimates.
+
+        Their lengths are taken as unknown: the odometry's are in the graph already.
+        """
+        previous = current
+        for step in range(self._config.links):
+            if previous not in self._before:
+                return
+            previous = self._before[previous].source
+            if step:
+                yield from self._link(current, previous)
+
+    def _link(self, current: int, previous: int) -> Iterator[Edge]:
+        relative = self._wide.estimate(self._view(previous), self._view(current))
+        if relative.status is Status.OK and self._is_sure(relative):
+            guess = np.linalg.norm((np.linalg.inv(self._graph.poses[previous])
+                                    @ self._graph.poses[current])[:3, 3])
+            yield _edge(previous, current, relative, unknown(float(guess)), 'link')
+
+    def loops(self, current: int) -> Iterator[Edge]:
+        """Propose keyframes that look like this one, and give those that geometry bears out."""
+        config, stamps = self._config, self._graph.stamps_ns
+        before = int(np.searchsorted(stamps[:current], stamps[current] - config.loop_gap * 1e9))
+        votes = self._places.votes(current, before)
+        best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
+        for place in best[votes[best] >= config.loop_votes].tolist():
+            yield from self._loop(current, place)
+
+    def _loop(self, current: int, place: int) -> Iterator[Edge]:
+        view = self._view(current)
+        relative = self._wide.estimate(view, self._view(place))
+        if relative.status in TRACKED and self._is_sure(relative):
+            yield _edge(current, place, relative, self._length(current, view, relative), 'loop')
+
+    def _length(self, current: int, view: View, relative: RelativePose) -> Length:
+        """Length of a loop's translation, by the points that the last step of the way saw too."""
+        step = self._before.get(current)
+        guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
+        if step is None or not step.scale_known:
+            return unknown(guess)
+        back = self._near.estimate(view, self._view(step.source))
+        if back.status is not Status.OK:
+            return unknown(guess)
+        share = np.sqrt(_variance_along(step)) / guess
+        return transferred_length(back, relative, Length(guess, guess * share, True), view.K)
+
+    def _is_sure(self, relative: RelativePose) -> bool:
+        inliers = int(relative.inliers.sum())
+        return (inliers >= self._config.loop_inliers
+                and inliers >= self._config.loop_share * len(relative.x))
+
+    def _view(self, keyframe: int) -> View:
+        frame = self._frames[keyframe]
+        # A copy of the features: what they cache of themselves is large.
+        return View(frame.gray, frame.K, replace(self._features[keyframe]), smooth(frame.gray))
+
+
+def transferred_length(step: RelativePose, other: RelativePose, length: Length,
+                       K: Array) -> Length:
+    """
+    Length of another motion from the same first view, from the length of a step.
+
+    A point that both pairs saw has one depth, so that its inverse depths in units of the two
+    translations are as the lengths of these. Unknown where too few points are shared.
+    """
+    _, here, there = np.intersect1d(_pixels(step), _pixels(other), return_indices=True)
+    depths, parallax = _inverse_depths(step, K)
+    others, _ = _inverse_depths(other, K)
+    told = parallax[here] > _LEAST_PARALLAX
+    ratios = others[there][told] / depths[here][told]
+    ratios = ratios[np.isfinite(ratios)]
+    if len(ratios) < _LEAST_SHARED:
+        return unknown(length.value)
+    ratio = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
+    if ratio <= 0:
+        return unknown(length.value)
+    return Length(length.value * ratio,
+                  float(np.hypot(length.value * spread, length.sigma * ratio)), length.known)
+
+
+def _pixels(relative: RelativePose) -> NDArray[np.int64]:
+    """Numbers (M,) for the inliers, equal where the pixels in the first view are."""
+    columns, rows = np.rint(4 * relative.x[relative.inliers]).astype(np.int64).T
+    return np.asarray(columns + (rows << 20))
+
+
+def _inverse_depths(relative: RelativePose, K: Array) -> tuple[Array, Array]:
+    """Inverse depths in units of the translation, and parallaxes in rad, (M,) of the inliers."""
+    m = rays(K, relative.x[relative.inliers]) @ relative.R.T
+    y = rays(K, relative.y_opt[relative.inliers])
+    # y x (m + rho t) = 0, by least squares: linear, so that noise about zero stays about zero
+    shift, lever = np.cross(y, m), np.cross(y, relative.t)
+    inverse = -(shift * lever).sum(1) / np.maximum((lever**2).sum(1), 1e-12)
+    return inverse, np.linalg.norm(shift, axis=1) / (y**2).sum(1)
+
+
+def _edge(source: int, target: int, relative: RelativePose, length: Length, kind: str) -> Edge:
+    return Edge(source, target, camera_motion(relative, length),
+                motion_covariance(relative, length) + LEAST_COVARIANCE, kind, length.known)
+
+
+def _variance_along(edge: Edge) -> float:
+    """Variance of the length of an edge's motion."""
+    direction = unit(edge.motion[:3, 3])
+    return float(direction @ edge.covariance[:3, :3] @ direction)

@@ -1,0 +1,108 @@
+"""What is written about a run of the offline SLAM."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+import json
+from pathlib import Path
+from typing import Any
+
+from djet_ros import __version__
+from djet_ros.config import Config
+from djet_ros.core.types import Array
+from djet_ros.data.pose_graph_files import write_graph
+from djet_ros.data.trajectories import TumWriter
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.evaluation.evo import find_tool, trajectory_metrics
+from djet_ros.evaluation.style import COLOURS, figure
+from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.run import Slam, travelled
+import numpy as np
+from numpy.typing import NDArray
+
+PLOT = 'slam.png'
+SUMMARY = 'slam.json'
+FILES = (SUMMARY, PLOT, 'pose_graph.g2o', 'pose_graph.csv', 'before_tum.txt', 'after_tum.txt',
+         'truth_tum.txt')
+
+
+def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Config,
+                 parameters: SlamConfig) -> dict[str, Any]:
+    """
+    Write trajectories, graph, plot and summary into a folder, and give the summary.
+
+    truth: (N, 4, 4) of the frames, NaN where it is not known; name: of the recording. The
+    optimised graph holds all edges; those that the kernel does not trust are in the csv too.
+    """
+    frames, graph = slam.frames, slam.solution.graph
+    ways = {'before': slam.before(), 'after': slam.after()}
+    for which, poses in ways.items():
+        _write_tum(folder / f'{which}_tum.txt', frames.stamps_ns, poses)
+    for kind in ('g2o', 'csv'):
+        write_graph(graph, folder / f'pose_graph.{kind}', kind)
+    kinds = Counter(edge.kind for edge in graph.edges)
+    summary: dict[str, Any] = {
+        'source': name, 'scale': config.odometry.scale, 'scale_known': slam.scale_known,
+        'scale_uncertainty': config.odometry.scale_uncertainty if slam.scale_known else None,
+        'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
+        'rejected': {kind: slam.rejected(kind) for kind in ('link', 'loop') if kinds[kind]},
+        'way': travelled(slam.before()), 'parameters': asdict(parameters),
+        'version': __version__}
+    known = np.isfinite(truth).all(axis=(1, 2))
+    if known.sum() > 2:
+        _write_tum(folder / 'truth_tum.txt', frames.stamps_ns[known], truth[known])
+        summary['errors'] = {which: _errors(folder, which, poses, truth, slam.scale_known)
+                             for which, poses in ways.items()}
+    _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, Path(name).name)
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n')
+    return summary
+
+
+def _errors(folder: Path, which: str, poses: Array, truth: Array,
+            scaled: bool) -> dict[str, float]:
+    """Errors of a trajectory, in metres and degrees; evo's own only where it is installed."""
+    there = truth[:, :3, 3]
+    errors = {'ape_m': position_rmse(aligned(poses[:, :3, 3], there, scaled), there)}
+    try:
+        find_tool('evo_ape')
+    except DjetError:
+        return errors
+    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{which}_tum.txt', scaled)
+    return errors | {f'evo_{name}': value for name, value in asdict(metrics).items()}
+
+
+def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
+    """Draw the way from above, before and after, with the loops that were closed."""
+    ways = [slam.before()[:, :3, 3], slam.after()[:, :3, 3]]
+    if truth is not None:
+        ways = [aligned(way, truth[:, :3, 3], slam.scale_known) for way in ways]
+    with figure(path, 7, 7) as page:
+        axes = page.add_subplot(aspect='equal')
+        if truth is not None:
+            axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
+        axes.plot(ways[0][:, 0], ways[0][:, 2], '--', color=COLOURS['rpe'], label='before')
+        axes.plot(ways[1][:, 0], ways[1][:, 2], color=COLOURS['djet'], label='after')
+        places = _keyframe_places(slam, ways[1])
+        loops = [edge for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
+                 if edge.kind == 'loop' and trust >= 0.5]
+        for edge in loops:
+            ends = places[[edge.source, edge.target]]
+            axes.plot(ends[:, 0], ends[:, 2], color=COLOURS['pjet'], lw=0.8,
+                      label='loop' if edge is loops[0] else None)
+        unit = 'm' if slam.scale_known or truth is not None else 'units'
+        axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
+        axes.legend()
+
+
+def _keyframe_places(slam: Slam, way: Array) -> Array:
+    """Positions (M, 3) of the keyframes among those of all frames (N, 3)."""
+    _, first = np.unique(slam.keyframes.keyframe, return_index=True)
+    return np.asarray(way[first])
+
+
+def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+    with TumWriter(path) as writer:
+        for stamp, pose in zip(stamps_ns.tolist(), poses):
+            writer.write(stamp, pose)

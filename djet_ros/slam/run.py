@@ -1,0 +1,73 @@
+"""From the results of a replay to an optimised trajectory: the offline SLAM on one screen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from djet_ros.config import Config
+from djet_ros.core.types import Array
+from djet_ros.data.pose_graph import PoseGraph
+from djet_ros.data.sources import Source
+from djet_ros.slam.backend import optimise, Solution
+from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.images import frames_at
+from djet_ros.slam.keyframes import choose_keyframes, Keyframes
+from djet_ros.slam.loops import EdgeFinder
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Slam:
+    """
+    What came of a run.
+
+    frames: graph of all frames, as the odometry made it; keyframes; solution: the graph of the
+    keyframes with links and loops, optimised.
+    """
+
+    frames: PoseGraph
+    keyframes: Keyframes
+    solution: Solution
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether the odometry's lengths are in metres."""
+        return all(edge.scale_known for edge in self.frames.edges if edge.kind == 'odometry')
+
+    def before(self) -> Array:
+        """Poses (N, 4, 4) of all frames by odometry."""
+        return self.frames.poses
+
+    def after(self) -> Array:
+        """Poses (N, 4, 4) of all frames, each moved with its keyframe."""
+        return self.keyframes.all_poses(self.solution.graph.poses)
+
+    def rejected(self, kind: str) -> int:
+        """Count the edges of a kind that the robust kernel trusts by less than a half."""
+        return sum(bool(edge.kind == kind and trust < 0.5)
+                   for edge, trust in zip(self.solution.graph.edges, self.solution.trust))
+
+
+def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig,
+             progress: Callable[[int, int], None] | None = None) -> Slam:
+    """
+    Choose keyframes, find links and loops in the recording's images, and optimise.
+
+    frames: the graph of the recording's replay with the configuration; progress is called with
+    (keyframes done, keyframes in all). Raises DjetError.
+    """
+    keyframes = choose_keyframes(frames, slam)
+    graph = keyframes.graph
+    finder = EdgeFinder(graph, frames_at(source, config, graph.stamps_ns), config.estimator, slam)
+    edges = [*graph.edges]
+    for done in range(len(graph.poses)):
+        edges += [*finder.links(done), *finder.loops(done)]
+        if progress is not None:
+            progress(done + 1, len(graph.poses))
+    return Slam(frames, keyframes, optimise(replace(graph, edges=tuple(edges))))
+
+
+def travelled(poses: Array) -> float:
+    """Length of the way through poses (N, 4, 4)."""
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

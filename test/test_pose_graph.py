@@ -1,0 +1,292 @@
+"""Pose graphs: what a replay's results become, and what other programs read of it."""
+
+import csv
+from dataclasses import replace
+import os
+import shutil
+import subprocess
+import sys
+
+from cards import Cards, K, pose, SIZE
+from djet_ros.config import Config, from_flat
+from djet_ros.core.geometry import rotation_exp
+from djet_ros.data.bags import BagMessage
+from djet_ros.data.pose_graph import Edge, PoseGraph, read_results
+from djet_ros.data.pose_graph_files import write_graph
+from djet_ros.data.replay import Replay
+from djet_ros.data.results import ResultsFolder
+from djet_ros.data.trajectories import read_tum
+from djet_ros.errors import DjetError
+from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
+from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
+import numpy as np
+import pytest
+from ros_messages import camera_info, image
+
+DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
+FRAMES = 5
+STEP = pose(x=0.25, z=0.15, yaw=0.01)
+
+
+def djet(*words, expect=0):
+    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
+                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+    assert done.returncode == expect, done.stderr
+    assert 'Traceback' not in done.stderr
+    return done
+
+
+class Drive:
+    """A source of images of cards; black ones and gaps in time as wanted."""
+
+    image_topic, info_topic = '/image_rect', '/camera_info'
+    ground_truth_topic = speed_topic = None
+
+    def __init__(self, black=(), gaps=()):
+        self._black, self._gaps = black, gaps
+
+    def __len__(self):
+        return FRAMES
+
+    def messages(self, topics=None):
+        cards, here, stamp = Cards(), np.eye(4), 10**9
+        for i in range(FRAMES):
+            stamp += 10**8 + (10**10 if i in self._gaps else 0)
+            gray = cards.gray(here)
+            if i in self._black:
+                gray = np.zeros_like(gray)
+            yield BagMessage(self.info_topic, stamp, camera_info(K, SIZE, stamp))
+            yield BagMessage(self.image_topic, stamp, image(gray, stamp_ns=stamp))
+            here = here @ STEP
+
+
+def replayed(path, source=None, **parameters):
+    config = from_flat({'odometry.scale': 'constant', **parameters}) if parameters else Config()
+    with ResultsFolder(path, config) as folder:
+        Replay(source or Drive(), config, folder, 'drive').run()
+    return path
+
+
+@pytest.fixture(scope='module')
+def results(tmp_path_factory):
+    """Results with a known scale."""
+    return replayed(tmp_path_factory.mktemp('known') / 'results',
+                    **{'odometry.scale_value': 0.29})
+
+
+@pytest.fixture(scope='module')
+def unscaled(tmp_path_factory):
+    return replayed(tmp_path_factory.mktemp('unknown') / 'results')
+
+
+def random_graph(seed, vertices=8):
+    """Give a graph whose poses do not agree with its edges, and full covariances."""
+    rng = np.random.default_rng(seed)
+
+    def motion(size):
+        result = np.eye(4)
+        result[:3, :3] = rotation_exp(size * rng.normal(size=3))
+        result[:3, 3] = rng.normal(size=3)
+        return result
+
+    def covariance():
+        A = rng.normal(size=(6, 6)) * [1, 1, 1, 0.1, 0.1, 0.1]
+        return (A.T @ A + np.diag([1, 1, 1, 0.01, 0.01, 0.01])) * 1e-2
+
+    poses = np.array([motion(0.5) for _ in range(vertices)])
+    edges = [Edge(i, i + 1, motion(0.3), covariance()) for i in range(vertices - 1)]
+    edges += [Edge(vertices - 1, 0, motion(0.3), covariance(), 'loop')]
+    return PoseGraph(np.arange(vertices) * 10**8 + 10**9, poses, tuple(edges))
+
+
+def exact_graph(vertices=6):
+    """Give a graph whose poses agree with its edges."""
+    graph = random_graph(3, vertices)
+    edges = [replace(edge, motion=np.linalg.inv(graph.poses[edge.source])
+                     @ graph.poses[edge.target]) for edge in graph.edges]
+    return replace(graph, edges=tuple(edges))
+
+
+# From results
+
+def test_a_replay_becomes_a_chain_of_its_frames(results):
+    graph = read_results(results)
+    stamps, poses = read_tum(results / 'trajectory_tum.txt')
+    assert np.array_equal(graph.stamps_ns, stamps)
+    assert np.array_equal(graph.poses, poses)
+    assert [(edge.source, edge.target) for edge in graph.edges] == [
+        (i, i + 1) for i in range(FRAMES - 1)]
+    for edge in graph.edges:
+        assert edge.kind == 'odometry'
+        assert edge.scale_known
+        assert np.allclose(poses[edge.source] @ edge.motion, poses[edge.target], atol=1e-9)
+
+
+def test_body_axes_in_the_messages_do_not_change_the_graph(results, tmp_path):
+    turned = read_results(replayed(tmp_path / 'body', **{
+        'odometry.scale_value': 0.29, 'odometry.frame_convention': 'body'}))
+    graph = read_results(results)
+    for edge, other in zip(graph.edges, turned.edges, strict=True):
+        assert np.allclose(edge.motion, other.motion, atol=1e-12)
+        assert np.allclose(edge.covariance, other.covariance, atol=1e-12)
+
+
+def test_an_unknown_scale_is_weak_information_along_the_translation_alone(unscaled):
+    graph = read_results(unscaled)
+    for edge in graph.edges:
+        assert not edge.scale_known
+        information = graph.information(edge)
+        along = np.append(edge.motion[:3, :3].T @ edge.motion[:3, 3], np.zeros(3))
+        assert along @ np.linalg.inv(information) @ along == pytest.approx(
+            UNKNOWN_LENGTH_SIGMA**2, rel=1e-2)
+        assert np.linalg.eigvalsh(information)[1] > 1
+
+
+def test_a_bad_frame_is_no_vertex_and_is_bridged(tmp_path):
+    graph = read_results(replayed(tmp_path / 'results', Drive(black=[2])))
+    assert len(graph.poses) == FRAMES - 1
+    assert [(edge.source, edge.target, edge.kind) for edge in graph.edges] == [
+        (i, i + 1, 'odometry') for i in range(FRAMES - 2)]
+
+
+def test_a_hole_in_time_is_an_edge_about_which_nothing_is_known(tmp_path):
+    graph = read_results(replayed(tmp_path / 'results', Drive(gaps=[3])))
+    assert [edge.kind for edge in graph.edges] == ['odometry', 'odometry', 'unknown', 'odometry']
+    assert np.array_equal(graph.edges[2].covariance, UNKNOWN_MOTION)
+    assert graph.information(graph.edges[2]).max() < 1
+
+
+def test_other_folders_and_damaged_results_are_refused(results, tmp_path):
+    with pytest.raises(DjetError, match='holds no results'):
+        read_results(tmp_path)
+    for name, damage, said in (
+            ('frames.csv', lambda text: text.replace('OK', 'SPLENDID', 1), 'line 3'),
+            ('frames.csv', lambda text: text.replace('1100000000', '1100000001'), 'same run'),
+            ('trajectory_tum.txt', lambda text: 'x' + text, 'not a number')):
+        folder = tmp_path / f'damaged {said}'
+        shutil.copytree(results, folder)
+        file = folder / name
+        file.write_text(damage(file.read_text()))
+        with pytest.raises(DjetError, match=said):
+            read_results(folder)
+
+
+# Information matrices
+
+def test_the_information_is_the_inverse_covariance_of_small_errors_at_the_target():
+    """By sampling: errors in ROS's sense, as g2o and GTSAM see them."""
+    graph = random_graph(1)
+    edge = replace(graph.edges[0], covariance=graph.edges[0].covariance * 1e-6)
+    rng = np.random.default_rng(0)
+    errors = []
+    for sample in rng.multivariate_normal(np.zeros(6), edge.covariance, 20_000):
+        wrong = edge.motion.copy()
+        wrong[:3, 3] += sample[:3]
+        wrong[:3, :3] = rotation_exp(sample[3:]) @ wrong[:3, :3]
+        delta = np.linalg.inv(edge.motion) @ wrong
+        errors.append([*delta[:3, 3], delta[2, 1], delta[0, 2], delta[1, 0]])
+    white = np.linalg.cholesky(graph.information(edge)).T @ np.transpose(errors)
+    assert np.abs(np.cov(white) - np.eye(6)).max() < 0.05
+
+
+@pytest.mark.parametrize(('spoil', 'said'), [
+    (lambda C: C * np.nan, 'is not a finite 6x6 matrix'),
+    (lambda C: np.zeros((6, 6)), 'has the variance 0'),
+    (lambda C: -C, 'has the variance -'),
+    (lambda C: C + np.triu(C, 1), 'is not symmetric'),
+    (lambda C: np.ones((6, 6)), 'is singular'),
+    (lambda C: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
+    (lambda C: C[:5, :5], 'is not a finite 6x6 matrix')])
+def test_covariances_that_have_no_inverse_are_refused_with_the_name_of_the_edge(
+        spoil, said, tmp_path):
+    graph = random_graph(2)
+    bad = replace(graph.edges[4], covariance=spoil(graph.edges[4].covariance))
+    graph = replace(graph, edges=(*graph.edges[:4], bad, *graph.edges[5:]))
+    for kind in ('g2o', 'csv'):
+        with pytest.raises(DjetError, match=r'edge 4 -> 5 \(1400000000 ns') as refused:
+            write_graph(graph, tmp_path / 'graph', kind)
+        assert said in str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
+# Files
+
+def test_the_files_read_back_to_the_graph(results, tmp_path):
+    graph = read_results(results)
+    done = djet('export', results, '--format', 'csv', '--output', tmp_path / 'out' / 'graph.csv')
+    assert f'{FRAMES} poses, {FRAMES - 1} edges ({FRAMES - 1} odometry)' in done.stdout
+    for row, edge in zip(csv.DictReader((tmp_path / 'out' / 'graph.csv').open()), graph.edges,
+                         strict=True):
+        assert int(row['target_stamp_ns']) == graph.stamps_ns[edge.target]
+        assert (row['kind'], row['scale_known']) == ('odometry', '1')
+        assert float(row['z']) == edge.motion[2, 3]
+        assert float(row['cov_y_rz']) == edge.covariance[1, 5]
+    write_graph(graph, tmp_path / 'tum', 'tum')
+    stamps, poses = read_tum(tmp_path / 'tum')
+    assert np.array_equal(stamps, graph.stamps_ns)
+    assert np.allclose(poses, graph.poses, atol=1e-12)
+    write_graph(graph, tmp_path / 'kitti', 'kitti')
+    assert np.array_equal(np.loadtxt(tmp_path / 'kitti').reshape(-1, 3, 4), graph.poses[:, :3])
+
+
+def test_the_command_refuses_to_overwrite_and_says_of_lengths_that_are_unknown(
+        unscaled, tmp_path):
+    out = tmp_path / 'graph.g2o'
+    done = djet('export', unscaled, '--output', out)
+    assert f'{FRAMES - 1} of unknown length' in done.stdout
+    before = out.read_bytes()
+    assert 'exists already' in djet('export', unscaled, '--output', out, expect=2).stderr
+    assert out.read_bytes() == before
+
+
+def test_gtsam_reads_the_poses_and_edges_of_a_g2o_file(tmp_path):
+    gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    graph = random_graph(5)
+    write_graph(graph, tmp_path / 'graph.g2o', 'g2o')
+    factors, values = gtsam.readG2o(str(tmp_path / 'graph.g2o'), True)
+    assert (factors.size(), values.size()) == (len(graph.edges), len(graph.poses))
+    for key, true in enumerate(graph.poses):
+        assert np.allclose(values.atPose3(key).matrix(), true, atol=1e-12)
+    for i, edge in enumerate(graph.edges):
+        # the error of an edge, by hand and to second order of what the poses are off
+        factor = factors.at(i)
+        small = np.full(6, 1e-4)
+        off = gtsam.Values()
+        off.insert(edge.source, gtsam.Pose3())
+        off.insert(edge.target, gtsam.Pose3(edge.motion).retract(np.roll(small, 3)))
+        assert factor.error(off) == pytest.approx(
+            small @ graph.information(edge) @ small / 2, rel=1e-2)
+
+
+def test_a_g2o_file_has_the_same_errors_as_the_graph_has_in_gtsam(results, unscaled, tmp_path):
+    gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.slam.backend import factor_graph, initial_values
+    graphs = [random_graph(seed) for seed in range(5)]
+    for i, graph in enumerate([*graphs, read_results(results), read_results(unscaled)]):
+        write_graph(graph, tmp_path / f'{i}.g2o', 'g2o')
+        read, _ = gtsam.readG2o(str(tmp_path / f'{i}.g2o'), True)
+        wrong = initial_values(graph.poses @ STEP @ graph.poses)
+        ours = factor_graph(graph)
+        errors = [ours.at(k + 1).error(wrong) for k in range(len(graph.edges))]
+        assert np.allclose([read.at(k).error(wrong) for k in range(read.size())], errors,
+                           rtol=1e-6)
+        assert max(errors) > 1
+
+
+def test_the_errors_stay_the_same_through_a_file_that_gtsam_writes(tmp_path):
+    """Of graphs whose sigmas are alike: GTSAM writes six digits, too few for unknown lengths."""
+    gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    for seed in range(5):
+        graph, path = random_graph(seed), tmp_path / f'{seed}.g2o'
+        write_graph(graph, path, 'g2o')
+        factors, values = gtsam.readG2o(str(path), True)
+        gtsam.writeG2o(factors, values, str(path))
+        again, poses = gtsam.readG2o(str(path), True)
+        assert again.error(poses) == pytest.approx(factors.error(values), rel=1e-3)
+
+
+def test_a_graph_that_agrees_with_itself_has_no_error(tmp_path):
+    gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    write_graph(exact_graph(), tmp_path / 'graph.g2o', 'g2o')
+    factors, values = gtsam.readG2o(str(tmp_path / 'graph.g2o'), True)
+    assert factors.error(values) < 1e-18
