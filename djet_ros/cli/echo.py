@@ -46,17 +46,17 @@ def run(args: argparse.Namespace) -> int:
 
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.names import Names
-    graph, names = Graph(), Names(args.node, args.remap)
+    names = Names(args.node, args.remap)
     view = View(names.full_node.strip('/'))
-    graph.listen(names.resolve('~/odometry'), 'nav_msgs/msg/Odometry',
-                 view.odometry if args.diagnostics else lambda message: print(
-                     pose_line(message), flush=True))
-    if args.diagnostics:
-        graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
-                     view.diagnostics)
-        _show(view, graph, stop)
-    while not stop.is_set():
-        graph.spin(0.1)
+    with Graph() as graph:
+        graph.listen(names.resolve('~/odometry'), 'nav_msgs/msg/Odometry',
+                     view.odometry if args.diagnostics else _print_pose)
+        if args.diagnostics:
+            graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
+                         view.diagnostics)
+            _show(view, graph, stop)
+        while not stop.is_set():
+            graph.spin(0.1)
     return 0
 
 
@@ -113,12 +113,12 @@ class View:
         return f'{self.summary}; path: {self.length}; {shown}'
 
 
-def pose_line(message: Any) -> str:
+def _print_pose(message: Any) -> None:
     """Stamp, position and orientation as in a TUM file."""
     stamp, pose = message.header.stamp, message.pose.pose
     at, turn = pose.position, pose.orientation
-    return (f'{stamp.sec}.{stamp.nanosec:09d} {at.x:.6f} {at.y:.6f} {at.z:.6f} '
-            f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}')
+    print(f'{stamp.sec}.{stamp.nanosec:09d} {at.x:.6f} {at.y:.6f} {at.z:.6f} '
+          f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}', flush=True)
 
 
 def _show(view: View, graph: Any, stop: Event) -> None:

@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.live_node import LiveNode
     from djet_ros.dds.names import Names
     names = Names(NODE_NAME, args.remap)
-    return LiveNode(Graph(), config, names, use_sim_time).run(stop)
+    with Graph() as graph:
+        return LiveNode(graph, config, names, use_sim_time).run(stop)
 
 
 def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:

@@ -49,13 +49,15 @@ def run(args: argparse.Namespace) -> int:
     names = Names('player', args.remap)
     source = open_source(args.source, args.image_topic, args.info_topic)
     try:
-        player = Player(Graph(), source, names, args.rate, args.clock)
-        print(f'waiting for a subscriber to {player.image_topic}', file=sys.stderr, flush=True)
-        player.wait_for_listener(stop)
-        while not stop.is_set():
-            player.play(stop)
-            if not args.loop:
-                break
+        with Graph() as graph:
+            player = Player(graph, source, names, args.rate, args.clock)
+            print(f'waiting for a subscriber to {player.image_topic}', file=sys.stderr,
+                  flush=True)
+            player.wait_for_listener(stop)
+            while not stop.is_set():
+                player.play(stop)
+                if not args.loop:
+                    break
     finally:
         source.close()
     late = f', the last {player.played.late:.1f} s late' if player.played.late > 0.1 else ''

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import os
-from typing import Any
+from typing import Any, Self
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, ReadCondition, WaitSet
@@ -25,6 +25,8 @@ _MAX_BLOCKING = duration(milliseconds=20)
 
 # Samples that who keeps all may hold, at either end, before the publisher has to wait.
 _KEEP_ALL_ROOM = 32
+
+_GONE = (DDSException.DDS_RETCODE_BAD_PARAMETER, DDSException.DDS_RETCODE_ALREADY_DELETED)
 
 _ANY = ViewState.Any | InstanceState.Any | SampleState.NotRead
 
@@ -112,8 +114,13 @@ class Publisher:
 
     @property
     def listeners(self) -> int:
-        """Count the subscriptions."""
-        return len(self._writer.get_matched_subscriptions())
+        """Count the subscriptions; none once the graph is closed."""
+        try:
+            return len(self._writer.get_matched_subscriptions())
+        except DDSException as error:
+            if error.code not in _GONE:
+                raise
+            return 0
 
     def listens(self, user_data: str) -> bool:
         """Tell whether a subscription says this of itself."""
@@ -176,6 +183,20 @@ class Graph:
         self._subscriptions: list[Subscription] = []
         self._waiting = WaitSet(self._participant)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+
+    def close(self) -> None:
+        """Leave the graph, and tell the others; nothing can be sent or heard any more."""
+        # Cyclone deletes what Python has forgotten, and at its exit Python forgets nothing: the
+        # others would take this participant for alive until its lease ends.
+        self._participant.__del__()
+
+    def __enter__(self) -> Self:
+        """Give the graph itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the graph."""
+        self.close()
 
     def advertise(self, topic: str, ros_type: str, profile: Profile = Profile()) -> Publisher:
         """Publish on a topic from now on."""
