@@ -14,7 +14,8 @@ from typing import Any
 
 from djet_ros.config import add_flags, flag_values
 from djet_ros.core.config import PRESETS
-from djet_ros.evaluation.entrants import check_methods, Entrant
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.entrants import Entrant
 from djet_ros.evaluation.pairs import PairRecord
 from djet_ros.evaluation.runner import dask_workers, local_workers, run
 from djet_ros.evaluation.sources import open_sources, Selection, Source
@@ -47,8 +48,8 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--stride', type=int, default=1, metavar='N',
                         help='frames from one to the other of a pair (default: %(default)s)')
     workers = parser.add_mutually_exclusive_group()
-    workers.add_argument('--workers', type=int, default=len(os.sched_getaffinity(0)), metavar='N',
-                         help='processes on this machine (default: %(default)s)')
+    workers.add_argument('--workers', type=int, metavar='N',
+                         help='processes on this machine (default: one for each core)')
     workers.add_argument('--scheduler', metavar='ADDRESS',
                          help='Dask scheduler that spreads the work instead, such as '
                          'tcp://host:8786')
@@ -71,7 +72,8 @@ def shared_values(args: argparse.Namespace) -> dict[str, Any]:
 def evaluated(args: argparse.Namespace, competing: Sequence[Entrant]
               ) -> Iterator[tuple[list[Source], list[PairRecord]]]:
     """Run all pairs with a progress bar; sources and records are good within the context."""
-    check_methods(sorted({entrant.method for entrant in competing}))
+    if args.workers is not None and args.workers < 1:
+        raise DjetError(f'workers is {args.workers}; at least one is needed')
     selection = Selection(args.start, args.end, args.stride)
     # Frames of bags are kept beside the results, where workers on other machines see them too.
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()

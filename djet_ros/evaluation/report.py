@@ -49,6 +49,7 @@ table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tab
 caption { text-align: left; padding: 0.5rem 0; color: #444; }
 th, td { padding: 0.25rem 0.6rem; text-align: left; border-bottom: 1px solid #ddd; }
 thead th { border-bottom: 2px solid #888; }
+.section td { border-top: 2px solid #bbb; }
 .number { text-align: right; white-space: nowrap; }
 tr:has(i) { background: #f4f1ea; }
 .wide { overflow-x: auto; }
@@ -184,12 +185,12 @@ def _image(picture: Picture, folder: Path, section: str) -> str:
 
 
 def _parameters(entrants: Sequence[Entrant]) -> str:
-    """Parameters of all presets, folded away."""
-    blocks = []
+    """Parameters of each preset and change, folded away; methods share them."""
+    blocks = {}
     for entrant in entrants:
-        values = ''.join(f'{name}: {value}\n' for name, value in asdict(entrant.config).items())
-        head = f'{TITLES[entrant.method]}, {entrant.preset}' + (
-            f', {entrant.change}' if entrant.change else '')
-        blocks.append(f'<details><summary>{html.escape(head)}</summary>'
-                      f'<pre>{html.escape(values)}</pre></details>')
-    return '<h2>Parameters</h2>\n' + '\n'.join(blocks)
+        head = f'{entrant.preset}, {entrant.change}' if entrant.change else entrant.preset
+        values = ''.join(f'{name}: {value}\n' for name, value in asdict(entrant.config).items()
+                         if name != 'method')
+        blocks[head] = (f'<details><summary>{html.escape(head)}</summary>'
+                        f'<pre>{html.escape(values)}</pre></details>')
+    return '<h2>Parameters</h2>\n' + '\n'.join(blocks.values())

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed, BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 import os
 import signal
+from threading import Thread
 
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.entrants import Entrant
@@ -70,13 +71,11 @@ def _keep_finished(futures: dict[Future[list[PairRecord]], Chunk], store: Record
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Executor]:
-    """Give an executor of processes on this machine, one thread each."""
-    if count < 1:
-        raise DjetError(f'workers is {count}; at least one is needed')
+def local_workers(count: int | None = None) -> Iterator[Executor]:
+    """Give an executor of processes on this machine, by default one per core, one thread each."""
     # Set before the workers import NumPy; equal thread counts also keep its sums equal.
     os.environ.update(dict.fromkeys(_THREADS, '1'))
-    with ProcessPoolExecutor(count, get_context('spawn'), _leave_interrupts_to_parent) as executor:
+    with ProcessPoolExecutor(count, get_context('spawn'), _follow_parent) as executor:
         yield executor
 
 
@@ -98,6 +97,15 @@ def dask_workers(address: str) -> Iterator[Executor]:
         yield client.get_executor()
 
 
-def _leave_interrupts_to_parent() -> None:
-    """Let Ctrl-C end the run at the parent, without a traceback from every worker."""
+def _follow_parent() -> None:
+    """Leave Ctrl-C to the parent, and end with it even where it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        # A pool's worker would wait for its next chunk for ever.
+        os._exit(1)

@@ -194,13 +194,15 @@ def html_table(table: Table) -> str:
              for column in range(len(table.header))]
     head = ''.join(f'<th{kind}>{html.escape(title)}</th>'
                    for kind, title in zip(kinds, table.header))
-    escaped = (replace(line, cells=tuple(html.escape(cell) for cell in line.cells))
-               for line in table.lines)
-    body = ''.join('<tr>' + ''.join(
-        f'<td{kind}>{cell}</td>' for kind, cell in
-        zip(kinds, _marked(line, '<b>', '</b>', '<i>', '</i>'))) + '</tr>\n' for line in escaped)
+    body = []
+    for line, before in zip(table.lines, (None, *table.lines)):
+        begins = before is None or before.cells[:table.sections] != line.cells[:table.sections]
+        escaped = replace(line, cells=tuple(html.escape(cell) for cell in line.cells))
+        cells = ''.join(f'<td{kind}>{cell}</td>' for kind, cell in
+                        zip(kinds, _marked(escaped, '<b>', '</b>', '<i>', '</i>')))
+        body.append(f'<tr class="section">{cells}</tr>\n' if begins else f'<tr>{cells}</tr>\n')
     return (f'<table>\n<caption>{html.escape(table.caption)}</caption>\n'
-            f'<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>\n</table>\n')
+            f'<thead><tr>{head}</tr></thead>\n<tbody>\n{"".join(body)}</tbody>\n</table>\n')
 
 
 def _marked(line: Line, bold: str, end_bold: str, foreign: str,

@@ -1,0 +1,477 @@
+"""``djet evaluate`` and ``djet ablate`` on rendered frames, mostly in real processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import csv
+import json
+import math
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from time import monotonic, sleep
+
+import cv2
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.types import Status
+from djet_ros.data.bag_writers import write_kitti_bag
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.data.trajectories import read_tum
+from djet_ros.evaluation.entrants import default_methods, Entrant, TITLES
+from djet_ros.evaluation.evo import trajectory_metrics
+from djet_ros.evaluation.pairs import Chunk, evaluate_chunk, has_failed, PairRecord
+from djet_ros.evaluation.sources import open_sources, Selection, Source
+from djet_ros.evaluation.summary import table_rows
+from djet_ros.evaluation.trajectories import estimated_trajectory, true_trajectory
+from djet_ros.scenes import render_sequence
+import numpy as np
+import pytest
+
+DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
+COLUMNS = ['sequence', 'method', 'preset', 'pairs', 'failures', 'rotation_mean_deg',
+           'rotation_median_deg', 'rotation_p95_deg', 'translation_mean_deg',
+           'translation_median_deg', 'translation_p95_deg', 'hamming_mean', 'ms_per_pair']
+FRAMES = 8
+# Enough work for a chunk to be interrupted.
+RUN = ('--methods', 'djet,rpe', '--presets', 'paper')
+
+
+@pytest.fixture(scope='module')
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a rendered street: 7 pairs, which are two chunks."""
+    return render_sequence('road', tmp_path_factory.mktemp('road'), FRAMES, size=(480, 160))
+
+
+@pytest.fixture(scope='module')
+def evaluated(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give the results folder of all methods and both presets, by one worker."""
+    folder = tmp_path_factory.mktemp('evaluated') / 'results'
+    answer = djet('evaluate', road, '--output', folder, '--workers', '1')
+    assert answer.returncode == 0, answer.stderr
+    return folder
+
+
+@pytest.fixture(scope='module')
+def short(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give the results folder of what RUN asks for, by one worker."""
+    folder = tmp_path_factory.mktemp('short') / 'results'
+    answer = djet('evaluate', road, '--output', folder, '--workers', '1', *RUN)
+    assert answer.returncode == 0, answer.stderr
+    return folder
+
+
+def djet(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    return subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=300, check=False)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def without_times(path: Path) -> list[dict[str, str]]:
+    """Rows of table1.csv but for the one column that differs from run to run."""
+    return [{name: value for name, value in row.items() if name != 'ms_per_pair'}
+            for row in rows(path)]
+
+
+# Tables and records
+
+def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
+    table = rows(evaluated / 'table1.csv')
+    assert list(table[0]) == COLUMNS
+    assert [(row['sequence'], row['preset'], row['method']) for row in table] == [
+        ('road', preset, method) for preset in ('best', 'paper') for method in default_methods()]
+    assert all(int(row['pairs']) == FRAMES - 1 for row in table)
+
+
+def test_the_best_preset_finds_exact_motion_to_a_fraction_of_a_degree(evaluated):
+    best = {row['method']: row for row in rows(evaluated / 'table1.csv')
+            if row['preset'] == 'best'}
+    for method in ('djet', 'rpe', 'pjet'):
+        assert float(best[method]['rotation_median_deg']) < 0.2
+        assert float(best[method]['translation_median_deg']) < 5
+    # Descriptors are what D-JET minimises.
+    assert float(best['djet']['hamming_mean']) < float(best['rpe']['hamming_mean'])
+
+
+def test_all_methods_of_a_preset_are_given_the_same_matches(evaluated):
+    records = rows(evaluated / 'pairs.csv')
+    assert len(records) == 2 * len(default_methods()) * (FRAMES - 1)
+    given = {(row['pair'], row['preset'], row['matches']) for row in records}
+    assert len(given) == 2 * (FRAMES - 1)
+
+
+def test_records_hold_the_motion_from_which_the_errors_came(road, evaluated):
+    truth = KittiSequence(road).poses
+    for row in rows(evaluated / 'pairs.csv'):
+        before, after = truth[int(row['previous'])], truth[int(row['current'])]
+        motion = np.linalg.inv(before) @ after
+        R, _ = cv2.Rodrigues(np.array([float(row[axis]) for axis in ('rx', 'ry', 'rz')]))
+        angle = np.degrees(np.linalg.norm(cv2.Rodrigues(motion[:3, :3].T @ R)[0]))
+        assert angle == pytest.approx(float(row['rotation_error_deg']), abs=1e-5)
+
+
+def test_tables_in_other_markups_hold_the_same_figures(evaluated):
+    mean = f"{float(rows(evaluated / 'table1.csv')[0]['rotation_mean_deg']):.3f}"
+    for name in ('table1.md', 'table1.tex', 'index.html'):
+        assert mean in (evaluated / name).read_text()
+
+
+def test_a_rendered_sequence_has_no_figures_of_the_paper_beside_it(evaluated):
+    assert 'the paper' not in (evaluated / 'table1.md').read_text()
+
+
+def test_kitti_sequences_have_the_papers_figures_beside_them(kitti, tmp_path):
+    answer = djet('evaluate', kitti / 'sequences' / '06', '--end', '3', '--methods', 'djet,rpe',
+                  '--presets', 'best', '--output', tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    assert '| *06* | *the paper* | *RP-E* | *0.049* |' in (tmp_path / 'table1.md').read_text()
+    # The file for programs holds what was measured, and nothing else.
+    assert {row['preset'] for row in rows(tmp_path / 'table1.csv')} == {'best'}
+
+
+def test_trajectories_stand_beside_the_ground_truth(road, evaluated):
+    folder = evaluated / 'trajectories' / 'road'
+    stamps, truth = read_tum(folder / 'ground_truth.tum')
+    assert np.allclose(truth, KittiSequence(road).poses, atol=1e-9)
+    for preset in ('best', 'paper'):
+        for method in default_methods():
+            its_stamps, poses = read_tum(folder / f'{method}_{preset}.tum')
+            assert np.array_equal(its_stamps, stamps)
+            lengths = [np.linalg.norm(np.diff(way[:, :3, 3], axis=0), axis=1)
+                       for way in (poses, truth)]
+            assert np.allclose(*lengths, atol=1e-6) or method != 'djet'
+
+
+def test_perfect_motions_make_the_true_trajectory(road, tmp_path):
+    source, = open_sources([road], Selection(), tmp_path)
+    truth = KittiSequence(road).poses
+    records = [record(pair=i, rotation=tuple(cv2.Rodrigues(motion[:3, :3])[0].ravel()),
+                      translation=tuple(motion[:3, 3] / np.linalg.norm(motion[:3, 3])))
+               for i, motion in enumerate(np.linalg.inv(truth[:-1]) @ truth[1:])]
+    assert np.allclose(estimated_trajectory(source, records).poses, truth, atol=1e-6)
+    # Of a record with a hole, the longer part counts.
+    assert len(true_trajectory(source, records[:2] + records[3:]).poses) == 5
+
+
+def record(pair: int, rotation: tuple[float, ...] = (0, 0, 0),
+           translation: tuple[float, ...] = (0, 0, 1), **values: object) -> PairRecord:
+    """Give a record of a perfect pair, but for some values."""
+    plain = {'sequence': 'road', 'previous': pair, 'current': pair + 1, 'method': 'djet',
+             'preset': 'best', 'change': '', 'status': Status.OK.value, 'matches': 100,
+             'inliers': 90, 'failed': False, 'rotation_error_deg': 0.0,
+             'translation_error_deg': 0.0, 'hamming_mean': 20.0, 'milliseconds': 100.0}
+    return PairRecord(pair=pair, rotation=rotation, translation=translation,
+                      **{**plain, **values})
+
+
+def test_rows_are_over_known_errors_and_count_the_failures():
+    nothing = {'rotation_error_deg': math.nan, 'translation_error_deg': math.nan,
+               'hamming_mean': math.nan, 'failed': True, 'status': 'DEGENERATE'}
+    row, = table_rows([record(0, rotation_error_deg=0.1, translation_error_deg=2.0),
+                       record(1, rotation_error_deg=0.3, translation_error_deg=4.0),
+                       record(2, **nothing)])
+    assert (row.pairs, row.failures) == (3, 1)
+    assert row.rotation_mean_deg == pytest.approx(0.2)
+    assert row.translation_p95_deg == pytest.approx(3.9)
+    assert row.hamming_mean == 20
+    only, = table_rows([record(0, **nothing)])
+    assert math.isnan(only.rotation_mean_deg)
+
+
+@pytest.mark.parametrize(('rotation', 'translation', 'way', 'failed'), [
+    (0.5, 5.0, 1.0, False),
+    (1.5, 5.0, 1.0, True),
+    (0.5, 15.0, 1.0, True),
+    (0.5, math.nan, 1.0, True),
+    (math.nan, math.nan, 1.0, True),
+    # A camera that stands has no direction to be missed.
+    (0.5, math.nan, 0.0, False),
+])
+def test_a_failure_is_what_it_is_said_to_be(rotation, translation, way, failed):
+    motion = np.eye(4)
+    motion[2, 3] = way
+    assert has_failed(rotation, translation, motion) is failed
+
+
+def test_pairs_without_ground_truth_are_left_out(road, tmp_path):
+    source, = open_sources([road], Selection(), tmp_path)
+    entrant = Entrant('five_point', 'best', EstimatorConfig(method='five_point'))
+    assert len(evaluate_chunk(Chunk(source, 0, 2), [entrant])) == 2
+    other = Source('torn', '', torn_truth(road, tmp_path), range(4), '')
+    assert [found.pair for found in evaluate_chunk(Chunk(other, 0, 3), [entrant])] == [1]
+
+
+def torn_truth(road: Path, folder: Path) -> Path:
+    """Copy frames into TUM's layout, whose truth may begin late and end early."""
+    (folder / 'tum' / 'rgb').mkdir(parents=True)
+    for i in range(4):
+        shutil.copy(road / 'image_0' / f'{i:06d}.png', folder / 'tum' / 'rgb' / f'{i}.png')
+    (folder / 'tum' / 'rgb.txt').write_text(''.join(f'{i + 1}.0 rgb/{i}.png\n' for i in range(4)))
+    (folder / 'tum' / 'calibration.txt').write_text('280 280 240 80\n')
+    (folder / 'tum' / 'groundtruth.txt').write_text(
+        ''.join(f'{2 + i / 20} 0 0 {i / 20} 0 0 0 1\n' for i in range(21)))
+    return folder / 'tum'
+
+
+# Sources
+
+def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path):
+    write_kitti_bag(KittiSequence(road, end=4), tmp_path / 'bag')
+    answer = djet('evaluate', tmp_path / 'bag', road, '--end', '4', '--methods', 'djet',
+                  '--presets', 'best', '--output', tmp_path / 'results')
+    assert answer.returncode == 0, answer.stderr
+    bag, folder = rows(tmp_path / 'results' / 'table1.csv')
+    assert (bag['sequence'], folder['sequence']) == ('bag', 'road')
+    assert float(bag['rotation_mean_deg']) == pytest.approx(
+        float(folder['rotation_mean_deg']), abs=1e-4)
+    # The frames that were taken out of the bag are gone again.
+    assert not list((tmp_path / 'results').glob('.frames*'))
+
+
+def test_frames_are_chosen_by_start_end_and_stride(road, tmp_path):
+    source, = open_sources([road], Selection(1, 8, 3), tmp_path)
+    assert list(source.frames) == [1, 4, 7]
+
+
+def test_a_folder_of_sequences_is_all_of_them_with_names_of_their_own(road, tmp_path):
+    for name in ('00', '01'):
+        shutil.copytree(road, tmp_path / 'sequences' / name)
+        (tmp_path / 'poses').mkdir(exist_ok=True)
+        shutil.copy(road.parent.parent / 'poses' / '00.txt', tmp_path / 'poses' / f'{name}.txt')
+    sources = open_sources([tmp_path], Selection(), tmp_path)
+    assert [source.name for source in sources] == ['road', 'road-2']
+
+
+# Running on workers
+
+def test_one_and_two_workers_write_the_same_bytes(road, short, tmp_path):
+    assert djet('evaluate', road, '--output', tmp_path, '--workers', '2', *RUN).returncode == 0
+    assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
+    assert without_times(tmp_path / 'table1.csv') == without_times(short / 'table1.csv')
+
+
+def test_a_dask_cluster_writes_the_same_bytes(road, short, tmp_path):
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host='127.0.0.1',
+                                  dashboard_address=None) as cluster:
+        answer = djet('evaluate', road, '--output', tmp_path,
+                      '--scheduler', cluster.scheduler_address, *RUN)
+    assert answer.returncode == 0, answer.stderr
+    assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
+
+
+@pytest.fixture
+def running(road: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give a run with one worker whose first chunk is done and whose second is not."""
+    process = subprocess.Popen(
+        [*DJET, 'evaluate', str(road), '--output', str(tmp_path), '--workers', '1', *RUN],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: len(chunks(tmp_path)) == 1)
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Wait until something has become true."""
+    end = monotonic() + 120
+    while not condition():
+        assert monotonic() < end
+        sleep(0.01)
+
+
+def chunks(folder: Path) -> list[str]:
+    """Lines of the chunks that are done."""
+    store = folder / 'records.jsonl'
+    return store.read_text().splitlines()[1:] if store.exists() else []
+
+
+def workers_of(process: subprocess.Popen[str]) -> list[int]:
+    """Process ids of the pool's workers."""
+    children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+    return [int(child) for child in children
+            if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
+
+
+def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path):
+    children = workers_of(running)
+    running.kill()
+    running.wait()
+    wait_for(lambda: not any(Path(f'/proc/{child}').exists() for child in children))
+    first, = chunks(tmp_path)
+    # As if the last line had been cut in the middle.
+    with (tmp_path / 'records.jsonl').open('a') as store:
+        store.write('{"chunk": "road:5')
+    assert djet('evaluate', road, '--output', tmp_path, '--workers', '1', *RUN).returncode == 0
+    assert len(chunks(tmp_path)) == 2
+    # With its times, so it was not computed anew.
+    assert chunks(tmp_path)[0] == first
+    assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
+
+
+def test_a_workers_death_is_said_and_costs_only_its_chunk(road, short, running, tmp_path):
+    for worker in workers_of(running):
+        os.kill(worker, signal.SIGKILL)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 2
+    assert said.splitlines()[-1].startswith('djet: error: a worker died')
+    assert len(chunks(tmp_path)) == 1
+    assert djet('evaluate', road, '--output', tmp_path, *RUN).returncode == 0
+    assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
+
+
+def test_an_interrupt_is_one_line_and_keeps_what_was_done(running, tmp_path):
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert 'Traceback' not in said
+    assert said.splitlines()[-1] == 'djet: interrupted'
+    assert chunks(tmp_path)
+
+
+def test_results_of_other_settings_are_not_mixed(road, tmp_path):
+    run = ('evaluate', road, '--end', '3', '--presets', 'best', '--output', tmp_path)
+    assert djet(*run, '--methods', 'djet').returncode == 0
+    before = (tmp_path / 'records.jsonl').read_bytes()
+    answer = djet(*run, '--methods', 'rpe')
+    assert answer.returncode == 2
+    assert 'other settings (methods); choose another folder, or --overwrite' in answer.stderr
+    assert (tmp_path / 'records.jsonl').read_bytes() == before
+    assert djet(*run, '--methods', 'rpe', '--overwrite').returncode == 0
+    assert {row['method'] for row in rows(tmp_path / 'table1.csv')} == {'rpe'}
+
+
+def test_a_damaged_store_is_named(road, tmp_path):
+    run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
+           '--output', tmp_path)
+    assert djet(*run).returncode == 0
+    with (tmp_path / 'records.jsonl').open('a') as store:
+        store.write('nonsense\n')
+    answer = djet(*run)
+    assert answer.returncode == 2
+    assert 'records.jsonl line 3 is damaged; run again with --overwrite' in answer.stderr
+
+
+# What the user can mend
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (['nowhere'], 'nowhere does not exist'),
+    (['.'], 'is neither a bag nor a folder of KITTI'),
+    (['road', '--methods', 'djet,orb'], "there is no method 'orb'; choose from djet, rpe, "),
+    (['road', '--methods', 'djet,djet'], "method 'djet' is given twice"),
+    (['road', '--presets', 'worst'], "there is no preset 'worst'; choose from best, paper"),
+    (['road', '--workers', '0'], 'workers is 0; at least one is needed'),
+    (['road', '--start', '7'], '8 frames, of which 1 are chosen'),
+    (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),
+    (['road', '--workers', '2', '--scheduler', 'tcp://x'], 'not allowed with argument'),
+])
+def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, said, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    called = [str(road) if word == 'road' else word for word in arguments]
+    answer = djet('evaluate', *called, '--output', tmp_path / 'results')
+    assert answer.returncode == 2
+    assert answer.stderr.startswith('djet: error: ')
+    assert answer.stderr.count('\n') == 1
+    assert said in answer.stderr
+    assert not (tmp_path / 'results').exists()
+
+
+def test_missing_poses_are_one_line_and_exit_code_2(small_kitti, tmp_path):
+    folder = small_kitti()
+    (folder.parent.parent / 'poses' / '07.txt').unlink()
+    answer = djet('evaluate', folder, '--output', tmp_path / 'results')
+    assert answer.returncode == 2
+    assert answer.stderr.count('\n') == 1
+    assert 'has no ground truth for two frames in a row' in answer.stderr
+
+
+def test_a_scheduler_that_is_not_there_is_one_line_and_exit_code_2(road, tmp_path):
+    pytest.importorskip('distributed')
+    answer = djet('evaluate', road, '--end', '3', '--output', tmp_path,
+                  '--scheduler', 'tcp://127.0.0.1:9')
+    assert answer.returncode == 2
+    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in answer.stderr.splitlines()[-1]
+
+
+# The page
+
+def test_everything_that_the_page_refers_to_is_there(evaluated):
+    page = (evaluated / 'index.html').read_text()
+    named = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len([name for name in named if name.endswith('.png')]) == 4
+    assert all((evaluated / name).is_file() for name in named)
+    assert all(title in page for title in (TITLES[method] for method in default_methods()))
+
+
+def test_the_page_shows_its_plots_in_a_browser(evaluated, tmp_path):
+    names = ('chromium', 'chromium-browser', 'google-chrome')
+    browser = next(filter(None, map(shutil.which, names)), None)
+    if browser is None:
+        pytest.skip(f'no browser is installed ({", ".join(names)})')
+    shot = tmp_path / 'page.png'
+    subprocess.run([browser, '--headless', '--no-sandbox', '--disable-gpu', '--hide-scrollbars',
+                    f'--user-data-dir={tmp_path}', '--window-size=1250,4000',
+                    f'--screenshot={shot}', (evaluated / 'index.html').as_uri()],
+                   capture_output=True, timeout=120, check=True)
+    page = cv2.imread(str(shot))
+    # The colour of the D-JET boxes (drawn at three quarters of opacity) is on the page.
+    blue = np.abs(page.astype(int) - (197, 149, 64)).max(2) < 12
+    assert blue.sum() > 500
+
+
+def test_evo_finds_no_error_in_the_truth_itself(evaluated):
+    if not shutil.which('evo_ape') and not (Path(sys.executable).parent / 'evo_ape').exists():
+        pytest.skip('evo is not installed')
+    truth = evaluated / 'trajectories' / 'road' / 'ground_truth.tum'
+    metrics = trajectory_metrics(truth, truth)
+    assert metrics.ape_m == pytest.approx(0, abs=1e-6)
+    assert metrics.rpe_deg == pytest.approx(0, abs=1e-3)
+
+
+# Ablation
+
+def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
+    answer = djet('ablate', road, '--end', '4', '--output', tmp_path, '--windows', '3,5',
+                  '--parts', 'window,recentring,starts', '--presets', 'best,paper')
+    assert answer.returncode == 0, answer.stderr
+    found = [(row['preset'], row['method'], row['change'])
+             for row in rows(tmp_path / 'ablation.csv')]
+    assert found == [
+        ('best', 'djet', ''), ('best', 'rpe', ''), ('best', 'five_point', ''),
+        ('best', 'djet', 'window 3×3'),
+        ('best', 'djet', 'window not re-centred'),
+        ('best', 'djet', 'start: 5-point only'), ('best', 'rpe', 'start: 5-point only'),
+        ('paper', 'djet', ''), ('paper', 'rpe', ''), ('paper', 'five_point', ''),
+        ('paper', 'djet', 'window 3×3'), ('paper', 'djet', 'window 5×5'),
+        ('paper', 'djet', 'window not re-centred'),
+        ('paper', 'djet', 'starts: several'), ('paper', 'rpe', 'starts: several')]
+    text = (tmp_path / 'ablation.md').read_text()
+    # The paper's Table 2 stands below.
+    assert '| *VAROS* | *D-JET* | *15×15* | *0.127* | *0.258* | *22.31* |' in text
+    assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (['--parts', 'colour'], "there is no part 'colour'; choose from window, "),
+    (['--windows', '4'], 'window is 4; it must be odd'),
+    (['--windows', 'five'], "--windows is 'five'; give odd numbers such as 3,5,7"),
+])
+def test_a_wrong_ablation_is_one_line_and_exit_code_2(road, tmp_path, arguments, said):
+    answer = djet('ablate', road, *arguments, '--output', tmp_path / 'results')
+    assert answer.returncode == 2
+    assert answer.stderr.count('\n') == 1
+    assert said in answer.stderr
+
+
+def test_the_store_is_plain_json(evaluated):
+    first, *others = (evaluated / 'records.jsonl').read_text().splitlines()
+    assert json.loads(first)['sequences'][0]['name'] == 'road'
+    assert sorted(json.loads(line)['chunk'] for line in others) == ['road:0+5', 'road:5+2']

@@ -1,0 +1,159 @@
+"""``djet similarity`` and ``djet surfaces``: what they show, and that they can be drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import subprocess
+import sys
+
+import cv2
+from djet_ros.cli.main import main
+from djet_ros.core.config import EstimatorConfig, preset
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.similarity import cross_similarity, read_image, self_similarity
+from djet_ros.evaluation.surface_steps import follow, RADIUS, telling_match
+from djet_ros.scenes import render_sequence
+import numpy as np
+import pytest
+
+# The library that matplotlib saves pictures with.
+PIL = pytest.importorskip('PIL.Image')
+
+CONFIG = EstimatorConfig()
+
+
+@pytest.fixture(scope='module')
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give three rendered frames of a street."""
+    return render_sequence('road', tmp_path_factory.mktemp('road'), 3, size=(480, 160))
+
+
+@pytest.fixture(scope='module')
+def gray() -> np.ndarray:
+    """Give an image with structure of several sizes."""
+    noise = np.random.default_rng(3).integers(0, 256, (200, 300)).astype(np.float32)
+    image = sum(cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1, 2, 4))
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def test_a_point_is_most_like_itself(gray):
+    points = np.array([[100.0, 80.0], [150.4, 99.6]])
+    found = self_similarity(gray, points, 6, 12, CONFIG)
+    assert found.x.tolist() == found.y.tolist() == [[100, 80], [150, 100]]
+    assert found.surfaces.shape == (25, 25, 2)
+    assert found.surfaces[12, 12].tolist() == [0, 0]
+    assert np.abs(found.fits.minima() - found.y).max() < 0.5
+
+
+def test_a_point_is_found_again_in_a_shifted_image(gray):
+    shifted = np.roll(gray, (2, 5), axis=(0, 1))
+    found = cross_similarity(gray, shifted, None, 4, 12, CONFIG)
+    # Keypoints of coarse pyramid levels are a pixel off; their surfaces tell by how much.
+    missing = np.array([5, 2]) - (found.y - found.x)
+    assert np.abs(missing).max() <= 1
+    for index, (x, y) in enumerate(missing):
+        assert found.surfaces[12 + y, 12 + x, index] == 0
+
+
+def test_the_strongest_keypoints_are_taken_and_kept_apart(gray):
+    found = self_similarity(gray, None, 5, 12, CONFIG)
+    between = np.abs(found.x[:, None] - found.x[None]).max(2) + 100 * np.eye(5)
+    assert between.min() > 12
+
+
+def test_rounds_end_where_the_estimator_ends(road):
+    sequence = KittiSequence(road)
+    for name in ('paper', 'best'):
+        estimator = TwoViewEstimator(preset(name))
+        views = [estimator.view(sequence.image(i), sequence.K) for i in (0, 1)]
+        x, y = estimator.match(*views)
+        course = follow(*views, x, y, estimator.config)
+        result = estimator.estimate_matched(*views, x, y)
+        assert len(course.rounds) == result.iterations
+        assert np.allclose(course.rounds[-1].optima, result.y_opt)
+        assert np.array_equal(course.inliers, result.inliers)
+        # The chosen match has moved, but stays in what is shown.
+        match = telling_match(course, estimator.config.window)
+        assert 0 < np.linalg.norm(course.rounds[-1].optima[match] - course.y[match]) < RADIUS
+
+
+def test_figures_are_drawn_in_the_size_of_what_they_show(road, tmp_path, capsys):
+    images = [str(road / 'image_0' / f'{i:06d}.png') for i in (0, 1)]
+    few, many, both = (tmp_path / 'new' / f'{name}.png' for name in ('few', 'many', 'both'))
+    assert main(['similarity', images[0], '--points', '200,80', '--output', str(few)]) == 0
+    assert main(['similarity', images[0], '--count', '4', '--output', str(many)]) == 0
+    assert main(['similarity', *images, '--count', '4', '--output', str(both)]) == 0
+    sizes = [PIL.open(path).size for path in (few, many, both)]
+    assert sizes[0][0] < sizes[1][0]
+    assert sizes[1] == sizes[2]
+    assert capsys.readouterr().out.splitlines()[0] == f'figure: {few}'
+
+
+def test_an_animation_has_a_frame_for_each_round(road, tmp_path, capsys):
+    moving, still = tmp_path / 'surfaces.gif', tmp_path / 'surfaces.png'
+    assert main(['surfaces', str(road), '--pair', '1', '--output', str(moving)]) == 0
+    rounds = int(capsys.readouterr().out.splitlines()[0].split()[-2])
+    assert rounds > 1
+    assert PIL.open(moving).n_frames == rounds
+    assert main(['surfaces', str(road), '--pair', '1', '--output', str(still)]) == 0
+    assert PIL.open(still).size[0] > 500
+
+
+def test_two_images_and_a_camera_are_as_good_as_a_sequence(road, tmp_path, capsys):
+    images = [str(road / 'image_0' / f'{i:06d}.png') for i in (1, 2)]
+    K = KittiSequence(road).K
+    camera = ','.join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    file = str(tmp_path / 'surfaces.png')
+    assert main(['surfaces', *images, '--camera', camera, '--output', file]) == 0
+    one = capsys.readouterr().out
+    assert main(['surfaces', str(road), '--pair', '1', '--output', file]) == 0
+    assert capsys.readouterr().out == one
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (['similarity', 'nowhere.png'], 'nowhere.png could not be read: No such file or directory'),
+    (['similarity', 'text'], 'text: compressed image is neither JPEG nor PNG'),
+    (['similarity', 'image', '--points', '5,5'], 'point 5,5 is too close to the border'),
+    (['similarity', 'image', '--points', '5'], "point '5' is not of the form X,Y"),
+    (['similarity', 'image', '--radius', '500'], 'between 2 and 100'),
+    (['similarity', 'image', 'image', '--points', '1,1'], 'no keypoint with a match is within'),
+    (['similarity', 'flat'], 'no keypoint has 20 pixels of image around it'),
+    (['surfaces', 'image', 'image'], 'two images need --camera FX,FY,CX,CY'),
+    (['surfaces', 'image', 'image', '--camera', '1,2'], "--camera is '1,2'; give FX,FY,CX,CY"),
+    (['surfaces', 'image', 'image', '--camera', '0,1,1,1'], 'focal lengths must be positive'),
+    (['surfaces', 'flat', 'flat', '--camera', '9,9,9,9'], 'have 0 matches, 20 are needed'),
+    (['surfaces', 'road', '--pair', '2'], 'pair 2 was asked for'),
+    (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),
+    (['surfaces', 'road', '--output', 'a.jpg'], 'its name must end in .png or .gif'),
+])
+def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, said, capsys,
+                                                  monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'text').write_text('no image')
+    cv2.imwrite(str(tmp_path / 'flat.png'), np.zeros((200, 200), np.uint8))
+    places = {'road': road, 'image': road / 'image_0' / '000000.png', 'flat': 'flat.png'}
+    code = main([str(places.get(word, word)) for word in arguments])
+    captured = capsys.readouterr()
+    assert code == 2
+    assert captured.err.startswith('djet: error: ')
+    assert captured.err.count('\n') == 1
+    assert said in captured.err
+
+
+def test_drawing_needs_no_screen(road, tmp_path):
+    draw = ('import sys; from djet_ros.cli.main import main; '
+            f'sys.exit(main(["similarity", {str(road / "image_0" / "000000.png")!r}]))')
+    answer = subprocess.run([sys.executable, '-c', draw], cwd=tmp_path, env={'PATH': ''},
+                            capture_output=True, text=True, timeout=60, check=False)
+    assert answer.returncode == 0, answer.stderr
+    assert (tmp_path / 'similarity.png').exists()
+
+
+def test_a_huge_declared_size_is_refused(tmp_path):
+    data = bytearray(cv2.imencode('.png', np.zeros((9, 9), np.uint8))[1].tobytes())
+    data[16:24] = (10**9).to_bytes(4, 'big') * 2
+    (tmp_path / 'huge.png').write_bytes(data)
+    with pytest.raises(DjetError, match='1000000000x1000000000 pixels'):
+        read_image(tmp_path / 'huge.png')
