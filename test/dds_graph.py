@@ -1,0 +1,113 @@
+"""A peer on a DDS graph of its own, and commands that run there as processes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from time import monotonic
+from typing import Any
+
+import pytest
+
+# Whoever imports this module is skipped with it.
+graph = pytest.importorskip(
+    'djet_ros.dds.graph', reason="cyclonedds is missing: pip install 'djet_ros[dds]'")
+Graph, Profile, Publisher = graph.Graph, graph.Profile, graph.Publisher
+
+PATIENCE = 30.0
+NODE = '/vo_node'
+IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+DEEP = Profile(depth=1000)
+TYPES = {
+    f'{NODE}/relative_pose': 'geometry_msgs/msg/PoseStamped',
+    f'{NODE}/relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    f'{NODE}/odometry': 'nav_msgs/msg/Odometry',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+
+# Not the graph of a robot that happens to be near.
+ENVIRONMENT = {
+    **{name: value for name, value in os.environ.items() if name != 'CYCLONEDDS_URI'},
+    'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    'OMP_NUM_THREADS': '1',
+    'PYTHONPATH': os.pathsep.join(filter(None, [
+        str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH', '')]))}
+
+
+class Peer:
+    """Hears what the odometry says, and publishes, in the process of the test."""
+
+    def __init__(self) -> None:
+        self.graph = Graph(ENVIRONMENT)
+        self.heard: dict[str, list[Any]] = defaultdict(list)
+        for topic, kind in TYPES.items():
+            self.listen(topic, kind)
+
+    def listen(self, topic: str, kind: str) -> None:
+        """Collect in ``heard`` what is published."""
+        self.graph.listen(topic, kind, self.heard[topic].append, DEEP)
+
+    def advertise(self, topic: str, kind: str, profile: Profile = DEEP,
+                  listeners: int = 1) -> Publisher:
+        """Publish from now on, and wait until so many listen."""
+        publisher = self.graph.advertise(topic, kind, profile)
+        self.wait(f'a listener on {topic}', lambda: publisher.listeners >= listeners)
+        return publisher
+
+    def wait(self, what: str, condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
+        """Take messages until a condition holds, and give its value."""
+        end = monotonic() + seconds
+        while not (value := condition()):
+            counts = {topic: len(messages) for topic, messages in self.heard.items()}
+            assert monotonic() < end, f'{what} did not come; heard {counts}'
+            self.graph.spin(0.05)
+        return value
+
+    def spin(self, seconds: float) -> None:
+        """Take messages for a while."""
+        end = monotonic() + seconds
+        while monotonic() < end:
+            self.graph.spin(0.05)
+
+    def said(self, **wanted: str) -> dict[str, str] | None:
+        """Give the last diagnostics that have these values; underscores stand for blanks."""
+        for message in reversed(self.heard['/diagnostics']):
+            values = {pair.key: pair.value for pair in message.status[0].values}
+            values['message'] = message.status[0].message
+            if all(values.get(key.replace('_', ' ')) == value for key, value in wanted.items()):
+                return values
+        return None
+
+
+class Command:
+    """A djet command in a process of its own, with what it writes."""
+
+    def __init__(self, log: Path, *words: str | Path) -> None:
+        self.path = log
+        with log.open('w') as file:
+            self.process = subprocess.Popen(
+                [sys.executable, '-c', 'from djet_ros.cli.main import main; '
+                 'raise SystemExit(main())', *map(str, words)],
+                env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
+
+    @property
+    def log(self) -> str:
+        """What it has written so far."""
+        return self.path.read_text()
+
+    def finish(self) -> str:
+        """Wait for a good end, and give what was written."""
+        assert self.process.wait(PATIENCE) == 0, self.log
+        return self.log
+
+    def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
+        """Send a signal; gives the exit code and the seconds until the end."""
+        start = monotonic()
+        self.process.send_signal(number)
+        code = self.process.wait(10)
+        return code, monotonic() - start

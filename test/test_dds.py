@@ -1,0 +1,329 @@
+"""The odometry on a graph without ROS: player, node and subscriber are processes over real DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import signal
+import struct
+import sys
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+from dds_graph import Command, IMAGE_TYPE, INFO_TYPE, NODE, Peer, Profile, TYPES
+from djet_ros.cli.main import main
+from djet_ros.data.bag_writers import write_kitti_bag
+from djet_ros.data.bags import Bag
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.dds.names import Names
+from djet_ros.dds.wire import encode
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.scenes import render_sequence
+import numpy as np
+import pytest
+from ros_messages import camera_info, header, image, serialised
+
+IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
+RECTIFIED = '/camera/image_rect'
+FRAMES = 12
+ODOMETRY = f'{NODE}/odometry'
+EVERY = ('-p', 'ros.queue_policy:=every')
+FAST = ('-p', 'estimator.max_features:=500')
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a rendered drive."""
+    folder = tmp_path_factory.mktemp('drive')
+    sequence = render_sequence('road', folder / 'kitti', FRAMES, 0, (320, 240))
+    write_kitti_bag(KittiSequence(sequence), folder / 'bag')
+    return folder / 'bag'
+
+
+@pytest.fixture(scope='module')
+def drive() -> list[Any]:
+    cards, here, images = Cards(), np.eye(4), []
+    for _ in range(6):
+        images.append(cards.gray(here))
+        here = here @ pose(x=0.25, z=0.15, yaw=0.01)
+    return images
+
+
+@pytest.fixture(scope='module')
+def graph_peer() -> Peer:
+    return Peer()
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
+    """Give a function that starts a djet command; it has ended, without a traceback, at last."""
+    started: list[Command] = []
+
+    def run(*words: str | Path) -> Command:
+        started.append(Command(tmp_path / f'{words[0]}_{len(started)}.log', *words))
+        return started[-1]
+
+    yield run
+    for one in started:
+        if one.process.poll() is None:
+            one.end()
+        assert 'Traceback' not in one.log, one.log
+
+
+@pytest.fixture
+def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[..., Command]]:
+    """Give a function that starts djet live, and waits until its topics are there."""
+    def run(*words: str, topic: str = IMAGE) -> Command:
+        one = start('live', '-r', f'image:={topic}', *words)
+        for output in TYPES:
+            graph_peer.wait(output, lambda output=output: graph_peer.graph.offers(output))
+        for messages in graph_peer.heard.values():
+            messages.clear()
+        return one
+
+    def gone() -> bool:
+        return not any(map(graph_peer.graph.offers, TYPES))
+
+    graph_peer.wait('the end of the last node', gone)
+    yield run
+
+
+@pytest.fixture
+def peer(graph_peer: Peer) -> Peer:
+    return graph_peer
+
+
+def stamp(index: int) -> int:
+    return 50 * 10**9 + index * 100_000_000
+
+
+def tracked(peer: Peer, stamps: list[int]) -> Callable[[], bool]:
+    """Make the condition that these images came out with a pair."""
+    return lambda: set(stamps) <= {stamp_ns(message.header)
+                                   for message in peer.heard[f'{NODE}/relative_pose']}
+
+
+def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+        live, start, peer, bag, tmp_path):
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 0
+    poses = [topic for topic in TYPES if topic != '/diagnostics']
+    with Bag(tmp_path / 'out' / 'bag') as replayed:
+        expected = {topic: [serialised(m.message) for m in replayed.messages({topic})]
+                    for topic in poses}
+    live(*EVERY, topic=RECTIFIED)
+    # Twenty times as fast: the player has to wait for the node.
+    player = start('play', bag, '--rate', '20')
+    peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
+    assert f'{FRAMES} images sent on {RECTIFIED}' in player.finish()
+    assert len(expected[poses[0]]) == FRAMES - 1
+    for topic in poses:
+        assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
+
+
+@pytest.mark.parametrize('reliability', ['best_effort', 'reliable'])
+def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
+        live, start, peer, bag, reliability):
+    live('-p', f'ros.qos_reliability:={reliability}', topic=RECTIFIED)
+    start('play', bag).finish()
+
+    def all_there() -> bool:
+        said = peer.said() or {}
+        fates = ('processed', 'dropped', 'rejected', 'lost on the way')
+        return sum(int(said.get(f'frames {fate}', 0)) for fate in fates) == FRAMES
+
+    peer.wait('all images', all_there)
+    assert int(peer.said()['frames processed']) > FRAMES // 2
+    if reliability == 'reliable':
+        assert peer.said()['frames lost on the way'] == '0'
+
+
+def test_the_node_survives_the_players_end_and_takes_the_next_one(live, start, peer, bag):
+    live(*EVERY, *FAST, topic=RECTIFIED)
+    for _ in range(2):
+        player = start('play', bag, '--loop', '--rate', '5')
+        peer.wait('a round', lambda: len(peer.heard[ODOMETRY]) > FRAMES)
+        player.process.kill()
+        player.process.wait()
+        # What had been sent until then is still worked on.
+        peer.spin(0.5)
+        peer.heard[ODOMETRY].clear()
+    said = peer.wait('silence', lambda: peer.said(message='waiting for an image'))
+    assert int(said['status: TIME_JUMP']) >= 2
+
+
+def test_two_players_at_once_are_both_counted(live, start, peer, bag):
+    live(*EVERY, *FAST, topic=RECTIFIED)
+    players = [start('play', bag, '--rate', '5') for _ in range(2)]
+    for player in players:
+        player.finish()
+    said = peer.wait('both', lambda: peer.said(frames_received=str(2 * FRAMES)))
+    assert int(said['frames processed']) + int(said['frames dropped']) == 2 * FRAMES
+
+
+def test_a_late_camera_info_is_waited_for(live, peer, drive):
+    live(*EVERY, *FAST)
+    images = peer.advertise(IMAGE, IMAGE_TYPE)
+    for i in range(3):
+        images.publish(image(drive[i], stamp_ns=stamp(i)))
+    peer.wait('a complaint', lambda: peer.said(message='waiting for camera_info',
+                                               frames_received='3'))
+    infos = peer.advertise(INFO, INFO_TYPE)
+    infos.publish(camera_info(K, SIZE))
+    peer.spin(0.2)
+    for i in range(3, 6):
+        images.publish(image(drive[i], stamp_ns=stamp(i)))
+    peer.wait('pairs', tracked(peer, [stamp(4), stamp(5)]))
+
+
+def test_a_latched_camera_info_from_before_the_node_is_heard(live, peer, drive):
+    infos = peer.advertise(INFO, INFO_TYPE, Profile(depth=1, latched=True), listeners=0)
+    infos.publish(camera_info(K, SIZE))
+    live(*EVERY, *FAST)
+    peer.wait('readiness', lambda: peer.said(message='waiting for an image'))
+    images = peer.advertise(IMAGE, IMAGE_TYPE)
+    for i in range(2):
+        images.publish(image(drive[i], stamp_ns=stamp(i)))
+    peer.wait('a pair', tracked(peer, [stamp(1)]))
+
+
+def test_garbage_on_the_topics_is_said_and_counted_and_the_next_pair_is_tracked(
+        live, peer, drive):
+    one = live(*EVERY, *FAST)
+    infos, images = peer.advertise(INFO, INFO_TYPE), peer.advertise(IMAGE, IMAGE_TYPE)
+    good = encode(image(drive[0], stamp_ns=stamp(9)))
+    # The header of CDR alone is the middleware's to check, for it can't even pass that on.
+    cdr, pixels = good[:4], good.index(drive[0].tobytes())
+    garbage = [cdr + b'garbage', good[:1000], good[:12] + b'\xff' * 4 + good[16:],
+               cdr + bytes(4), good[:pixels - 4] + b'\xff\xff\xff\x7f']
+    infos.send(b'\0\1\0\0no camera')
+    infos.publish(camera_info(K, SIZE))
+    peer.spin(0.2)
+    for i, rubbish in enumerate(garbage):
+        images.publish(image(drive[i], stamp_ns=stamp(i)))
+        images.send(rubbish)
+    images.publish(image(drive[5], stamp_ns=stamp(5)))
+    peer.wait('pairs', tracked(peer, [stamp(i) for i in range(1, 6)]))
+    said = peer.wait('the count', lambda: peer.said(frames_lost_on_the_way=str(len(garbage))))
+    assert said['frames processed'] == '6'
+    assert 'could not be read' in one.log
+
+
+def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
+    one = live('-p', 'ros.qos_reliability:=reliable')
+    images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(reliable=False), listeners=0)
+    peer.wait('the log', lambda: f'incompatible QoS on {IMAGE}' in one.log)
+    assert 'offers best_effort, volatile, /vo_node asks for reliable, volatile' in one.log
+    assert images.listeners == 0
+
+
+def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
+    live(*EVERY, *FAST)
+    infos, images = peer.advertise(INFO, INFO_TYPE), peer.advertise(IMAGE, IMAGE_TYPE)
+    infos.publish(camera_info(K, SIZE))
+    peer.spin(0.2)
+    for i in range(2):
+        images.publish(image(drive[i], stamp_ns=stamp(i)))
+    peer.wait('a pair', tracked(peer, [stamp(1)]))
+    for number, (service, state) in enumerate({
+            'pause': 'paused', 'resume': 'waiting for an image',
+            'reset': 'waiting for an image'}.items()):
+        peer.heard['/diagnostics'].clear()
+        answer = call(peer, service, number)
+        # success, and an empty text with its terminating zero
+        assert answer[:9] == struct.pack('<B3xIB', True, 1, 0)
+        said = peer.wait(state, lambda state=state: peer.said(message=state))
+    assert said['frames received'] == '0'
+
+
+def test_diagnostics_follow_simulated_time(live, start, peer, bag):
+    live(*EVERY, *FAST, '-p', 'use_sim_time:=true', topic=RECTIFIED)
+    start('play', bag, '--clock', '--rate', '10').finish()
+    peer.wait('tracking', lambda: peer.said(message='tracking'))
+    recorded = {header(stamp_ns(m.header)).stamp.sec for m in peer.heard[ODOMETRY]}
+    assert peer.heard['/diagnostics'][-1].header.stamp.sec in recorded
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_mid_stream_ends_all_cleanly_within_a_second(live, start, peer, bag, number):
+    one = live(*EVERY, topic=RECTIFIED)
+    player = start('play', bag, '--loop', '--rate', '10')
+    echo = start('echo', '--diagnostics')
+    peer.wait('a pair', lambda: peer.heard[f'{NODE}/relative_pose'])
+    peer.wait('an echo', lambda: 'tracking; path: ' in echo.log)
+    for command in (one, player, echo):
+        code, seconds = command.end(number)
+        assert code == 0, command.path
+        assert seconds < 1, command.path
+    peer.spin(0.3)
+    # Whole or not at all.
+    assert len({len(peer.heard[topic]) for topic in TYPES if 'relative' in topic}) == 1
+
+
+def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):
+    echo = start('echo')
+    live(*EVERY, *FAST, topic=RECTIFIED)
+    peer.spin(0.5)
+    start('play', bag, '--rate', '10').finish()
+    peer.wait('the lines', lambda: len(echo.log.splitlines()) == FRAMES)
+    assert all(len(line.split()) == 8 for line in echo.log.splitlines())
+
+
+def call(peer: Peer, service: str, number: int) -> bytes:
+    """Call a service of type Trigger as rmw_cyclonedds_cpp does; gives the answer's content."""
+    client = f'clientid={number};'
+    mine = struct.pack('<Qq', 4711, number)
+    answers: list[bytes] = []
+    peer.graph.listen_raw(f'rr{NODE}/{service}Reply', 'std_srvs::srv::dds_::Trigger_Response_',
+                          lambda data, _: answers.append(data), Profile(), client)
+    requests = peer.graph.advertise_raw(
+        f'rq{NODE}/{service}Request', 'std_srvs::srv::dds_::Trigger_Request_', Profile(), client)
+    peer.wait('the service', lambda: requests.listeners)
+    requests.send(b'\0\1\0\0' + mine + b'\0')
+    peer.wait('the answer', lambda: answers)
+    assert answers[0][4:20] == mine
+    return answers[0][20:]
+
+
+# Without a graph
+
+def test_names_are_resolved_and_remapped_as_in_ros():
+    names = Names('vo_node', ['image:=/left/image_raw', '~/odometry:=odom', '__ns:=/robot'])
+    assert names.resolve('image') == '/left/image_raw'
+    assert names.resolve('camera_info') == '/robot/camera_info'
+    assert names.resolve('~/odometry') == '/robot/odom'
+    assert names.resolve('~/relative_pose') == '/robot/vo_node/relative_pose'
+    assert names.resolve('/diagnostics') == '/diagnostics'
+    assert Names('vo_node', ['__node:=front']).resolve('~/path') == '/front/path'
+
+
+@pytest.mark.parametrize(('words', 'environment', 'reason'), [
+    (['-r', 'image=/x'], {}, "'image=/x' is no remapping"),
+    (['-p', 'ros.queue_size'], {}, 'is no parameter; write it as name:=value'),
+    (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
+    (['-p', 'ros.queue_size:=many'], {}, 'must be of type int'),
+    (['-p', 'odometry.scale:=ground_truth'], {}, 'only a recording has'),
+    ([], {'ROS_DOMAIN_ID': 'home'}, "ROS_DOMAIN_ID is 'home'"),
+    ([], {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'HOUSE'}, 'choose from LOCALHOST, SUBNET'),
+    ([], {'CYCLONEDDS_URI': '<Cyclone'}, 'check CYCLONEDDS_URI'),
+])
+def test_what_the_user_can_mend_is_said_in_a_line(
+        words, environment, reason, monkeypatch, capfd, tmp_path):
+    for name, value in {'ROS_DOMAIN_ID': '231', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                        **environment}.items():
+        monkeypatch.setenv(name, value)
+    assert main(['live', *words]) == 2
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith('djet: error: ')
+    assert reason in line
+
+
+def test_without_cyclone_dds_the_commands_say_how_to_get_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'djet_ros.dds.graph', None)
+    for name in [name for name in sys.modules if name.startswith('cyclonedds')]:
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in [name for name in sys.modules if name.startswith('djet_ros.dds.')]:
+        monkeypatch.delitem(sys.modules, name)
+    assert main(['echo']) == 2
+    assert capsys.readouterr().err == (
+        "djet: error: this command needs the Python module 'cyclonedds', which is not installed: "
+        'pip install cyclonedds\n')
