@@ -15,7 +15,7 @@ from djet_ros.data.pose_graph_files import write_graph
 from djet_ros.data.trajectories import TumWriter
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.alignment import aligned, position_rmse
-from djet_ros.evaluation.evo import find_tool, trajectory_metrics
+from djet_ros.evaluation.evo import trajectory_metrics
 from djet_ros.evaluation.style import COLOURS, figure
 from djet_ros.slam.config import SlamConfig
 from djet_ros.slam.run import Slam, travelled
@@ -26,6 +26,9 @@ PLOT = 'slam.png'
 SUMMARY = 'slam.json'
 FILES = (SUMMARY, PLOT, 'pose_graph.g2o', 'pose_graph.csv', 'before_tum.txt', 'after_tum.txt',
          'truth_tum.txt')
+
+_LINES: dict[str, Any] = {'before': {'color': COLOURS['rpe'], 'ls': '--'},
+                          'after': {'color': COLOURS['djet']}}
 
 
 def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Config,
@@ -53,53 +56,63 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Conf
     known = np.isfinite(truth).all(axis=(1, 2))
     if known.sum() > 2:
         _write_tum(folder / 'truth_tum.txt', frames.stamps_ns[known], truth[known])
-        summary['errors'] = {which: _errors(folder, which, poses, truth, slam.scale_known)
+        summary['errors'] = {which: _error(poses, truth, slam.scale_known)
                              for which, poses in ways.items()}
+        try:
+            for which, errors in summary['errors'].items():
+                errors.update(_evo(folder, which, slam.scale_known))
+        except DjetError as error:
+            # It is not installed, or refuses a way that is straight.
+            summary['evo'] = str(error)
     _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, Path(name).name)
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n')
     return summary
 
 
-def _errors(folder: Path, which: str, poses: Array, truth: Array,
-            scaled: bool) -> dict[str, float]:
-    """Errors of a trajectory, in metres and degrees; evo's own only where it is installed."""
+def _error(poses: Array, truth: Array, scaled: bool) -> dict[str, float]:
     there = truth[:, :3, 3]
-    errors = {'ape_m': position_rmse(aligned(poses[:, :3, 3], there, scaled), there)}
-    try:
-        find_tool('evo_ape')
-    except DjetError:
-        return errors
+    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], there, scaled), there)}
+
+
+def _evo(folder: Path, which: str, scaled: bool) -> dict[str, float]:
+    """Metrics of a trajectory file by evo's own commands."""
     metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{which}_tum.txt', scaled)
-    return errors | {f'evo_{name}': value for name, value in asdict(metrics).items()}
+    return {f'evo_{name}': value for name, value in asdict(metrics).items()}
 
 
 def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
-    """Draw the way from above, before and after, with the loops that were closed."""
-    ways = [slam.before()[:, :3, 3], slam.after()[:, :3, 3]]
+    """Draw the way from above, before and after, and both errors along it."""
+    ways = {'before': slam.before()[:, :3, 3], 'after': slam.after()[:, :3, 3]}
     if truth is not None:
-        ways = [aligned(way, truth[:, :3, 3], slam.scale_known) for way in ways]
-    with figure(path, 7, 7) as page:
-        axes = page.add_subplot(aspect='equal')
+        ways = {which: aligned(way, truth[:, :3, 3], slam.scale_known)
+                for which, way in ways.items()}
+    with figure(path, 7 if truth is None else 12, 6) as page:
+        axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
         if truth is not None:
             axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
-        axes.plot(ways[0][:, 0], ways[0][:, 2], '--', color=COLOURS['rpe'], label='before')
-        axes.plot(ways[1][:, 0], ways[1][:, 2], color=COLOURS['djet'], label='after')
-        places = _keyframe_places(slam, ways[1])
-        loops = [edge for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
-                 if edge.kind == 'loop' and trust >= 0.5]
-        for edge in loops:
-            ends = places[[edge.source, edge.target]]
-            axes.plot(ends[:, 0], ends[:, 2], color=COLOURS['pjet'], lw=0.8,
-                      label='loop' if edge is loops[0] else None)
+        for which, way in ways.items():
+            axes.plot(way[:, 0], way[:, 2], label=which, **_LINES[which])
+        axes.plot(*_closed(slam, ways['after'])[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4,
+                  label='loop closed')
         unit = 'm' if slam.scale_known or truth is not None else 'units'
         axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
         axes.legend()
+        if truth is not None:
+            errors = page.add_subplot(1, 2, 2)
+            seconds = (slam.frames.stamps_ns - slam.frames.stamps_ns[0]) * 1e-9
+            for which, way in ways.items():
+                errors.plot(seconds, np.linalg.norm(way - truth[:, :3, 3], axis=1), label=which,
+                            **_LINES[which])
+            errors.set(xlabel='time (s)', ylabel='distance from the truth, aligned (m)')
+            errors.legend()
 
 
-def _keyframe_places(slam: Slam, way: Array) -> Array:
-    """Positions (M, 3) of the keyframes among those of all frames (N, 3)."""
+def _closed(slam: Slam, way: Array) -> Array:
+    """Positions (L, 3), among those of all frames (N, 3), from which a trusted loop was closed."""
     _, first = np.unique(slam.keyframes.keyframe, return_index=True)
-    return np.asarray(way[first])
+    closing = [edge.source for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
+               if edge.kind == 'loop' and trust >= 0.5]
+    return np.asarray(way[first[np.array(closing, np.int64)]])
 
 
 def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:

@@ -1,0 +1,381 @@
+"""Closing loops: keyframes, places, lengths of loops, the optimisation, and the command."""
+
+from dataclasses import replace
+import json
+import os
+import subprocess
+import sys
+
+from cards import Cards, K, pose
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.data.pose_graph import Edge, PoseGraph
+from djet_ros.data.trajectories import read_tum
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.odometry.scale import Length
+from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
+from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.keyframes import choose_keyframes
+from djet_ros.slam.loops import transferred_length
+from djet_ros.slam.places import PlaceIndex
+import numpy as np
+import pytest
+
+DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
+
+SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
+
+
+def djet(*words, expect=0):
+    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
+                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+    assert done.returncode == expect, done.stderr
+    assert 'Traceback' not in done.stderr
+    return done
+
+
+def twice_round(frames=60, laps=2):
+    """Poses round a circle, and the same as an odometry that turns too much has them."""
+    true, drifted = [np.eye(4)], [np.eye(4)]
+    for _ in range(frames * laps - 1):
+        true.append(true[-1] @ pose(z=1.0, yaw=2 * np.pi / frames))
+        drifted.append(drifted[-1] @ pose(z=1.0, yaw=2 * np.pi / frames + 2e-3))
+    return np.array(true), np.array(drifted)
+
+
+def chain(poses, covariance=None):
+    """Graph of an odometry that took these poses, a tenth of a second apart."""
+    covariance = np.diag(SIGMAS**2) if covariance is None else covariance
+    edges = [Edge(i, i + 1, np.linalg.inv(poses[i]) @ poses[i + 1], covariance)
+             for i in range(len(poses) - 1)]
+    return PoseGraph(10**9 + np.arange(len(poses)) * 10**8, poses, tuple(edges))
+
+
+def loop(true, source, target):
+    return Edge(source, target, np.linalg.inv(true[source]) @ true[target],
+                np.diag(SIGMAS**2), 'loop')
+
+
+# Keyframes
+
+def test_keyframes_come_by_way_and_by_turn():
+    straight = np.array([pose(z=0.5 * i) for i in range(9)])
+    turning = np.array([pose(yaw=np.radians(4 * i)) for i in range(9)])
+    for poses, expected in ((straight, [0, 4, 8]), (turning, [0, 3, 6])):
+        keyframes = choose_keyframes(chain(poses), SlamConfig())
+        assert keyframes.graph.stamps_ns.tolist() == [10**9 + i * 10**8 for i in expected]
+        assert [(edge.source, edge.target) for edge in keyframes.graph.edges] == [(0, 1), (1, 2)]
+
+
+def test_all_frames_hang_on_their_keyframes():
+    _, poses = twice_round()
+    keyframes = choose_keyframes(chain(poses), SlamConfig(keyframe_distance=3.0))
+    assert np.allclose(keyframes.all_poses(keyframes.graph.poses), poses, atol=1e-9)
+    moved = pose(x=1.0, yaw=0.3)
+    assert np.allclose(keyframes.all_poses(moved @ keyframes.graph.poses), moved @ poses)
+
+
+def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps():
+    rng = np.random.default_rng(0)
+    steps, samples = [pose(z=1.0, yaw=0.1)] * 3, []
+    for _ in range(4000):
+        way = np.eye(4)
+        for step in steps:
+            noise = rng.normal(size=6) * SIGMAS
+            wrong = step.copy()
+            wrong[:3, 3] += noise[:3]
+            wrong[:3, :3] = rotation_exp(noise[3:]) @ wrong[:3, :3]
+            way = way @ wrong
+        samples.append(way)
+    poses = np.array([np.eye(4), steps[0], steps[0] @ steps[1], steps[0] @ steps[1] @ steps[2]])
+    config = SlamConfig(keyframe_distance=2.5, keyframe_turn=90)
+    edge, = choose_keyframes(chain(poses), config).graph.edges
+    off = np.array([[*(way[:3, 3] - edge.motion[:3, 3]),
+                     *cv2.Rodrigues(way[:3, :3] @ edge.motion[:3, :3].T)[0].ravel()]
+                    for way in samples])
+    white = np.linalg.solve(np.linalg.cholesky(edge.covariance), off.T)
+    assert np.abs(np.cov(white) - np.eye(6)).max() < 0.1
+
+
+def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so():
+    graph = chain(np.array([pose(z=0.1 * i) for i in range(4)]))
+    hole = replace(graph.edges[1], kind='unknown', covariance=UNKNOWN_MOTION, scale_known=False)
+    graph = replace(graph, edges=(graph.edges[0], hole, graph.edges[2]))
+    keyframes = choose_keyframes(graph, SlamConfig())
+    edge, = keyframes.graph.edges
+    assert (edge.kind, edge.scale_known) == ('unknown', False)
+    assert keyframes.keyframe.tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('keyframe_distance', 0.0), ('links', 0), ('loop_share', 1.5), ('loop_gap', float('nan'))])
+def test_parameters_outside_their_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        SlamConfig(**{name: value})
+
+
+# Places
+
+@pytest.fixture(scope='module')
+def features():
+    """Features of three different worlds, and of the first once more from beside."""
+    estimator = TwoViewEstimator()
+    views = [Cards(seed).gray() for seed in (1, 2, 3)] + [Cards(1).gray(pose(x=0.2), noise=1)]
+    return [estimator.features(view) for view in views]
+
+
+def test_a_place_seen_again_gets_most_votes(features):
+    votes = PlaceIndex(features).votes(3, 3)
+    assert votes.shape == (3,)
+    assert votes[0] > 100
+    assert votes[0] > 10 * max(votes[1:])
+
+
+def test_only_keyframes_from_before_get_votes(features):
+    index = PlaceIndex(features)
+    assert index.votes(3, 0).shape == (0,)
+    assert np.array_equal(index.votes(3, 1), index.votes(3, 3)[:1])
+
+
+def test_keyframes_without_features_get_no_votes(features):
+    nothing = TwoViewEstimator().features(np.zeros((50, 50), np.uint8))
+    assert PlaceIndex([nothing, features[0], nothing]).votes(2, 2).tolist() == [0, 0]
+    assert PlaceIndex([nothing, features[0]]).votes(1, 1).tolist() == [0]
+
+
+# Lengths of loops
+
+def seen(points, motion, noise=0.0, seed=0):
+    """Exact pair of views of points (N, 3), motion the second camera in the first."""
+    R, t = motion[:3, :3].T, -motion[:3, :3].T @ motion[:3, 3]
+
+    def pixels(X):
+        x = X @ K.T
+        return x[:, :2] / x[:, 2:]
+
+    y = pixels(points @ R.T + t)
+    y += noise * np.random.default_rng(seed).normal(size=y.shape)
+    return RelativePose(Status.OK, R, unit(t), x=pixels(points), y=y, y_opt=y,
+                        inliers=np.ones(len(points), bool))
+
+
+@pytest.fixture
+def points():
+    rng = np.random.default_rng(4)
+    return np.column_stack([rng.uniform(-3, 3, (80, 2)), rng.uniform(4, 20, 80)])
+
+
+@pytest.mark.parametrize('motion', [pose(z=-0.4), pose(x=0.3, z=1.2, yaw=0.05), pose(x=-2.0)])
+def test_the_length_of_a_loop_is_told_by_the_depths_of_a_step(points, motion):
+    step, known = pose(z=-1.0, yaw=0.02), Length(1.0, 0.05, True)
+    true = np.linalg.norm(motion[:3, 3])
+    exact = transferred_length(seen(points, step), seen(points, motion), known, K)
+    assert exact.known
+    assert exact.value == pytest.approx(true, rel=1e-6)
+    assert exact.sigma == pytest.approx(0.05 * true, rel=1e-3)
+    noisy = transferred_length(seen(points, step, 0.3, 1), seen(points, motion, 0.3, 2), known, K)
+    assert abs(noisy.value - true) < 2 * noisy.sigma
+    assert exact.sigma < noisy.sigma < true
+
+
+def test_a_length_is_unknown_where_too_few_points_are_shared(points):
+    step, other = seen(points[:40], pose(z=-1.0)), seen(points[30:], pose(x=1.0))
+    assert not transferred_length(step, other, Length(1.0, 0.05, True), K).known
+    # far points have no parallax, and so no depth
+    far = points * 1e4
+    assert not transferred_length(seen(far, pose(z=-1.0)), seen(far, pose(x=1.0)),
+                                  Length(1.0, 0.05, True), K).known
+
+
+# Optimisation
+
+@pytest.fixture
+def optimise():
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.slam.backend import optimise
+    return optimise
+
+
+def test_a_graph_that_agrees_with_itself_stays_as_it_is(optimise):
+    true, _ = twice_round()
+    graph = chain(true)
+    graph = replace(graph, edges=(*graph.edges, loop(true, 60, 0), loop(true, 119, 59)))
+    solution = optimise(graph)
+    assert np.allclose(solution.graph.poses, true, atol=1e-6)
+    assert (solution.trust > 0.99).all()
+
+
+def test_loops_take_the_drift_away(optimise):
+    true, drifted = twice_round()
+    graph = chain(drifted)
+    loops = tuple(loop(true, 60 + i, i) for i in range(0, 60, 5))
+    after = optimise(replace(graph, edges=(*graph.edges, *loops))).graph.poses
+
+    def error(poses):
+        return position_rmse(aligned(poses[:, :3, 3], true[:, :3, 3]), true[:, :3, 3])
+
+    assert error(drifted) > 0.5
+    assert error(after) < error(drifted) / 5
+
+
+def test_wrong_loops_are_not_trusted_and_change_nothing(optimise):
+    true, drifted = twice_round()
+    graph = chain(drifted)
+    good = tuple(loop(true, 60 + i, i) for i in range(0, 60, 5))
+    rng = np.random.default_rng(1)
+    wrong = tuple(replace(loop(true, 60 + i, i), source=int(rng.integers(40, 50)))
+                  for i in range(15, 23))
+    clean = optimise(replace(graph, edges=(*graph.edges, *good)))
+    solution = optimise(replace(graph, edges=(*graph.edges, *good, *wrong)))
+    assert (solution.trust[-len(wrong):] < 0.1).all()
+    assert (solution.trust[:-len(wrong)] > 0.5).all()
+    assert np.allclose(solution.graph.poses, clean.graph.poses, atol=0.05)
+
+
+def test_a_loop_of_unknown_length_still_tells_directions(optimise):
+    true, drifted = twice_round()
+    graph = chain(drifted)
+    loops = []
+    for i in range(0, 60, 5):
+        edge = loop(true, 60 + i, (i + 1) % 60)
+        direction = unit(edge.motion[:3, 3])
+        motion = edge.motion.copy()
+        motion[:3, 3] *= 3.0
+        loops.append(replace(edge, motion=motion, scale_known=False,
+                             covariance=edge.covariance + 1e6 * np.pad(
+                                 np.outer(direction, direction), (0, 3))))
+    after = optimise(replace(graph, edges=(*graph.edges, *loops))).graph.poses
+    assert position_rmse(after[:, :3, 3], true[:, :3, 3]) < position_rmse(
+        drifted[:, :3, 3], true[:, :3, 3]) / 5
+
+
+def test_a_singular_covariance_is_refused_with_the_name_of_its_edge(optimise):
+    true, _ = twice_round()
+    graph = chain(true)
+    bad = replace(loop(true, 60, 0), covariance=np.ones((6, 6)))
+    with pytest.raises(DjetError, match=r'loop edge 60 -> 0 .* is singular'):
+        optimise(replace(graph, edges=(*graph.edges, bad)))
+
+
+# Alignment
+
+def test_alignment_undoes_any_motion_and_scale():
+    rng = np.random.default_rng(2)
+    truth = rng.normal(size=(20, 3))
+    R = rotation_exp(rng.normal(size=3))
+    moved = truth @ R.T + [1, 2, 3]
+    assert np.allclose(aligned(moved, truth), truth)
+    assert np.allclose(aligned(0.2 * moved, truth, scaled=False), truth)
+    assert position_rmse(aligned(0.2 * moved, truth), truth) > 0.5
+    holes = truth.copy()
+    holes[3:6] = np.nan
+    assert np.allclose(aligned(moved, holes), truth)
+    assert position_rmse(truth + np.array([3, 0, 4]), holes) == pytest.approx(5)
+
+
+# The command
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory):
+    """Give a KITTI sequence of a way to the right and back, past cards."""
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    folder = tmp_path_factory.mktemp('dataset') / 'sequences' / '00'
+    (folder / 'image_0').mkdir(parents=True)
+    (folder.parents[1] / 'poses').mkdir()
+    cards, rows = Cards(), []
+    ways = [0.25 * i for i in (*range(8), *range(8, -1, -1))]
+    for i, way in enumerate(ways):
+        here = pose(x=way, z=0.3 * way**2)
+        cv2.imwrite(str(folder / 'image_0' / f'{i:06d}.png'), cards.gray(here, noise=i))
+        rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
+    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
+    (folder / 'calib.txt').write_text(f'P0: {row}\n')
+    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(len(ways))))
+    (folder.parents[1] / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
+    return folder
+
+
+FLAGS = ('--keyframe-distance', 0.5, '--loop-gap', 0.5)
+
+
+@pytest.fixture(scope='module')
+def closed(drive, tmp_path_factory):
+    """Folder of a run on the recording."""
+    out = tmp_path_factory.mktemp('run') / 'slam'
+    done = djet('slam', drive, '--output', out, '--scale', 'ground_truth', *FLAGS)
+    assert 'edges: loop' in done.stdout
+    return out
+
+
+def test_the_command_closes_loops_of_a_recording(closed):
+    said = json.loads((closed / 'slam.json').read_text())
+    assert (said['scale'], said['scale_known'], said['scale_uncertainty']) == (
+        'ground_truth', True, 0.05)
+    assert said['frames'] == 17
+    assert said['keyframes'] == said['edges']['odometry'] + 1 >= 7
+    assert said['edges']['loop'] >= 3
+    assert said['errors']['after']['ape_m'] < 0.05
+    stamps, poses = read_tum(closed / 'after_tum.txt')
+    _, truth = read_tum(closed / 'truth_tum.txt')
+    assert len(stamps) == 17
+    assert position_rmse(aligned(poses[:, :3, 3], truth[:, :3, 3]),
+                         truth[:, :3, 3]) == pytest.approx(said['errors']['after']['ape_m'])
+    size = cv2.imread(str(closed / 'slam.png')).shape
+    assert min(size[:2]) > 400
+
+
+def test_its_loops_are_as_sure_as_they_say(closed):
+    rows = [row.split(',') for row in (closed / 'pose_graph.csv').read_text().splitlines()]
+    stamps, truth = read_tum(closed / 'truth_tum.txt')
+    at = dict(zip(stamps.tolist(), truth))
+    loops = [row for row in rows if row[2] == 'loop']
+    surprises = []
+    for row in loops:
+        true = np.linalg.inv(at[int(row[0])]) @ at[int(row[1])]
+        numbers = np.array(row[4:], float)
+        covariance = np.zeros((6, 6))
+        covariance[np.triu_indices(6)] = numbers[7:]
+        covariance = covariance + np.triu(covariance, 1).T
+        off = true[:3, 3] - numbers[:3]
+        surprises.append(off @ np.linalg.solve(covariance[:3, :3], off))
+    # of three degrees of freedom; single pairs may be off, as the kernel expects of loops
+    assert np.median(surprises) < 8
+
+
+def test_the_command_takes_results_too_and_wherever_their_recording_went(
+        closed, drive, tmp_path):
+    results = closed / 'replay'
+    djet('slam', results, '--output', tmp_path / 'again', *FLAGS)
+    for name in ('pose_graph.g2o', 'after_tum.txt'):
+        assert (tmp_path / 'again' / name).read_bytes() == (closed / name).read_bytes()
+    summary = json.loads((results / 'summary.json').read_text())
+    moved = tmp_path / 'results'
+    moved.mkdir()
+    for name in ('frames.csv', 'trajectory_tum.txt', 'config.yaml', 'bag'):
+        (moved / name).symlink_to(results / name)
+    (moved / 'summary.json').write_text(json.dumps({**summary, 'source': '/gone'}))
+    refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
+    assert '--source' in refused.stderr
+    djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
+
+
+def test_the_command_keeps_earlier_results_and_parameters(closed, tmp_path):
+    refused = djet('slam', closed / 'replay', '--output', closed, *FLAGS, expect=2)
+    assert '--overwrite' in refused.stderr
+    refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--links', 0, expect=2)
+    assert 'links is 0' in refused.stderr
+    refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--scale', 'constant',
+                   expect=2)
+    assert 'have their parameters already' in refused.stderr
+
+
+def test_links_to_more_keyframes_are_edges_of_unknown_length(closed, tmp_path):
+    djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--links', 2, *FLAGS)
+    rows = [row.split(',') for row in (tmp_path / 'slam' / 'pose_graph.csv').read_text(
+        ).splitlines()]
+    links = [row for row in rows if row[2] == 'link']
+    assert len(links) >= 4
+    assert all(row[3] == '0' for row in links)
