@@ -461,6 +461,7 @@ def small_views():
             for image in (noise, np.roll(noise, 3, 1), np.full_like(noise, 128))]
 
 
+@pytest.mark.filterwarnings('error')
 @given(kind=st.sampled_from(SORTS), count=st.integers(1, 60), seed=st.integers(0, 2**32 - 1),
        method=st.sampled_from(METHODS), preset_name=st.sampled_from(['best', 'paper']),
        images=st.tuples(*2 * [st.integers(0, 2)]),
@@ -477,4 +478,4 @@ def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, pr
     assert np.isfinite(result.y_opt).all()
     if result.status == Status.OK:
         variances = np.linalg.eigvalsh(result.covariance_5)
-        assert variances[0] > -1e-12 * variances[-1] and variances[-1] > 0
+        assert variances[0] > -1e-8 * variances[-1] and variances[-1] > 0

@@ -84,12 +84,13 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     deviation, so that what moves or is near in part of the image does not turn it.
     """
     x, y = unit(rays_x), unit(rays_y)
-    weights = np.ones(len(x))
+    R, weights = np.eye(3), np.ones(len(x))
     for _ in range(rounds):
-        rotation, _ = Rotation.align_vectors(y, x, weights)
-        deviation = np.linalg.norm(y - rotation.apply(x), axis=1)
+        U, _, Vt = np.linalg.svd((y.T * weights) @ x)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        deviation = np.linalg.norm(y - x @ R.T, axis=1)
         weights = 1 / (1 + (deviation / max(float(np.median(deviation)), 1e-9))**2)
-    return np.asarray(rotation.as_matrix())
+    return R
 
 
 def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:
