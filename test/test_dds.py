@@ -146,7 +146,8 @@ def test_the_node_survives_the_players_end_and_takes_the_next_one(live, start, p
         player.process.wait()
         # What had been sent until then is still worked on.
         peer.spin(0.5)
-        peer.heard[ODOMETRY].clear()
+        for messages in peer.heard.values():
+            messages.clear()
     said = peer.wait('silence', lambda: peer.said(message='waiting for an image'))
     assert int(said['status: TIME_JUMP']) >= 2
 
