@@ -59,14 +59,14 @@ class VoNode(Node):
         image, info = self._input_topics(config)
         self._session = Session(Tracker(config, message_type, image_topic=image), self,
                                 {'image': image, 'camera_info': info})
+        # Publishers that do not fit are reported by name, which becomes known a little later.
+        self._mismatched: dict[str, Subscription] = {}
         self._outputs: dict[str, Publisher] = {}
         self._speed_inputs: list[Subscription] = []
         self._info_topic = info
         self._latched_input: Subscription | None = None
         self._connect(config)
 
-        # Those that nothing fits to, by topic: reported once they are known by name.
-        self._mismatched: dict[str, Subscription] = {}
         # CameraInfo first: of two that wait, it is to be taken before its image.
         self._listen(CameraInfo, info, self._session.camera_info, _qos(config))
         self._listen(CompressedImage if config.ros.image_transport == 'compressed' else Image,

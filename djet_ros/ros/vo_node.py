@@ -27,15 +27,20 @@ def main() -> int:
         return _fail("rclpy is missing: install ROS 2 and 'source /opt/ros/jazzy/setup.bash'; "
                      "without ROS, 'djet replay' works on recorded bags")
 
+    from djet_ros.data.text import one_line
     from djet_ros.errors import DjetError
-    from djet_ros.ros.node import run
-    from rclpy.utilities import remove_ros_args
+    try:
+        from djet_ros.ros.node import run
+        from rclpy.utilities import remove_ros_args
+    except ImportError as error:
+        # Such as an rclpy that was built for another Python.
+        return _fail(f'this Python ({sys.executable}) lacks something: {one_line(error)}')
     parser = argparse.ArgumentParser(
         prog='vo_node', description='Visual odometry by D-JET as a ROS 2 node.', epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.parse_args(remove_ros_args()[1:])
     try:
-        return run(stop)
+        return 0 if stop.is_set() else run(stop)
     except DjetError as error:
         return _fail(str(error))
 
