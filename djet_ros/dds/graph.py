@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import os
+from pathlib import Path
+import re
 from typing import Any, Self
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -35,7 +37,7 @@ _ANY = ViewState.Any | InstanceState.Any | SampleState.NotRead
 _LOCALHOST = """\
 <CycloneDDS><Domain>
   <General>
-    <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+    {interfaces}
     <AllowMulticast>false</AllowMulticast>
     <MaxMessageSize>65500B</MaxMessageSize><FragmentSize>60000B</FragmentSize>
   </General>
@@ -44,6 +46,8 @@ _LOCALHOST = """\
     <Peers><Peer address="localhost"/>{peers}</Peers>
   </Discovery>
 </Domain></CycloneDDS>,"""
+
+_LOOPBACK = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
 
 _SUBNET = """\
 <CycloneDDS><Domain><Discovery>
@@ -129,7 +133,11 @@ class Publisher:
 
     def wait_until_taken(self, seconds: float) -> bool:
         """Wait until all reliable subscriptions have everything."""
-        return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        try:
+            return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        except AttributeError:
+            # Cyclone 11.0.1 looks the code of its own timeout up in the wrong class.
+            return False
 
 
 class Subscription:
@@ -272,9 +280,17 @@ def _configuration(environment: Mapping[str, str]) -> str:
                         f'{", ".join(_RANGES)}')
     peers = ''.join(f'<Peer address="{peer}"/>'
                     for peer in environment.get('ROS_STATIC_PEERS', '').split(';') if peer)
-    # What the user says comes last and counts.
-    return (_RANGES[name].format(peers=peers, pid=os.getpid())
-            + environment.get('CYCLONEDDS_URI', ''))
+    # What the user says comes last and counts; but interfaces add up, and none may come twice.
+    uri = environment.get('CYCLONEDDS_URI', '')
+    interfaces = '' if _chooses_interfaces(uri) else _LOOPBACK
+    return _RANGES[name].format(interfaces=interfaces, peers=peers, pid=os.getpid()) + uri
+
+
+def _chooses_interfaces(uri: str) -> bool:
+    """Tell whether a Cyclone configuration, which is XML or names of files, chooses interfaces."""
+    files = [Path(name) for name in re.findall('file://([^,]+)', uri)]
+    texts = [uri, *(file.read_text(errors='replace') for file in files if file.is_file())]
+    return any('<NetworkInterface' in text for text in texts)
 
 
 def _type_hash(ros_type: str) -> str:
