@@ -1,0 +1,56 @@
+"""The bench writes the figures that it promises, and refuses what it can't measure."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from djet_ros.scenes.sequence import render_sequence
+import pytest
+
+
+@pytest.fixture(scope='module')
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp('bench')
+    render_sequence('road', out, 3, size=(620, 188))
+    return next((out / 'sequences').iterdir())
+
+
+def bench(*arguments: object) -> subprocess.CompletedProcess[str]:
+    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
+    return subprocess.run([sys.executable, '-c', code, 'bench', *map(str, arguments)],
+                          capture_output=True, text=True, timeout=300)
+
+
+def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(sequence, tmp_path):
+    output = tmp_path / 'bench.json'
+    run = bench(sequence, '--output', output, '--pairs', 2)
+    assert run.returncode == 0, run.stderr
+    figures = json.loads(output.read_text())
+    for name in ('pipeline_over_opencv', 'pairs_per_second', 'djet_stage_ms',
+                 'kernel_speedup_over_cv2', 'bytes_per_frame'):
+        assert figures[name] > 0, name
+    assert figures['pairs'] == figures['all_cores']['pairs'] == 2
+    assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (('missing', '--output', 'a.json'), 'missing'),
+    (('.', '--output', 'a.json', '--pairs', 0), '--pairs is 0')])
+def test_what_can_be_mended_is_one_line_and_exit_code_2(tmp_path, arguments, said, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = bench(*arguments)
+    assert run.returncode == 2
+    assert said in run.stderr
+    assert run.stderr.count('\n') == 1
+
+
+def test_figures_are_not_overwritten_silently(sequence, tmp_path):
+    output = tmp_path / 'bench.json'
+    output.write_text('{}')
+    run = bench(sequence, '--output', output)
+    assert run.returncode == 2
+    assert '--overwrite' in run.stderr
+    assert output.read_text() == '{}'

@@ -1,0 +1,59 @@
+"""The covariance of a pose is true on scenes other than the one it was calibrated on."""
+
+from __future__ import annotations
+
+from djet_ros.core.config import preset
+from djet_ros.core.covariance import pose_covariance
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import sphere_tangents, unit
+from djet_ros.core.jet import Loss, Residuals
+from djet_ros.core.types import Status
+from djet_ros.scenes.pair import render_pair
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def normalised_squared_error(name: str, first: int) -> float:
+    """e^T C^-1 e over the five degrees of freedom of a pair; 5 on average if C is true."""
+    pair = render_pair(name, first, seed=3)
+    estimator = TwoViewEstimator(preset('best'))
+    pose = estimator.estimate(*(estimator.view(gray, pair.K)
+                                for gray in (pair.previous, pair.current)))
+    assert pose.status is Status.OK
+    error = np.concatenate([Rotation.from_matrix(pair.R @ pose.R.T).as_rotvec(),
+                            sphere_tangents(pose.t).T @ (unit(pair.t) - pose.t)])
+    return float(error @ np.linalg.solve(pose.covariance_5, error))
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    # Pairs far from one another, so that their errors are independent. True within a factor of
+    # 2.5 in variance, 1.6 in standard deviation: errors of real surfaces are no Gaussians.
+    found = [normalised_squared_error(name, first) for name in ('road', 'loop', 'sharp_turn')
+             for first in range(5, 100, 19)]
+    assert 5 / 2.5 < np.mean(found) < 5 * 2.5
+
+
+def test_settling_on_the_opposite_direction_turns_what_goes_with_it():
+    rng = np.random.default_rng(0)
+    t = unit(np.array([0.2, -0.1, -1.0]))
+    residuals = Residuals(rng.normal(size=400), np.ones(400), rng.normal(size=(5, 400)),
+                          sphere_tangents(t))
+    places = rng.uniform(0, 1000, (400, 2))
+    same, opposite = (pose_covariance(residuals, Loss(), places, sign * t, sign < 0)[1]
+                      for sign in (1, -1))
+    assert np.allclose(opposite[:3, :3], same[:3, :3])
+    assert np.allclose(opposite[3:, 3:], same[3:, 3:])
+    assert np.allclose(opposite[:3, 3:], -same[:3, 3:])
+    assert np.linalg.matrix_rank(same, 1e-12) == 5
+
+
+def test_repeating_every_match_next_to_itself_makes_no_pose_surer():
+    rng = np.random.default_rng(1)
+    t = np.array([0.0, 0, 1])
+    J, r, places = rng.normal(size=(5, 300)), rng.normal(size=300), rng.uniform(0, 1000, (300, 2))
+    once = pose_covariance(Residuals(r, np.ones(300), J, sphere_tangents(t)), Loss(), places, t,
+                           False)[0]
+    twice = pose_covariance(
+        Residuals(np.tile(r, 2), np.ones(600), np.tile(J, 2), sphere_tangents(t)), Loss(),
+        np.tile(places, (2, 1)), t, False)[0]
+    assert np.allclose(once, twice)
