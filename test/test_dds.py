@@ -77,6 +77,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
     for one in started:
         if one.process.poll() is None:
             one.end()
+    for one in started:
         assert 'Traceback' not in one.log, one.log
 
 
