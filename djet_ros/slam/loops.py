@@ -70,7 +70,7 @@ class EdgeFinder:
                 yield from self._link(current, previous)
 
     def _link(self, current: int, previous: int) -> Iterator[Edge]:
-        relative = self._wide.estimate(self._view(previous), self._view(current))
+        relative = self._near.estimate(self._view(previous), self._view(current))
         if relative.status is Status.OK and self._is_sure(relative):
             guess = np.linalg.norm((np.linalg.inv(self._graph.poses[previous])
                                     @ self._graph.poses[current])[:3, 3])
