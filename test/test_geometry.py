@@ -132,6 +132,13 @@ def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():
     assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-4
 
 
+def test_a_rotation_fitted_to_rays_of_one_plane_is_no_mirror():
+    rays_x = np.array([[-0.5, 0, 1], [-0.2, 0, 1], [0.3, 0, 1], [0.4, 0, 1]])
+    for turn in ((0.1, 0.2, 0.3), (-0.3, 0, 0.5), (0, 0, np.pi), (np.pi, 0, 0)):
+        R = Rotation.from_rotvec(turn).as_matrix()
+        assert np.allclose(fit_rotation(rays_x, rays_x @ R.T), R, atol=1e-9)
+
+
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-6, 0.3, np.pi - 1e-6])
 def test_angles_between_poses_are_exact_even_where_an_arc_cosine_is_blind(angle):
     axis = unit(np.array([1.0, -2.0, 0.5]))
