@@ -8,6 +8,7 @@ import sys
 
 from cards import Cards, K, pose
 import cv2
+from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
@@ -19,7 +20,7 @@ from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 from djet_ros.slam.config import SlamConfig
 from djet_ros.slam.keyframes import choose_keyframes
-from djet_ros.slam.loops import transferred_length
+from djet_ros.slam.loops import EdgeFinder, transferred_length
 from djet_ros.slam.places import PlaceIndex
 import numpy as np
 import pytest
@@ -188,6 +189,20 @@ def test_a_length_is_unknown_where_too_few_points_are_shared(points):
     far = points * 1e4
     assert not transferred_length(seen(far, pose(z=-1.0)), seen(far, pose(x=1.0)),
                                   Length(1.0, 0.05, True), K).known
+
+
+def test_standing_where_one_has_been_is_a_loop_of_a_known_place():
+    """The first view once more: no parallax, so no direction, but no farther than a step."""
+    cards = Cards()
+    poses = np.array([pose(x=0.5 * i) for i in range(3)] + [pose()])
+    graph = chain(poses)
+    frames = (cards.frame(1 + 0.1 * i, here, noise=i) for i, here in enumerate(poses))
+    finder = EdgeFinder(graph, frames, EstimatorConfig(), SlamConfig(loop_gap=0.25))
+    edge, = finder.loops(3)
+    assert (edge.source, edge.target, edge.scale_known) == (3, 0, True)
+    assert np.linalg.norm(edge.motion[:3, 3]) < 0.1
+    step = np.linalg.norm(graph.edges[-1].motion[:3, 3])
+    assert np.sqrt(np.linalg.eigvalsh(edge.covariance)[-1]) == pytest.approx(step, rel=0.1)
 
 
 # Optimisation

@@ -86,8 +86,11 @@ class EdgeFinder:
             yield from self._loop(current, place)
 
     def _loop(self, current: int, place: int) -> Iterator[Edge]:
-        view = self._view(current)
-        relative = self._wide.estimate(view, self._view(place))
+        view, seen = self._view(current), self._view(place)
+        # The estimator takes both views to be of one camera.
+        if not np.array_equal(view.K, seen.K):
+            return
+        relative = self._wide.estimate(view, seen)
         if relative.status in TRACKED and self._is_sure(relative):
             yield _edge(current, place, relative, self._length(current, view, relative), 'loop')
 
@@ -95,8 +98,11 @@ class EdgeFinder:
         """Length of a loop's translation, by the points that the last step of the way saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
-        if step is None or not step.scale_known:
+        if step is None or not step.scale_known or not guess:
             return unknown(guess)
+        if relative.status is Status.NO_PARALLAX:
+            # The same place again: nearer than any step, in whatever direction.
+            return Length(guess, guess, True)
         back = self._near.estimate(view, self._view(step.source))
         if back.status is not Status.OK:
             return unknown(guess)
