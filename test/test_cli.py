@@ -44,7 +44,8 @@ def start_probe(body: str) -> subprocess.Popen[str]:
 
 
 def test_the_list_of_commands_is_the_list_of_their_modules() -> None:
-    modules = {path.stem.replace('_', '-') for path in Path(djet_ros.__file__).parent.glob('cli/*.py')
+    files = Path(djet_ros.__file__).parent.glob('cli/*.py')
+    modules = {path.stem.replace('_', '-') for path in files
                if 'def add_parser(' in path.read_text()}
     assert set(COMMANDS) == modules
 
