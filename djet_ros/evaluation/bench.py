@@ -75,7 +75,7 @@ def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     times: dict[str, list[float]] = {'ours': [], 'plain': []}
     for index in range(min(pairs + 1, len(sequence))):
         # Who goes first changes, so that neither always finds the file in the cache.
-        order = [('ours', ours.next), ('plain', plain.next)]
+        order = [('ours', ours.take), ('plain', plain.take)]
         for name, step in order if index % 2 else reversed(order):
             start = perf_counter()
             step(index)
@@ -97,7 +97,7 @@ class _Pipeline:
         self._prior: RelativePose | None = None
         self._timings: list[dict[str, float]] = []
 
-    def next(self, index: int) -> None:
+    def take(self, index: int) -> None:
         start = perf_counter()
         view = self._estimator.view(self._sequence.image(index), self._sequence.K)
         decoded_and_seen = perf_counter() - start
@@ -120,7 +120,7 @@ class _PlainChain:
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._last: tuple[Any, Any] | None = None
 
-    def next(self, index: int) -> None:
+    def take(self, index: int) -> None:
         K = self._sequence.K
         keypoints, descriptors = self._orb.detectAndCompute(self._sequence.image(index), None)
         if self._last is not None:

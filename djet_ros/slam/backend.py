@@ -67,7 +67,7 @@ def _factor(graph: PoseGraph, edge: Edge) -> gtsam.BetweenFactorPose3:
 
 
 def initial_values(poses: Sequence[Array] | Array) -> gtsam.Values:
-    """Give poses (4, 4) the keys 0, 1, …"""
+    """Give poses (4, 4) the keys 0, 1 and so on."""
     values = gtsam.Values()
     for key, pose in enumerate(poses):
         values.insert(key, gtsam.Pose3(pose))
