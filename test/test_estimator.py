@@ -340,7 +340,7 @@ def test_a_rendered_camera_that_stays_on_the_spot_has_no_parallax(scene, method,
         result = estimator.estimate(a, b)
         assert result.status == Status.NO_PARALLAX
         assert not result.t.any()
-        assert np.rad2deg(rotation_angle(result.R, R)) < 0.05
+        assert np.rad2deg(rotation_angle(result.R, R)) < 0.02
 
 
 @pytest.fixture(scope='module')
