@@ -94,7 +94,8 @@ def print_table(console: Console, table: ReadableTable) -> None:
         printed = Table(title=', '.join(section), title_justify='left', box=SIMPLE_HEAD,
                         padding=0)
         for column, title in enumerate(table.header[table.sections:], table.sections):
-            printed.add_column(title, justify='right' if column >= table.numeric else 'left')
+            printed.add_column(title, justify='right' if column >= table.numeric else 'left',
+                               no_wrap=column == table.sections)
         for line in lines:
             cells = [Text(cell, 'bold' if column in line.bold else '')
                      for column, cell in enumerate(line.cells)]

@@ -78,7 +78,7 @@ def evaluate_chunk(chunk: Chunk, entrants: Sequence[Entrant]) -> list[PairRecord
     """
     # Workers are as many as cores: threads of their own would only be in each other's way.
     cv2.setNumThreads(1)
-    sequence, frames = opened(chunk.source.folder), chunk.source.frames
+    sequence, frames = opened(chunk.source), chunk.source.frames
     assert sequence.poses is not None  # sources without poses are refused at the start
     records: list[PairRecord] = []
     current: _Image | None = None

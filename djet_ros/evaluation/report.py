@@ -8,6 +8,7 @@ from dataclasses import asdict, astuple, dataclass
 import html
 import os
 from pathlib import Path
+from urllib.parse import quote
 
 from djet_ros import __version__
 from djet_ros.evaluation import plots
@@ -179,7 +180,7 @@ def _link(name: str) -> str:
 
 
 def _image(picture: Picture, folder: Path, section: str) -> str:
-    source = html.escape(picture.path.relative_to(folder).as_posix())
+    source = quote(picture.path.relative_to(folder).as_posix())
     text = html.escape(f'{section}: {picture.text}')
     return f'<img src="{source}" alt="{text}" loading="lazy">'
 

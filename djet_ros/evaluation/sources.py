@@ -72,8 +72,12 @@ def open_sources(paths: Iterable[Path], selection: Selection, workspace: Path) -
 
 
 @lru_cache(maxsize=2)
-def opened(folder: Path) -> FrameSequence:
-    """Open the frames of a source, once in each process as long as chunks follow one another."""
+def opened(source: Source) -> FrameSequence:
+    """Open the frames of a source, once in each process as long as its chunks follow another."""
+    return _frames_in(source.folder)
+
+
+def _frames_in(folder: Path) -> FrameSequence:
     if is_extracted(folder):
         return ExtractedSequence(folder)
     sequence = open_sequence(folder)
@@ -84,7 +88,7 @@ def opened(folder: Path) -> FrameSequence:
 def pair_of_frames(path: Path, index: int, workspace: Path
                    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Images (H, W) of frames index and index + 1 of any dataset, and their camera matrix."""
-    sequence = opened(_readable(path, workspace / 'frames'))
+    sequence = _frames_in(_readable(path, workspace / 'frames'))
     if not 0 <= index < len(sequence) - 1:
         raise DjetError(f'pair {index} was asked for, {path} has pairs 0 to {len(sequence) - 2}')
     return sequence.image(index), sequence.image(index + 1), sequence.K
@@ -101,7 +105,7 @@ def _readable(path: Path, place: Path) -> Path:
 
 def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Source:
     folder = _readable(path, workspace / name)
-    sequence = opened(folder)
+    sequence = _frames_in(folder)
     frames = _selected(path, sequence, selection)
     if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):
         raise DjetError(f'{path} has no ground truth for two frames in a row; errors need it '

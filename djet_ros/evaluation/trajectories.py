@@ -34,7 +34,7 @@ class Trajectory:
 
 def true_trajectory(source: Source, records: Sequence[PairRecord]) -> Trajectory:
     """Ground truth over the longest run of pairs among the records of one entrant."""
-    sequence, frames = opened(source.folder), _frames(_longest_run(records))
+    sequence, frames = opened(source), _frames(_longest_run(records))
     assert sequence.poses is not None  # sources without poses are refused at the start
     poses = sequence.poses[frames]
     return Trajectory(sequence.stamps_ns[frames], np.linalg.inv(poses[0]) @ poses)
