@@ -16,7 +16,7 @@ import sys
 from time import monotonic, sleep
 
 import cv2
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.config import EstimatorConfig, preset
 from djet_ros.core.types import Status
 from djet_ros.data.bag_writers import write_kitti_bag
 from djet_ros.data.kitti import KittiSequence
@@ -141,9 +141,9 @@ def test_trajectories_stand_beside_the_ground_truth(road, evaluated):
     folder = evaluated / 'trajectories' / 'road'
     stamps, truth = read_tum(folder / 'ground_truth.tum')
     assert np.allclose(truth, KittiSequence(road).poses, atol=1e-9)
-    for preset in ('best', 'paper'):
+    for name in ('best', 'paper'):
         for method in default_methods():
-            its_stamps, poses = read_tum(folder / f'{method}_{preset}.tum')
+            its_stamps, poses = read_tum(folder / f'{method}_{name}.tum')
             assert np.array_equal(its_stamps, stamps)
             lengths = [np.linalg.norm(np.diff(way[:, :3, 3], axis=0), axis=1)
                        for way in (poses, truth)]
@@ -457,6 +457,18 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     # The paper's Table 2 stands below.
     assert '| *VAROS* | *D-JET* | *15×15* | *0.127* | *0.258* | *22.31* |' in text
     assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
+
+
+def test_clean_matches_are_fewer_and_make_the_five_point_start_good(road, tmp_path):
+    source, = open_sources([road], Selection(), tmp_path)
+    config = preset('paper', method='five_point')
+    records = evaluate_chunk(Chunk(source, 0, 5), [
+        Entrant('five_point', 'paper', config, clean=clean) for clean in (False, True)])
+    for every, clean in zip(records[::2], records[1::2]):
+        assert clean.matches < every.matches
+        assert clean.inliers / clean.matches > every.inliers / every.matches
+    with_all, without = ([found.translation_error_deg for found in records[i::2]] for i in (0, 1))
+    assert np.mean(without) < np.mean(with_all)
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [

@@ -33,12 +33,15 @@ def add_parser(subparsers: Any) -> None:
                         help='sides of the sampling area in pixels, odd (default: %(default)s)')
     parser.add_argument('--parts', default=','.join(PARTS), metavar='LIST',
                         help='what is changed (default: %(default)s)')
+    parser.add_argument('--clean-matches', action='store_true',
+                        help='give all variants only matches that agree with the pose of RP-E, '
+                        'preset best: what is left is the effect of the surfaces')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run all variants, and print the tables."""
     competing = ablation_entrants(split(args.presets), split(args.parts), _windows(args.windows),
-                                  shared_values(args))
+                                  shared_values(args), clean=args.clean_matches)
     with evaluated(args, competing) as (sources, records):
         tables = write_ablation(args.output, sources, competing, records)
     console = Console()

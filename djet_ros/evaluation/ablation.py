@@ -62,19 +62,20 @@ PARTS = tuple(changes(()))
 
 
 def ablation_entrants(presets: Sequence[str], parts: Sequence[str], windows: Sequence[int],
-                      values: Mapping[str, Any]) -> list[Entrant]:
+                      values: Mapping[str, Any], *, clean: bool = False) -> list[Entrant]:
     """
     Let D-JET start with each preset and with each single change of it.
 
-    Beside them start RP-E, with the changes that it knows too, and the 5-point method. Raises
-    DjetError on unknown names and on windows that can't be.
+    Beside them start RP-E, with the changes that it knows too, and the 5-point method. clean
+    gives all of them only matches that agree with a robust pose. Raises DjetError on unknown
+    names and on windows that can't be.
     """
     check_names('preset', presets, PRESETS)
     check_names('part', parts, PARTS)
     chosen = changes(windows)
     competing: list[Entrant] = []
     for name in presets:
-        base = {method: Entrant(method, name, configured(method, name, values))
+        base = {method: Entrant(method, name, configured(method, name, values), clean=clean)
                 for method in ('djet', 'rpe', 'five_point')}
         competing += base.values()
         for change in (change for part in parts for change in chosen[part]):

@@ -8,6 +8,7 @@ from time import perf_counter
 from typing import Any
 
 import cv2
+from djet_ros.core.config import preset
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.evaluation import peers
@@ -131,13 +132,23 @@ class _SharedWork:
     def matched(self, entrant: Entrant) -> tuple[View, View, Array, Array, float]:
         """Give both views, the matches x, y (N, 2), and the seconds of features and matching."""
         (previous, _), (current, seconds) = (image.view(entrant) for image in self._images)
-        key = (id(previous), entrant.config.search_radius)
+        key = (id(previous), entrant.config.search_radius, entrant.clean)
         if key not in self._matches:
             start = perf_counter()
             x, y = TwoViewEstimator(entrant.config).match(previous, current)
-            self._matches[key] = x, y, perf_counter() - start
+            matching = perf_counter() - start
+            agreeing = _agreeing(previous, current, x, y) if entrant.clean else slice(None)
+            self._matches[key] = x[agreeing], y[agreeing], matching
         x, y, matching = self._matches[key]
         return previous, current, x, y, seconds + matching
+
+
+def _agreeing(previous: View, current: View, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Tell, (N,) bool, which matches agree with the robust pose that RP-E finds on all."""
+    result = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
+        previous, current, x, y)
+    found = len(result.inliers) == len(x) and bool(result.inliers.any())
+    return result.inliers if found else np.ones(len(x), bool)
 
 
 def _record(source: Source, pair: int, entrant: Entrant, shared: _SharedWork,
