@@ -17,7 +17,6 @@ from cyclonedds.idl.types import uint8
 from djet_ros.data.decoding import jazzy
 from djet_ros.data.text import one_line
 from djet_ros.errors import DjetError
-from rosbags.serde import SerdeError
 
 
 @cache
@@ -60,7 +59,8 @@ def encode(message: Any) -> bytes:
 
 def decode(data: bytes, ros_name: str) -> Any:
     """Read CDR as a message of rosbags; DjetError where it is none."""
+    # rosbags reads by generated code, which fails on rubbish in as many ways as there are types.
     try:
         return jazzy().deserialize_cdr(data, ros_name)
-    except SerdeError as error:
+    except Exception as error:
         raise DjetError(f'{len(data)} bytes are no {ros_name}: {one_line(error)[:120]}') from error
