@@ -34,6 +34,9 @@ _EPIPOLE_BLUR = 5.0
 # motion in the scene fits many matches loosely, the camera's own fits most of them closely.
 _TIGHT = 1.0
 
+# Starts that are refined; of five, two are as a rule in the basin of another.
+_REFINED_STARTS = 3
+
 # Steps after which the costs of several starts tell their basins apart.
 _STEPS_TO_COMPARE = 7
 
@@ -120,10 +123,13 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 
 def _cheapest(problem: JetProblem, starts: list[Pose],
               config: EstimatorConfig) -> tuple[Solution, Loss]:
-    """Refine every start, and the cheapest of them to the end."""
-    scale = min(_scale(epipolar_residuals(problem, s.R, s.t)) for s in starts)
+    """Refine the most promising starts, and the cheapest of them to the end."""
+    residuals = [epipolar_residuals(problem, s.R, s.t) for s in starts]
+    scale = min(_scale(r) for r in residuals)
     tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
-    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts),
+    costs = [float(tight(r.r**2)[0].sum()) for r in residuals]
+    promising = [starts[i] for i in np.argsort(costs, kind='stable')[:_REFINED_STARTS]]
+    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in promising),
                key=lambda solution: solution.cost)
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
