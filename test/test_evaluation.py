@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import csv
+from dataclasses import replace
 import json
 import math
 import os
@@ -459,14 +460,17 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
 
 
-def test_clean_matches_are_fewer_and_agree_better(road, tmp_path):
+def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):
     source, = open_sources([road], Selection(), tmp_path)
-    config = preset('paper', method='five_point')
+    config = preset('paper', method='rpe')
     records = evaluate_chunk(Chunk(source, 0, 5), [
-        Entrant('five_point', 'paper', config, clean=clean) for clean in (False, True)])
-    for every, clean in zip(records[::2], records[1::2]):
-        assert clean.matches < every.matches
-        assert clean.inliers / clean.matches > every.inliers / every.matches
+        Entrant('rpe', 'paper', config),
+        Entrant('rpe', 'paper', replace(config, starts='several'), good_start=True)])
+    without, with_it = records[::2], records[1::2]
+    assert all(a.matches > b.matches for a, b in zip(without, with_it))
+    assert (np.mean([found.rotation_error_deg for found in with_it])
+            < np.mean([found.rotation_error_deg for found in without]) / 2)
+    assert not any(found.failed for found in with_it)
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [

@@ -33,15 +33,16 @@ def add_parser(subparsers: Any) -> None:
                         help='sides of the sampling area in pixels, odd (default: %(default)s)')
     parser.add_argument('--parts', default=','.join(PARTS), metavar='LIST',
                         help='what is changed (default: %(default)s)')
-    parser.add_argument('--clean-matches', action='store_true',
-                        help='give all variants only matches that agree with the pose of RP-E, '
-                        'preset best: what is left is the effect of the surfaces')
+    parser.add_argument('--good-start', action='store_true',
+                        help='give all variants the pose of RP-E, preset best, as a start, and '
+                        'only the matches that agree with it: what is left is the effect of the '
+                        'surfaces')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run all variants, and print the tables."""
     competing = ablation_entrants(split(args.presets), split(args.parts), _windows(args.windows),
-                                  shared_values(args), clean=args.clean_matches)
+                                  shared_values(args), good_start=args.good_start)
     with evaluated(args, competing) as (sources, records):
         tables = write_ablation(args.output, sources, competing, records)
     console = Console()

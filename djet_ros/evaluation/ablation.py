@@ -62,20 +62,23 @@ PARTS = tuple(changes(()))
 
 
 def ablation_entrants(presets: Sequence[str], parts: Sequence[str], windows: Sequence[int],
-                      values: Mapping[str, Any], *, clean: bool = False) -> list[Entrant]:
+                      values: Mapping[str, Any], *, good_start: bool = False) -> list[Entrant]:
     """
     Let D-JET start with each preset and with each single change of it.
 
-    Beside them start RP-E, with the changes that it knows too, and the 5-point method. clean
-    gives all of them only matches that agree with a robust pose. Raises DjetError on unknown
-    names and on windows that can't be.
+    Beside them start RP-E, with the changes that it knows too, and the 5-point method.
+    good_start: see Entrant; presets with the 5-point start take it among several then. Raises
+    DjetError on unknown names and on windows that can't be.
     """
     check_names('preset', presets, PRESETS)
     check_names('part', parts, PARTS)
     chosen = changes(windows)
+    if good_start:
+        values = {**values, 'starts': 'several'}
     competing: list[Entrant] = []
     for name in presets:
-        base = {method: Entrant(method, name, configured(method, name, values), clean=clean)
+        base = {method: Entrant(method, name, configured(method, name, values),
+                                good_start=good_start)
                 for method in ('djet', 'rpe', 'five_point')}
         competing += base.values()
         for change in (change for part in parts for change in chosen[part]):

@@ -25,15 +25,16 @@ class Entrant:
     A method with all of its parameters.
 
     preset: where the parameters come from; change: what differs from it, in words, empty if
-    nothing does; clean: whether only matches are given that agree with the pose of RP-E, preset
-    best. Peers take their matches and their RANSAC threshold from config.
+    nothing does; good_start: whether the pose of RP-E, preset best, is given as one more start,
+    and only the matches that agree with it. Peers take their matches and their RANSAC threshold
+    from config.
     """
 
     method: str
     preset: str
     config: EstimatorConfig
     change: str = ''
-    clean: bool = False
+    good_start: bool = False
 
     def settings(self) -> dict[str, Any]:
         """Everything that decides the results, as plain values."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -95,14 +95,28 @@ def evaluate_chunk(chunk: Chunk, entrants: Sequence[Entrant]) -> list[PairRecord
     return records
 
 
-def estimate(entrant: Entrant, previous: View, current: View, x: Array,
-             y: Array) -> RelativePose:
-    """Estimate from matches x, y (N, 2) in pixels by the entrant's method."""
+@dataclass(frozen=True)
+class Given:
+    """
+    What an entrant is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
+
+    seconds: what the features of one view and the matches took.
+    """
+
+    views: tuple[View, View]
+    x: Array
+    y: Array
+    start: RelativePose | None
+    seconds: float
+
+
+def estimate(entrant: Entrant, given: Given) -> RelativePose:
+    """Estimate a pair by the entrant's method."""
     config = entrant.config
     if entrant.method in peers.ESTIMATORS:
-        return peers.estimate(entrant.method, previous, current, x, y, config.ransac_threshold,
-                              config.min_matches)
-    return TwoViewEstimator(config).estimate_matched(previous, current, x, y)
+        return peers.estimate(entrant.method, *given.views, given.x, given.y,
+                              config.ransac_threshold, config.min_matches)
+    return TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
 
 
 class _Image:
@@ -127,36 +141,35 @@ class _SharedWork:
 
     def __init__(self, previous: _Image, current: _Image) -> None:
         self._images = previous, current
-        self._matches: dict[Any, tuple[Array, Array, float]] = {}
+        self._given: dict[Any, Given] = {}
 
-    def matched(self, entrant: Entrant) -> tuple[View, View, Array, Array, float]:
-        """Give both views, the matches x, y (N, 2), and the seconds of features and matching."""
+    def given(self, entrant: Entrant) -> Given:
+        """Give what the entrant starts from."""
         (previous, _), (current, seconds) = (image.view(entrant) for image in self._images)
-        key = (id(previous), entrant.config.search_radius, entrant.clean)
-        if key not in self._matches:
+        key = (id(previous), entrant.config.search_radius, entrant.good_start)
+        if key not in self._given:
             start = perf_counter()
             x, y = TwoViewEstimator(entrant.config).match(previous, current)
-            matching = perf_counter() - start
-            agreeing = _agreeing(previous, current, x, y) if entrant.clean else slice(None)
-            self._matches[key] = x[agreeing], y[agreeing], matching
-        x, y, matching = self._matches[key]
-        return previous, current, x, y, seconds + matching
+            given = Given((previous, current), x, y, None, seconds + perf_counter() - start)
+            self._given[key] = _with_good_start(given) if entrant.good_start else given
+        return self._given[key]
 
 
-def _agreeing(previous: View, current: View, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Tell, (N,) bool, which matches agree with the robust pose that RP-E finds on all."""
-    result = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
-        previous, current, x, y)
-    found = len(result.inliers) == len(x) and bool(result.inliers.any())
-    return result.inliers if found else np.ones(len(x), bool)
+def _with_good_start(given: Given) -> Given:
+    """Add the robust pose that RP-E finds, and keep the matches that agree with it."""
+    robust = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
+        *given.views, given.x, given.y)
+    if not robust.inliers.any():
+        return given
+    return replace(given, x=robust.x[robust.inliers], y=robust.y[robust.inliers], start=robust)
 
 
 def _record(source: Source, pair: int, entrant: Entrant, shared: _SharedWork,
             true_motion: Array) -> PairRecord:
-    previous, current, x, y, seconds = shared.matched(entrant)
+    given = shared.given(entrant)
     start = perf_counter()
-    result = estimate(entrant, previous, current, x, y)
-    seconds += perf_counter() - start
+    result = estimate(entrant, given)
+    seconds = given.seconds + perf_counter() - start
     motion = camera_motion(result)
     rotation_error, translation_error = motion_errors(result.status, motion, true_motion)
     hamming = result.hamming[result.inliers] if len(result.hamming) else result.hamming
@@ -164,7 +177,7 @@ def _record(source: Source, pair: int, entrant: Entrant, shared: _SharedWork,
     return PairRecord(
         sequence=source.name, pair=pair, previous=source.frames[pair],
         current=source.frames[pair + 1], method=entrant.method, preset=entrant.preset,
-        change=entrant.change, status=result.status.value, matches=len(x),
+        change=entrant.change, status=result.status.value, matches=len(given.x),
         inliers=int(result.inliers.sum()),
         failed=has_failed(rotation_error, translation_error, true_motion),
         rotation_error_deg=rotation_error, translation_error_deg=translation_error,
