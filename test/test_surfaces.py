@@ -216,3 +216,12 @@ def test_surfaces_without_a_minimum_are_counted_and_treated_by_policy(policy):
 def test_views_carry_the_smoothed_image_that_orb_tests():
     gray = textured(np.random.default_rng(37), SIZE)
     assert np.array_equal(view(gray).smoothed, smooth(gray))
+
+
+@pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
+def test_in_an_image_smaller_than_a_window_no_point_has_a_surface(pair, kind):
+    tiny = view(np.full((9, 9), 7, np.uint8))
+    points = np.array([[4.0, 4.0], [70.0, 60.0]])
+    for previous, current in ((tiny, tiny), (pair[0], tiny), (tiny, pair[0])):
+        surface = kind(previous, current, points, EstimatorConfig(window=15))
+        assert not surface.around(points).usable.any()

@@ -91,6 +91,9 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) ->
 def _gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
     """Square patches as (S, S, N): points last, so that every test runs over contiguous memory."""
     side = 2 * reach + 1
+    if not len(centres):
+        # The image may be smaller than a window.
+        return np.empty((side, side, 0), np.uint8)
     windows = np.lib.stride_tricks.sliding_window_view(smoothed, (side, side))
     patches = windows[centres[:, 1] - reach, centres[:, 0] - reach]
     points_last = np.ascontiguousarray(patches.reshape(len(centres), side * side).T)

@@ -103,7 +103,11 @@ class PhotometricSurface:
 
         Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
         """
-        places = np.where(self._inside(points, image.shape)[:, None], points, self._radius + 1)
+        inside = self._inside(points, image.shape)
+        if not inside.any():
+            # The image may be smaller than a window.
+            return np.zeros((len(points), self._weights.size), np.float32)
+        places = np.where(inside[:, None], points, self._radius + 1)
         corners = np.floor(places).astype(np.int64)
         fx, fy = (places - corners).astype(np.float32).T[:, :, None, None]
         side = 2 * self._radius + 2
