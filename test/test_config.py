@@ -156,3 +156,34 @@ def test_a_flag_that_cannot_be_read_is_named():
     add_flags(parser, ['odometry.max_gap'])
     with pytest.raises(DjetError, match=r"odometry\.max_gap is 'soon'; it must be of type float"):
         flag_values(parser.parse_args(['--max-gap', 'soon']))
+
+
+LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(
+    f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 10)}]\n' for i in range(1, 12))
+
+
+@pytest.mark.parametrize('text', [
+    LAUGHS + 'estimator: {window: *a11}',
+    LAUGHS.replace('[', '{<<: [').replace(']', ']}').replace('[ha, ha]', '{ha: 1}')])
+def test_aliases_that_unfold_to_more_than_memory_holds_are_refused(tmp_path, text):
+    with pytest.raises(DjetError, match='its aliases unfold to more than'):
+        load_yaml(written(tmp_path, text))
+
+
+def test_aliases_are_read(tmp_path):
+    text = 'estimator: {window: &side 7}\nodometry: {max_lost: *side}'
+    assert load_yaml(written(tmp_path, text)).odometry.max_lost == 7
+
+
+@pytest.mark.parametrize('value', ['!!bool so', '!!int ""', '!!float ""', '!!timestamp soon',
+                                   '\x01', '2001-01-01 00:00:00 +99:99'])
+def test_values_that_the_yaml_library_stumbles_over_are_refused_in_one_line(tmp_path, value):
+    with pytest.raises(DjetError, match='is not valid YAML') as caught:
+        load_yaml(written(tmp_path, f'estimator: {{window: {value}}}'))
+    assert str(caught.value).isprintable()
+
+
+def test_what_strangers_wrote_cannot_control_the_terminal():
+    error = DjetError('no parameter \x1b[2J\n\u202e ' + 'x' * 5000)
+    assert str(error).startswith('no parameter ?[2J ? xxx')
+    assert len(str(error)) < 1100

@@ -151,6 +151,7 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
 
 @pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
     ('cam0/data.csv', f',{STAMPS[0]}.png', ',../../secret.png', 'lies outside the folder'),
+    ('cam0/data.csv', f',{STAMPS[0]}.png', ',a\0b.png', 'is no name of a file'),
     ('cam0/data.csv', f',{STAMPS[0]}.png', '', 'line 2 has 1 words'),
     ('cam0/data.csv', str(STAMPS[0]), '1.5', 'is no stamp in nanoseconds'),
     ('cam0/data.csv', str(STAMPS[0]), str(STAMPS[3]), 'is not after the one before'),
@@ -159,7 +160,12 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
     ('cam0/sensor.yaml', 'intrinsics', 'outsides', 'is no ASL camera description'),
     ('cam0/sensor.yaml', 'data: [', 'data: [1, ', 'is no ASL camera description'),
     ('cam0/sensor.yaml', 'T_BS:', 'T_BS: [', 'is not valid YAML'),
+    ('cam0/sensor.yaml', '[160, 120]', '!!bool [', 'is not valid YAML'),
+    ('cam0/sensor.yaml', '[160, 120]', '!!bool so', 'is not valid YAML'),
+    ('cam0/sensor.yaml', 'data: [0.0', 'data: [1e308', 'is no rigid motion'),
+    ('cam0/sensor.yaml', ' 0.3, 0.0,', ' 0.3, 5.0,', 'is no rigid motion'),
     ('state_groundtruth_estimate0/data.csv', ',1,0,0,0,', ',2,0,0,0,', 'has length 2, it must'),
+    ('state_groundtruth_estimate0/data.csv', ',7,8,', ',1e300,8,', 'farther than 1e[+]09 m'),
 ])
 def test_a_wrong_euroc_folder_is_named(asl, file, old, new, said):
     path = asl / 'mav0' / file

@@ -222,3 +222,22 @@ def test_flipped_bytes_raise_nothing_but_a_reason(extension, at, put):
     data[at:at + len(put)] = put
     with contextlib.suppress(BadMessage):
         gray_image(compressed(bytes(data)))
+
+
+def with_png_chunk_length(length):
+    data = encoded('.png')
+    at = data.index(b'IDAT')
+    return data[:at - 4] + struct.pack('>I', length) + data[at:]
+
+
+@pytest.mark.parametrize('length', [2**32 - 1, 2**31 - 1, 400_000_000])
+def test_a_png_chunk_that_declares_more_than_there_is_is_not_decoded(length):
+    # OpenCV makes room for it first: seconds, and gigabytes.
+    assert reason(compressed(with_png_chunk_length(length))) == 'undecodable'
+
+
+def test_a_jpeg_of_very_many_scans_is_not_decoded():
+    data = cv2.imencode('.jpg', GRAY, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    last = data[data.rindex(b'\xff\xda'):-2]
+    assert gray_image(compressed(data)).shape == GRAY.shape
+    assert reason(compressed(data[:-2] + last * 100 + data[-2:])) == 'undecodable'

@@ -82,6 +82,10 @@ DAMAGES = {
     'is not after the one before': lambda f: replace(f / 'times.txt', '1.036223e-01', '0'),
     '07.txt line 1 has 11 numbers, 12': lambda f: replace(f / '../../poses/07.txt', ' 0 ', ' '),
     'pose 0 is no rigid motion': lambda f: replace(f / '../../poses/07.txt', '1', '2'),
+    'pose 1 is no rigid motion (':
+        lambda f: replace(f / '../../poses/07.txt', '9.998000066666e-01', '1e300'),
+    'pose 0 is at [0.0, 0.0, 1e+300] m, farther than':
+        lambda f: replace(f / '../../poses/07.txt', ' 0.000000000000e+00\n', ' 1e300\n'),
     "no line 'P0:'": lambda f: replace(f / 'calib.txt', 'P0:', 'P5:'),
     'P0 has 13 numbers': lambda f: replace(f / 'calib.txt', 'P0:', 'P0: 1'),
     "calib.txt line 1: '60.5x' is not a": lambda f: replace(f / 'calib.txt', '60.5', '60.5x'),

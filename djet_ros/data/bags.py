@@ -18,8 +18,8 @@ from typing import Any, NamedTuple, Self
 from djet_ros.data.decoding import Decoder, decoder
 from djet_ros.data.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.data.storages.compression import decompress_file, ZSTD_MAGIC
-from djet_ros.data.text import one_line, read_yaml
-from djet_ros.errors import DjetError
+from djet_ros.data.text import read_yaml
+from djet_ros.errors import DjetError, one_line
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)

@@ -9,14 +9,13 @@ import re
 import cv2
 from djet_ros.core.types import Array
 from djet_ros.data.bags import BagSource, is_bag
-from djet_ros.data.kitti import KittiSequence
+from djet_ros.data.kitti import check_rigid, KittiSequence
 from djet_ros.data.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.data.text import (
     increasing,
     lines,
     nanoseconds,
     numbers,
-    one_line,
     read_yaml,
     stamped,
     stamped_rows,
@@ -24,7 +23,7 @@ from djet_ros.data.text import (
 )
 from djet_ros.data.trajectories import poses_from_quaternions, read_tum
 from djet_ros.data.varos import varos_camera, VarosSequence
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
@@ -158,6 +157,8 @@ def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
         name = PurePosixPath(words[1])
         if name.is_absolute() or '..' in name.parts:
             raise DjetError(f"{path} line {number}: '{name}' lies outside the folder")
+        if '\0' in words[1]:
+            raise DjetError(f"{path} line {number}: '{name}' is no name of a file")
         stamps.append(stamped(path, number, words[0], stamp))
         paths.append(folder / name)
     if not stamps:
@@ -195,6 +196,7 @@ def _asl_camera(path: Path) -> tuple[Array, Array, Array]:
     if model != 'radial-tangential' or len(intrinsics) != 4 or len(distortion) not in (0, 4, 5):
         raise DjetError(f"{path}: distortion model '{model}' with {len(intrinsics)} and "
                         f'{len(distortion)} numbers; radial-tangential with 4 and 4 is known')
+    check_rigid(camera_in_body[None], path)
     return *_camera(intrinsics, distortion, path), camera_in_body
 
 

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from djet_ros.data.storages.base import BrokenFile, Connection
 from djet_ros.data.storages.compression import decompress_message, ZSTD_MAGIC
-from djet_ros.data.text import one_line
+from djet_ros.errors import one_line
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores

@@ -6,7 +6,15 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.data.sequence import from_first, ImageFiles
-from djet_ros.data.text import increasing, lines, nanoseconds, number_rows, numbers, stamped_rows
+from djet_ros.data.text import (
+    check_positions,
+    increasing,
+    lines,
+    nanoseconds,
+    number_rows,
+    numbers,
+    stamped_rows,
+)
 from djet_ros.errors import DjetError
 import numpy as np
 from numpy.typing import NDArray
@@ -84,9 +92,12 @@ def read_poses(path: Path) -> Array:
 
 def check_rigid(poses: Array, path: Path) -> None:
     """Raise DjetError that names the file and the first of poses (N, 4, 4) that is no motion."""
-    R = poses[:, :3, :3]
+    check_positions(poses[:, :3, 3], path)
+    # Squares of anything larger would not be finite, and compare as nothing does.
+    R = np.clip(np.nan_to_num(poses[:, :3, :3], nan=9.0), -9.0, 9.0)
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    wrong = np.flatnonzero((error > 1e-3) | (np.linalg.det(R) < 0))
+    wrong = np.flatnonzero((error > 1e-3) | (np.linalg.det(R) < 0)
+                           | (poses[:, 3] != (0, 0, 0, 1)).any(axis=1))
     if wrong.size:
         raise DjetError(f'{path}: pose {wrong[0]} is no rigid motion (its rotation part is off '
                         f'by {error[wrong[0]]:.2g}); is it a file of poses?')

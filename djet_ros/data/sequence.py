@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 # 8192 x 8192: beyond any camera we know, and far below what would exhaust memory.
 LARGEST_IMAGE_PIXELS = 1 << 26
 
-PNG_END = b'IEND\xaeB`\x82'
+PNG_START = b'\x89PNG\r\n\x1a\n'
 
 
 class FrameSequence(Protocol):
@@ -73,8 +73,7 @@ class ImageFiles:
         image: NDArray[Any] | None = None
         try:
             data = path.read_bytes()
-            # libpng would report a file that is cut short on stderr by itself.
-            if PNG_END in data:
+            if whole_png(data):
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
         except OSError as error:
             raise DjetError(f'{path} could not be read: {error.strerror}') from error
@@ -86,6 +85,22 @@ class ImageFiles:
         return np.asarray(image, dtype=np.uint8)
 
 
+def whole_png(data: bytes) -> bool:
+    """
+    Tell whether a PNG file has all of its chunks.
+
+    Decoders make room for whatever length a chunk declares, and libpng reports a file that is cut
+    short on stderr by itself.
+    """
+    at = len(PNG_START)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from('>I4s', data, at)
+        at += 12 + length
+        if kind == b'IEND':
+            return bool(at <= len(data))
+    return False
+
+
 def png_size(path: Path) -> tuple[int, int]:
     """Give (width, height) from the header of a PNG file, else DjetError."""
     try:
@@ -93,7 +108,7 @@ def png_size(path: Path) -> tuple[int, int]:
             header = file.read(24)
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror}') from error
-    if header[:8] != b'\x89PNG\r\n\x1a\n' or header[12:16] != b'IHDR' or len(header) < 24:
+    if header[:8] != PNG_START or header[12:16] != b'IHDR' or len(header) < 24:
         raise DjetError(f'{path} is not a PNG image')
     width, height = struct.unpack('>II', header[16:])
     if not 0 < width * height <= LARGEST_IMAGE_PIXELS:

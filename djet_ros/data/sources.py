@@ -27,7 +27,7 @@ from djet_ros.data.datasets import open_sequence
 from djet_ros.data.decoding import message_type
 from djet_ros.data.kitti import KittiSequence, read_poses
 from djet_ros.data.sequence import FrameSequence
-from djet_ros.data.text import lines
+from djet_ros.data.text import FARTHEST, lines
 from djet_ros.data.trajectories import read_tum
 from djet_ros.errors import DjetError
 import numpy as np
@@ -171,7 +171,11 @@ def open_source(path: Path, image_topic: str | None = None, info_topic: str | No
 
 
 def pose_of(message: Any) -> tuple[int, Array]:
-    """Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped."""
+    """
+    Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.
+
+    The pose is NaN where the message holds none: no unit quaternion, or a place beyond FARTHEST.
+    """
     if hasattr(message, 'transform'):
         position, orientation = message.transform.translation, message.transform.rotation
     else:
@@ -179,8 +183,9 @@ def pose_of(message: Any) -> tuple[int, Array]:
         position, orientation = pose.position, pose.orientation
     quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
     result = np.full((4, 4), np.nan)
-    numbers = [*quaternion, position.x, position.y, position.z]
-    if np.isfinite(numbers).all() and np.linalg.norm(quaternion) > 0.5:
+    place = np.abs([position.x, position.y, position.z])
+    if (place <= FARTHEST).all() and (np.abs(quaternion) < 2.0).all() \
+            and 0.5 < np.linalg.norm(quaternion) < 2.0:
         result[:] = np.eye(4)
         result[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         result[:3, 3] = position.x, position.y, position.z

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.core.types import Array
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 import numpy as np
 from numpy.typing import NDArray
 import yaml
@@ -19,14 +19,10 @@ import yaml
 LARGEST_TEXT = 64 << 20
 # Pure-Python YAML reads about 200 kB/s; the compiled loader overflows the stack on deep nesting.
 LARGEST_YAML = 2 << 20
+# Metres: beyond everything on Earth, and far below where squares lose what drives it.
+FARTHEST = 1e9
 # Stamps are written into messages as int32 seconds.
 LATEST_SECOND = 2**31 - 2000
-
-
-def one_line(said: object) -> str:
-    """Make what another library said, or a file has in it, one short line for a terminal."""
-    line = ' '.join(str(said).split())[:600] or type(said).__name__
-    return ''.join(letter if letter.isprintable() else '?' for letter in line)
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
@@ -49,9 +45,36 @@ def read_yaml(path: Path) -> Any:
     """Content of a YAML file: plain values only, no Python objects."""
     text = read_text(path, LARGEST_YAML)
     try:
-        return yaml.load(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise DjetError(f'{path} is not valid YAML: {one_line(error)}') from error
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        _unfolded(node, {})
+        return None if node is None else loader.construct_document(node)
+    # PyYAML lets out whatever its constructors stumble over: KeyError of '!!bool x'.
+    except (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError,
+            TypeError, ValueError) as error:
+        raise DjetError(f'{path} is not valid YAML: {one_line(error, 300)}') from error
+
+
+def _unfolded(node: Any, known: dict[int, int]) -> int:
+    """
+    Count the values below a node, those behind aliases again each time.
+
+    A few lines of lists of aliases of lists are more values than any memory holds.
+    """
+    if id(node) in known:
+        if not known[id(node)]:
+            raise yaml.YAMLError('an alias stands within what it stands for')
+        return known[id(node)]
+    known[id(node)] = 0
+    count = 1
+    if isinstance(node, yaml.CollectionNode):
+        for item in node.value:
+            count += sum(_unfolded(part, known)
+                         for part in (item if isinstance(item, tuple) else (item,)))
+    if count > LARGEST_YAML:
+        raise yaml.YAMLError(f'its aliases unfold to more than {LARGEST_YAML} values')
+    known[id(node)] = count
+    return count
 
 
 def lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -104,6 +127,14 @@ def stamped(path: Path, number: int, text: str, stamp: Callable[[str], int]) -> 
         return stamp(text)
     except ValueError as error:
         raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
+
+
+def check_positions(positions: Array, path: Path) -> None:
+    """Raise DjetError that names the file and the first of positions (N, 3) that is nowhere."""
+    wrong = np.flatnonzero(~(np.abs(positions) <= FARTHEST).all(axis=1))
+    if wrong.size:
+        raise DjetError(f'{path}: pose {wrong[0]} is at {positions[wrong[0]].tolist()} m, farther '
+                        f'than {FARTHEST:g} m; is it a file of poses?')
 
 
 def increasing(stamps_ns: NDArray[np.int64], path: Path) -> NDArray[np.int64]:

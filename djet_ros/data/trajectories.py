@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from djet_ros.core.types import Array
-from djet_ros.data.text import nanoseconds, stamped_rows
+from djet_ros.data.text import check_positions, nanoseconds, stamped_rows
 from djet_ros.errors import DjetError
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,9 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Array]:
 
 def poses_from_quaternions(positions: Array, quaternions: Array, path: Path) -> Array:
     """Poses (N, 4, 4) from (N, 3) and (N, 4) x y z w; path names the source in a DjetError."""
-    length = np.linalg.norm(quaternions, axis=1)
+    check_positions(positions, path)
+    # Anything beyond is as wrong, and its square may not be finite.
+    length = np.linalg.norm(np.clip(quaternions, -9.0, 9.0), axis=1)
     wrong = np.flatnonzero(np.abs(length - 1) > 1e-2)
     if wrong.size:
         raise DjetError(f'{path}: the quaternion of pose {wrong[0]} has length '

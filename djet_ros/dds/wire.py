@@ -15,8 +15,7 @@ from typing import Any, Self
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import uint8
 from djet_ros.data.decoding import jazzy
-from djet_ros.data.text import one_line
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 
 
 @cache

@@ -11,8 +11,7 @@ import sys
 from tempfile import TemporaryDirectory
 import zipfile
 
-from djet_ros.data.text import one_line
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import struct
 from typing import Any
 
 import cv2
-from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS
+from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS, PNG_START, whole_png
 from djet_ros.errors import DjetError
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ Gray = NDArray[np.uint8]
 
 # Features need a neighbourhood; OpenCV fails on slivers.
 _SMALLEST_SIDE = 16
+
+
+# Encoders of progressive images make about ten.
+_MOST_SCANS = 64
 
 
 class BadMessage(DjetError):
@@ -164,8 +168,8 @@ def _check_size(width: int, height: int) -> None:
 
 def _declared_size(raw: bytes) -> tuple[int, int]:
     """Give (width, height) that a PNG or JPEG declares, before anything is decoded."""
-    if raw[:8] == b'\x89PNG\r\n\x1a\n' and raw[12:16] == b'IHDR' and len(raw) >= 24:
-        if b'IEND' not in raw[-64:]:
+    if raw[:8] == PNG_START and raw[12:16] == b'IHDR' and len(raw) >= 24:
+        if not whole_png(raw):
             raise BadMessage('undecodable', f'PNG image of {len(raw)} bytes is cut short')
         width, height = struct.unpack('>II', raw[16:24])
         return width, height
@@ -173,6 +177,10 @@ def _declared_size(raw: bytes) -> tuple[int, int]:
         # Decoders fill what is missing with gray. Cameras pad the end with zeros.
         if b'\xff\xd9' not in raw[-4096:]:
             raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')
+        # Each costs a pass over the whole image, and may have a few bytes only.
+        if (scans := raw.count(b'\xff\xda')) > _MOST_SCANS:
+            raise BadMessage('undecodable', f'JPEG image has {scans} scans, at most {_MOST_SCANS} '
+                             'are decoded')
         return _jpeg_size(raw)
     raise BadMessage('unknown_encoding', 'compressed image is neither JPEG nor PNG')
 

@@ -28,13 +28,17 @@ MessageType = Callable[[str], Any]
 # The first pose is exact by definition, but filters divide by what they are told.
 LEAST_COVARIANCE = np.eye(6) * 1e-9
 
+# The seconds of a stamp are an int32.
+_LATEST_NS = 2**31 * 10**9 - 1
+
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def stamp_ns(header: Any) -> int:
-    """Nanoseconds of a header's stamp."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    """Nanoseconds of a header's stamp; at most what a header can hold again."""
+    # A sender's nanoseconds may exceed a second, and so lead beyond the last one.
+    return min(int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec), _LATEST_NS)
 
 
 def in_convention(result: OdometryResult, convention: str) -> OdometryResult:

@@ -27,8 +27,7 @@ def main() -> int:
         return _fail("rclpy is missing: install ROS 2 and 'source /opt/ros/jazzy/setup.bash'; "
                      "without ROS, 'djet replay' works on recorded bags")
 
-    from djet_ros.data.text import one_line
-    from djet_ros.errors import DjetError
+    from djet_ros.errors import DjetError, one_line
     try:
         from djet_ros.ros.node import run
         from rclpy.utilities import remove_ros_args
