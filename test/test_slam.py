@@ -128,23 +128,42 @@ def features():
     return [estimator.features(view) for view in views]
 
 
+def index(*keyframes):
+    places = PlaceIndex()
+    for features in keyframes:
+        places.add(features)
+    return places
+
+
 def test_a_place_seen_again_gets_most_votes(features):
-    votes = PlaceIndex(features).votes(3, 3)
+    votes = index(*features).votes(features[3], 3)
     assert votes.shape == (3,)
     assert votes[0] > 100
     assert votes[0] > 10 * max(votes[1:])
 
 
 def test_only_keyframes_from_before_get_votes(features):
-    index = PlaceIndex(features)
-    assert index.votes(3, 0).shape == (0,)
-    assert np.array_equal(index.votes(3, 1), index.votes(3, 3)[:1])
+    places = index(*features)
+    assert places.votes(features[3], 0).shape == (0,)
+    assert np.array_equal(places.votes(features[3], 1), places.votes(features[3], 3)[:1])
 
 
 def test_keyframes_without_features_get_no_votes(features):
     nothing = TwoViewEstimator().features(np.zeros((50, 50), np.uint8))
-    assert PlaceIndex([nothing, features[0], nothing]).votes(2, 2).tolist() == [0, 0]
-    assert PlaceIndex([nothing, features[0]]).votes(1, 1).tolist() == [0]
+    assert index(nothing, features[0]).votes(nothing, 2).tolist() == [0, 0]
+    assert index(nothing).votes(features[0], 1).tolist() == [0]
+
+
+def test_votes_come_from_all_keyframes_however_many_there_are(features):
+    """Also from those that were sorted into tables long ago, until they are forgotten."""
+    places, few = index(), index(*features[:3]).votes(features[3], 3)
+    for number in range(150):
+        places.add(features[number % 3])
+    assert places.votes(features[3], 150).tolist() == [*few] * 50
+    assert places.votes(features[3], 100).tolist() == ([*few] * 50)[:100]
+    places.forget(70)
+    assert places.votes(features[3], 150)[:64].sum() == 0
+    assert places.votes(features[3], 150)[64:].tolist() == ([*few] * 50)[64:]
 
 
 # Lengths of loops
@@ -196,8 +215,9 @@ def test_standing_where_one_has_been_is_a_loop_of_a_known_place():
     cards = Cards()
     poses = np.array([pose(x=0.5 * i) for i in range(3)] + [pose()])
     graph = chain(poses)
-    frames = (cards.frame(1 + 0.1 * i, here, noise=i) for i, here in enumerate(poses))
-    finder = EdgeFinder(graph, frames, EstimatorConfig(), SlamConfig(loop_gap=0.25))
+    finder = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25))
+    for i, (here, before) in enumerate(zip(poses, (None, *graph.edges))):
+        finder.add(cards.frame(1 + 0.1 * i, here, noise=i), before)
     edge, = finder.loops(3)
     assert (edge.source, edge.target, edge.scale_known) == (3, 0, True)
     assert np.linalg.norm(edge.motion[:3, 3]) < 0.1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from djet_ros.core.types import Array
 from djet_ros.data.pose_graph import Edge, PoseGraph
@@ -31,6 +31,33 @@ class Keyframes:
         return np.asarray(poses[self.keyframe] @ self.offsets)
 
 
+@dataclass(frozen=True)
+class Hanging:
+    """
+    How a frame hangs on its keyframe.
+
+    keyframe: its number; offset (4, 4): the frame in the keyframe; covariance (6, 6) of the
+    offset, along the keyframe's axes; scale_known: whether its length is in metres.
+    """
+
+    keyframe: int
+    offset: Array = field(default_factory=lambda: np.eye(4))
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    scale_known: bool = True
+
+    def then(self, motion: Array, covariance: Array, scale_known: bool) -> Hanging:
+        """Tell how the next frame hangs there: its motion (4, 4), with covariance (6, 6)."""
+        return Hanging(self.keyframe, self.offset @ motion,
+                       compose(self.offset, self.covariance, motion, covariance),
+                       self.scale_known and scale_known)
+
+    def is_far(self, config: SlamConfig) -> bool:
+        """Tell whether the frame should be a keyframe itself."""
+        turn = np.degrees(Rotation.from_matrix(self.offset[:3, :3]).magnitude())
+        way = np.linalg.norm(self.offset[:3, 3])
+        return bool(way >= config.keyframe_distance or turn >= config.keyframe_turn)
+
+
 def choose_keyframes(frames: PoseGraph, config: SlamConfig) -> Keyframes:
     """
     Choose keyframes by way and turn, and compose the edges between them.
@@ -38,29 +65,17 @@ def choose_keyframes(frames: PoseGraph, config: SlamConfig) -> Keyframes:
     frames: every vertex but the first has one edge, from a vertex before it, as the odometry
     makes them. A frame about whose motion nothing is known is a keyframe.
     """
-    count = len(frames.poses)
-    keyframe = np.zeros(count, np.int64)
-    offsets, covariances = np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6, 6))
-    scaled = np.ones(count, bool)
-    chosen, edges = [0], []
+    hanging = [Hanging(0)] * len(frames.poses)
+    chosen: list[int] = [0]
+    edges: list[Edge] = []
     for edge in frames.edges:
-        source, target = edge.source, edge.target
-        motion = offsets[source] @ edge.motion
-        covariance = compose(offsets[source], covariances[source], edge.motion, edge.covariance)
-        known = bool(scaled[source] and edge.scale_known)
-        keyframe[target] = keyframe[source]
-        if edge.kind == 'unknown' or _is_far(motion, config):
-            edges.append(Edge(int(keyframe[source]), len(chosen), motion, covariance, edge.kind,
-                              known))
-            keyframe[target] = len(chosen)
-            chosen.append(target)
-        else:
-            offsets[target], covariances[target], scaled[target] = motion, covariance, known
+        there = hanging[edge.source].then(edge.motion, edge.covariance, edge.scale_known)
+        if edge.kind == 'unknown' or there.is_far(config):
+            edges.append(Edge(there.keyframe, len(chosen), there.offset, there.covariance,
+                              edge.kind, there.scale_known))
+            there = Hanging(len(chosen))
+            chosen.append(edge.target)
+        hanging[edge.target] = there
     graph = PoseGraph(frames.stamps_ns[chosen], frames.poses[chosen], tuple(edges))
-    return Keyframes(graph, keyframe, offsets)
-
-
-def _is_far(motion: Array, config: SlamConfig) -> bool:
-    turn = np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude())
-    way = np.linalg.norm(motion[:3, 3])
-    return bool(way >= config.keyframe_distance or turn >= config.keyframe_turn)
+    return Keyframes(graph, np.array([one.keyframe for one in hanging]),
+                     np.array([one.offset for one in hanging]))

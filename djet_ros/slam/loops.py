@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import rays, unit
 from djet_ros.core.hamming import smooth
 from djet_ros.core.types import Array, Features, RelativePose, Status, View
-from djet_ros.data.pose_graph import Edge, PoseGraph
+from djet_ros.data.pose_graph import Edge
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.scale import Length, unknown
@@ -34,26 +35,42 @@ _LEAST_PARALLAX = 1.5e-3
 
 class EdgeFinder:
     """
-    Estimates edges between keyframes from their images.
+    Estimates edges between keyframes from their images, which are kept until they are forgotten.
 
-    frames: one for each keyframe of the graph. The images are all kept.
+    Keyframes have the numbers in which they come: 0, 1 and so on.
     """
 
-    def __init__(self, graph: PoseGraph, frames: Iterator[Frame], estimator: EstimatorConfig,
-                 config: SlamConfig) -> None:
-        """Read the images and find their features."""
-        self._graph, self._config = graph, config
+    def __init__(self, estimator: EstimatorConfig, config: SlamConfig) -> None:
+        self._config = config
         self._near = TwoViewEstimator(estimator)
         self._wide = TwoViewEstimator(replace(
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
-        self._frames: list[Frame] = []
-        self._features: list[Features] = []
-        for frame in frames:
-            self._frames.append(frame)
-            self._features.append(self._near.features(frame.gray))
-        self._places = PlaceIndex(self._features)
+        self._frames: dict[int, Frame] = {}
+        self._features: dict[int, Features] = {}
+        self._stamps: list[int] = []
+        self._places = PlaceIndex()
         # The neighbour before each keyframe: the motion to it has a length.
-        self._before = {edge.target: edge for edge in graph.edges if edge.kind == 'odometry'}
+        self._before: dict[int, Edge] = {}
+        self._first = 0
+
+    def add(self, frame: Frame, before: Edge | None = None) -> None:
+        """Take the next keyframe, later than all others, and the edge from its neighbour."""
+        number = self._first + len(self._stamps)
+        self._frames[number] = frame
+        self._features[number] = self._near.features(frame.gray)
+        self._stamps.append(frame.stamp_ns)
+        self._places.add(self._features[number])
+        if before is not None and before.kind == 'odometry':
+            self._before[number] = before
+
+    def forget(self, first: int) -> None:
+        """Forget the keyframes before one; nothing is found between them and others any more."""
+        for number in range(self._first, first):
+            for kept in (self._frames, self._features, self._before):
+                kept.pop(number, None)
+        del self._stamps[:first - self._first]
+        self._first = first
+        self._places.forget(first)
 
     def links(self, current: int) -> Iterator[Edge]:
         """
@@ -61,26 +78,27 @@ class EdgeFinder:
 
         Their lengths are taken as unknown: the odometry's are in the graph already.
         """
-        previous = current
+        motion, previous = np.eye(4), current
         for step in range(self._config.links):
-            if previous not in self._before:
+            before = self._before.get(previous)
+            if before is None or before.source not in self._frames:
                 return
-            previous = self._before[previous].source
+            motion, previous = before.motion @ motion, before.source
             if step:
-                yield from self._link(current, previous)
+                yield from self._link(current, previous, float(np.linalg.norm(motion[:3, 3])))
 
-    def _link(self, current: int, previous: int) -> Iterator[Edge]:
+    def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
         relative = self._near.estimate(self._view(previous), self._view(current))
         if relative.status is Status.OK and self._is_sure(relative):
-            guess = np.linalg.norm((np.linalg.inv(self._graph.poses[previous])
-                                    @ self._graph.poses[current])[:3, 3])
-            yield _edge(previous, current, relative, unknown(float(guess)), 'link')
+            yield _edge(previous, current, relative, unknown(guess), 'link')
 
     def loops(self, current: int) -> Iterator[Edge]:
         """Propose keyframes that look like this one, and give those that geometry bears out."""
-        config, stamps = self._config, self._graph.stamps_ns
-        before = int(np.searchsorted(stamps[:current], stamps[current] - config.loop_gap * 1e9))
-        votes = self._places.votes(current, before)
+        config, here = self._config, current - self._first
+        latest = self._stamps[here] - config.loop_gap * 1e9
+        before = self._first + bisect_left(self._stamps, latest, hi=here)
+        votes = self._places.votes(self._features[current], before)
+        votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
         for place in best[votes[best] >= config.loop_votes].tolist():
             yield from self._loop(current, place)
@@ -98,7 +116,7 @@ class EdgeFinder:
         """Length of a loop's translation, by the points that the last step of the way saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
-        if step is None or not step.scale_known or not guess:
+        if step is None or step.source not in self._frames or not step.scale_known or not guess:
             return unknown(guess)
         if relative.status is Status.NO_PARALLAX:
             # The same place again: nearer than any step, in whatever direction.

@@ -59,12 +59,14 @@ def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig
     """
     keyframes = choose_keyframes(frames, slam)
     graph = keyframes.graph
-    finder = EdgeFinder(graph, frames_at(source, config, graph.stamps_ns), config.estimator, slam)
+    finder = EdgeFinder(config.estimator, slam)
     edges = [*graph.edges]
-    for done in range(len(graph.poses)):
-        edges += [*finder.links(done), *finder.loops(done)]
+    images = frames_at(source, config, graph.stamps_ns)
+    for number, (frame, before) in enumerate(zip(images, (None, *graph.edges))):
+        finder.add(frame, before)
+        edges += [*finder.links(number), *finder.loops(number)]
         if progress is not None:
-            progress(done + 1, len(graph.poses))
+            progress(number + 1, len(graph.poses))
     return Slam(frames, keyframes, optimise(replace(graph, edges=tuple(edges))))
 
 
