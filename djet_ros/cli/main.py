@@ -26,6 +26,7 @@ COMMANDS = {
     'echo': 'what a live odometry says, in the terminal',
     'slam': 'close loops offline and optimise the trajectory with GTSAM',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
+    'soak': 'run many frames through the odometry: does memory or latency grow?',
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",

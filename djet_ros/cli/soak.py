@@ -1,0 +1,66 @@
+"""``djet soak``: memory and latency over many frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.soak import SIZE, soak
+from rich.console import Console
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser(
+        'soak', description=f'Run many rendered frames of {SIZE[0]}x{SIZE[1]} through the '
+        'odometry, black ones, gaps and steps back in time among them, and record memory and '
+        'latency. Writes the figures as JSON and a plot beside them. The exit code is 1 if '
+        'memory grows beyond the bound.')
+    parser.add_argument('--output', type=Path, required=True, metavar='FILE.json',
+                        help='where the figures go; the plot goes to FILE.png')
+    parser.add_argument('--frames', type=int, default=20_000, metavar='N',
+                        help='frames to process (default: %(default)s)')
+    parser.add_argument('--max-growth', type=float, default=10.0, metavar='MB',
+                        help='resident memory that may come on top of what a fifth of the frames '
+                        'took (default: %(default)s)')
+    parser.add_argument('--overwrite', action='store_true', help='replace existing figures')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Soak, write and show the figures."""
+    if args.output.exists() and not args.overwrite:
+        raise DjetError(f'{args.output} exists; give another name or --overwrite')
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    with Console(stderr=True).status('soaking ...') as status:
+        figures = soak(args.frames, args.max_growth, lambda done: status.update(
+            f'soaking: {done} of {args.frames} frames ...'))
+    args.output.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+    plot = args.output.with_suffix('.png')
+    draw(figures, plot)
+    latency = figures['latency_ms']
+    print(f"{figures['frames']} frames in {figures['seconds']:.0f} s; latency p50 "
+          f"{latency['p50_ms']:.1f}, p95 {latency['p95_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
+          f"largest {latency['max_ms']:.1f} ms\n"
+          f"memory {figures['memory_mb']:.1f} MB, grown by {figures['growth_mb']:.1f} MB "
+          f"({figures['most_growth_mb']:g} MB are allowed): "
+          f"{'held' if figures['held'] else 'NOT HELD'}\n"
+          f'figures: {args.output}\nplot: {plot}')
+    return 0 if figures['held'] else 1
+
+
+def draw(figures: dict[str, Any], path: Path) -> None:
+    """Plot memory and latency against the frames."""
+    from djet_ros.evaluation.style import figure
+    stretches = figures['stretches']
+    frames = [stretch['frames'] for stretch in stretches]
+    with figure(path, 8.0, 3.2) as empty:
+        memory, latency = empty.subplots(1, 2)
+        memory.plot(frames, [stretch['memory_mb'] for stretch in stretches], 'o-')
+        memory.set(xlabel='frames', ylabel='resident memory [MB]', ylim=(0, None))
+        for name, label in (('p50_ms', 'median'), ('p95_ms', '95 %'), ('p99_ms', '99 %')):
+            latency.plot(frames, [stretch[name] for stretch in stretches], label=label)
+        latency.set(xlabel='frames', ylabel='latency of a frame [ms]', ylim=(0, None))
+        latency.legend()

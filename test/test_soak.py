@@ -1,0 +1,80 @@
+"""The soak records what it promises, and its exit code tells of growth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from djet_ros.core.types import Status
+from djet_ros.evaluation import soak as module
+from djet_ros.evaluation.soak import resident_mb, soak
+from djet_ros.odometry.visual_odometry import VisualOdometry
+import numpy as np
+import pytest
+
+FRAMES = 120
+
+
+def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
+    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
+    return subprocess.run([sys.executable, '-c', code, 'soak', *map(str, arguments)],
+                          capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path) -> None:
+    output = tmp_path / 'deep' / 'soak.json'
+    run = djet_soak('--output', output, '--frames', FRAMES)
+    assert run.returncode == 0, run.stderr
+    assert 'held' in run.stdout
+    figures = json.loads(output.read_text())
+    assert figures['held'] is True
+    assert figures['growth_mb'] < 10
+    assert figures['memory_mb'] > 50
+    assert 0 < figures['latency_ms']['p50_ms'] <= figures['latency_ms']['p99_ms']
+    assert [stretch['frames'] for stretch in figures['stretches']] == list(
+        range(FRAMES // 20, FRAMES + 1, FRAMES // 20))
+    # Small things do not pile up either: one kept result alone would be dozens for each frame.
+    early, late = (figures['stretches'][i]['python_blocks'] for i in (4, -1))
+    assert late - early < 5 * FRAMES
+    assert sum(figures['status'].values()) == FRAMES
+    assert {Status.OK, Status.TOO_FEW_MATCHES} <= figures['status'].keys()
+    assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+
+
+class Leaking(VisualOdometry):
+    """An odometry that keeps a megabyte of each frame."""
+
+    kept: list[object]
+
+    def process(self, frame):
+        self.__dict__.setdefault('kept', []).append(np.ones(1 << 17))
+        return super().process(frame)
+
+
+def test_a_leak_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'VisualOdometry', Leaking)
+    monkeypatch.setattr(module, 'FEATURES', 100)
+    figures = soak(100, most_growth_mb=10.0)
+    assert figures['held'] is False
+    assert figures['growth_mb'] == pytest.approx(0.8 * 100 * 1.05, rel=0.3)
+
+
+def test_resident_memory_is_what_the_process_has() -> None:
+    before = resident_mb()
+    block = np.ones(10 << 20)
+    assert resident_mb() - before == pytest.approx(block.nbytes / 1e6, rel=0.1)
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (('--frames', 3), '3 frames are too few'), ((), 'exists; give another name')])
+def test_what_can_be_mended_is_one_line_and_exit_code_2(
+        tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+    output = tmp_path / 'soak.json'
+    if not arguments:
+        output.write_text('{}')
+    run = djet_soak('--output', output, *arguments)
+    assert run.returncode == 2
+    assert said in run.stderr
+    assert run.stderr.count('\n') == 1
