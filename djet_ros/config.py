@@ -45,13 +45,22 @@ class OdometryConfig:
         'and the reference frame stays', minimum=0.0, maximum=10.0)
     scale: str = parameter(
         'none', 'where the length of a translation comes from: none (unit length), constant '
-        '(scale_value), speed (a speed topic), ground_truth (offline only)',
-        choices=('none', 'constant', 'speed', 'ground_truth'))
+        '(scale_value), speed (a speed topic), camera_height (the height over the ground that the '
+        'images show), ground_truth (offline only)',
+        choices=('none', 'constant', 'speed', 'camera_height', 'ground_truth'))
     scale_value: float = parameter(
         1.0, 'length of each translation in metres, for scale constant',
         minimum=1e-6, maximum=1e6)
     scale_uncertainty: float = parameter(
-        0.05, 'standard deviation of a known length, as a share of it', minimum=1e-6, maximum=10.0)
+        0.05, 'standard deviation of a known length, as a share of it; for scale camera_height '
+        'that of the height, and what the images leave uncertain comes on top',
+        minimum=1e-6, maximum=10.0)
+    camera_height: float = parameter(
+        1.0, 'metres from flat ground up to the camera, for scale camera_height',
+        minimum=0.01, maximum=1000.0)
+    camera_pitch: float = parameter(
+        0.0, 'degrees by which the camera looks down, to within 2, for scale camera_height; it '
+        'must not roll', minimum=-30.0, maximum=80.0)
     rectified: str = parameter(
         'auto', 'whether images come rectified: true (camera is P), false (camera is K, D), auto '
         "(true where the image topic's last name has 'rect' in it, else false)",

@@ -47,7 +47,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                         help='parameters as YAML, plain or in the layout of ROS; flags come on '
                         'top, and --preset replaces all its values of the estimator')
     add_flags(parser, ['estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
-                       'odometry.rectified', 'odometry.frame_convention'])
+                       'odometry.camera_height', 'odometry.camera_pitch', 'odometry.rectified',
+                       'odometry.frame_convention'])
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth instead of the recording's own: a TUM file, or a KITTI "
                         'file with a row for each image')

@@ -37,6 +37,7 @@ own lengths are known (--scale, --scale-uncertainty) decides what loops may chan
 """
 
 _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
+                 'odometry.camera_height', 'odometry.camera_pitch',
                  'odometry.scale_uncertainty')
 
 
@@ -58,7 +59,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                             help='needed where the bag has several')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameters of the odometry as YAML; for a recording, as the next '
-                        'five')
+                        'seven')
     add_flags(parser, _REPLAY_FLAGS)
     slam = parser.add_argument_group('keyframes and loops')
     for name, description in describe(SlamConfig()).items():

@@ -99,6 +99,7 @@ class Replay:
             log.steps.append(_Step(result.stamp_ns, result.previous_stamp_ns, result.status,
                                    result.motion, result.pose))
             log.metric &= result.scale_known or result.status is not Status.OK
+            log.scaled += result.scale_known and result.status in TRACKED
             self._folder.add_frame(number, result, seconds)
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
@@ -133,7 +134,7 @@ class Replay:
         return {
             'source': self._name, 'image_topic': self._source.image_topic,
             'method': config.estimator.method, 'preset': config.preset,
-            'scale': config.odometry.scale,
+            'scale': config.odometry.scale, 'pairs_of_known_scale': self._log.scaled,
             'frames': counts.processed, 'pairs': len(self._log.pairs()),
             'seconds': round(seconds, 3),
             'images': counts.received, 'dropped': dict(counts.dropped),
@@ -189,10 +190,11 @@ class _Step(NamedTuple):
 
 @dataclass
 class _Log:
-    """Steps of a run; metric: whether all their lengths were known."""
+    """Steps of a run; metric: whether all their lengths were known; scaled: how many were."""
 
     steps: list[_Step] = field(default_factory=list)
     metric: bool = True
+    scaled: int = 0
     first_problem: str | None = None
 
     def pairs(self) -> list[Pair]:

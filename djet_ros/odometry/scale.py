@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from djet_ros.config import OdometryConfig
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
+from djet_ros.odometry.ground import Ground, GroundMotion
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,18 @@ _LONGEST_HOLD_NS = 500_000_000
 
 # Speeds kept for intervals that are still to come.
 _KEPT_SPEEDS = 10_000
+
+# How speed (m/s) wanders in a second, and the camera's pitch and roll against the ground (rad).
+_WANDERING = np.array([1.0, np.radians(0.5), np.radians(0.5)])
+
+# What nobody knows before the first pair: speed, and how well the camera is mounted.
+_AT_FIRST = np.array([1e3, np.radians(2.0), np.radians(2.0)])
+
+# Pitch and roll with which a vehicle bounces, from pair to pair.
+_BOUNCE = np.radians(0.2)
+
+# Normalised squared error (1 or 2 expected) beyond which something is not what it was taken for.
+_SURPRISE = 20.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +128,91 @@ class SpeedScale:
         self._speeds: list[float] = []
 
 
+class CameraHeightScale:
+    """
+    Ways over the ground in heights of the camera, which is known in metres, over level ground.
+
+    Each pair of views gives the way between them and the camera's pitch and roll, with an
+    uncertainty; one is often sure only against the other. A Kalman filter over (speed, pitch,
+    roll) brings together what pairs say: speed changes as vehicles can, pitch and roll hardly.
+    The ground must be seen to fill the lower part of the image, and the camera must not roll.
+    Where no ground was seen for half a second, the length is unknown, and the last speed remains
+    the guess.
+
+    uncertainty: standard deviation of the height as a share of it, all bumps of the road included.
+    """
+
+    def __init__(self, height: float, pitch: float, uncertainty: float = 0.05) -> None:
+        """Take the camera's height in metres and its pitch in rad, looking down is positive."""
+        self._height, self._pitch, self._uncertainty = height, pitch, uncertainty
+        self._ground: tuple[Array, tuple[int, ...], Ground] | None = None
+        self.reset()
+
+    def see(self, start_ns: int, end_ns: int, previous: View, current: View,
+            relative: RelativePose) -> None:
+        """Look at a pair of views and the motion between them, before its length is asked for."""
+        seconds = (end_ns - start_ns) * 1e-9
+        x, P = self._predicted(end_ns)
+        # Ways that the filter expects, in heights; four deviations to both sides.
+        expected = (x[0] + np.array([-4, 4]) * np.sqrt(P[0, 0])) * seconds / self._height
+        seen = self._ground_of(current).motion(
+            previous, current, relative, (float(expected[0]), float(expected[1])))
+        if seen is not None:
+            self._update(end_ns, *self._measured(seen, seconds), x, P)
+
+    def between(self, start_ns: int, end_ns: int) -> Length:
+        """Speed over the ground times time."""
+        if self._seen_ns is None:
+            return unknown(1.0)
+        x, P = self._predicted(end_ns)
+        seconds = (end_ns - start_ns) * 1e-9
+        metres = max(float(x[0]), 0.0) * seconds
+        if end_ns - self._seen_ns > _LONGEST_HOLD_NS:
+            return unknown(metres)
+        sigma = np.hypot(np.sqrt(P[0, 0]) * seconds, self._uncertainty * metres)
+        return Length(metres, max(float(sigma), 1e-3), True)
+
+    def reset(self) -> None:
+        """Forget speed, pitch and roll."""
+        self._x, self._P = np.array([0.0, self._pitch, 0.0]), np.diag(_AT_FIRST**2)
+        self._seen_ns: int | None = None
+
+    def _ground_of(self, view: View) -> Ground:
+        """Ground of the camera, which seldom changes."""
+        if self._ground is None or self._ground[1] != view.gray.shape \
+                or not np.array_equal(self._ground[0], view.K):
+            self._ground = view.K, view.gray.shape, Ground(view.K, view.gray.shape, self._pitch)
+        return self._ground[2]
+
+    def _predicted(self, stamp_ns: int) -> tuple[Array, Array]:
+        """State (3,) and covariance (3, 3) at a stamp."""
+        seconds = 0.0 if self._seen_ns is None else max(stamp_ns - self._seen_ns, 0) * 1e-9
+        return self._x, self._P + np.diag(_WANDERING**2) * seconds
+
+    def _measured(self, seen: GroundMotion, seconds: float) -> tuple[Array, Array]:
+        """Speed, pitch and roll (3,) and their covariance, with what bounces."""
+        scale = np.array([self._height / seconds, 1.0, 1.0])
+        return seen.value * scale, seen.covariance * np.outer(scale, scale) + np.diag(
+            [0.0, _BOUNCE**2, _BOUNCE**2])
+
+    def _update(self, stamp_ns: int, z: Array, R: Array, x: Array, P: Array) -> None:
+        """Take a measurement z (3,) with its covariance into the state that was predicted."""
+        off, S = z - x, P + R
+        if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _SURPRISE:
+            # No ground leans like this.
+            return
+        if off[0]**2 > _SURPRISE * S[0, 0]:
+            # What is seen counts more than how vehicles speed up.
+            P = P.copy()
+            P[0] = P[:, 0] = 0.0
+            P[0, 0] = _AT_FIRST[0]**2
+        gain = P @ np.linalg.inv(P + R)
+        keep = np.eye(3) - gain
+        self._x = x + gain @ (z - x)
+        self._P = keep @ P @ keep.T + gain @ R @ gain.T
+        self._seen_ns = stamp_ns
+
+
 class GroundTruthScale:
     """Distances between known positions (N, 3) in metres at increasing stamps (N,)."""
 
@@ -152,6 +250,12 @@ def unknown(guess: float) -> Length:
     return Length(guess, UNKNOWN_LENGTH_SIGMA, False)
 
 
+def same_scale(before: OdometryConfig, after: OdometryConfig) -> bool:
+    """Tell whether two configurations ask for the same source."""
+    names = ('scale', 'scale_value', 'scale_uncertainty', 'camera_height', 'camera_pitch')
+    return all(getattr(before, name) == getattr(after, name) for name in names)
+
+
 def scale_source(config: OdometryConfig,
                  ground_truth: tuple[NDArray[np.int64], Array] | None = None) -> ScaleSource:
     """
@@ -164,6 +268,9 @@ def scale_source(config: OdometryConfig,
         return ConstantScale(config.scale_value, config.scale_uncertainty)
     if config.scale == 'speed':
         return SpeedScale(config.scale_uncertainty)
+    if config.scale == 'camera_height':
+        return CameraHeightScale(config.camera_height, np.radians(config.camera_pitch),
+                                 config.scale_uncertainty)
     if config.scale == 'ground_truth':
         if ground_truth is None:
             raise DjetError("odometry.scale is 'ground_truth', and there is no ground truth; "

@@ -17,7 +17,7 @@ from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
-from djet_ros.odometry.scale import scale_source, ScaleSource, SpeedScale
+from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource, SpeedScale
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
 import numpy as np
 
@@ -91,8 +91,7 @@ class Tracker:
         DjetError where the scale needs something that can't be had while running.
         """
         before, after = self.config.odometry, config.odometry
-        if (before.scale, before.scale_value, before.scale_uncertainty) != (
-                after.scale, after.scale_value, after.scale_uncertainty):
+        if not same_scale(before, after):
             self._scale = scale_source(after)
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
@@ -176,6 +175,7 @@ class Tracker:
         """Say how the odometry is doing."""
         diagnosis = diagnose(self.state, '' if self._paused else self._detail, self.counts,
                              self.last, self._rate.hertz)
+        diagnosis.values['scale source'] = self.config.odometry.scale
         diagnosis.values.update(self.face_values)
         return diagnosis
 

@@ -9,7 +9,7 @@ from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
-from djet_ros.odometry.scale import Length, scale_source, ScaleSource
+from djet_ros.odometry.scale import CameraHeightScale, Length, scale_source, ScaleSource
 from djet_ros.odometry.uncertainty import (
     compose,
     motion_covariance,
@@ -101,7 +101,7 @@ class VisualOdometry:
 
         # The pair: the motion before it is one of its starting poses.
         relative = self._estimator.estimate(self._view, view, self._prior)
-        length = self._scale.between(self._reference.stamp_ns, frame.stamp_ns)
+        length = self._length(frame, view, relative)
         if self._stands_still(relative):
             return self._stay(frame, relative, length)
         if relative.status not in TRACKED:
@@ -114,6 +114,13 @@ class VisualOdometry:
         self._refer_to(frame, view)
         self._prior, self._bad_pairs = relative, 0
         return result
+
+    def _length(self, frame: Frame, view: View, relative: RelativePose) -> Length:
+        """Length of the translation; what the pair itself shows of it is seen first."""
+        span = self._reference.stamp_ns, frame.stamp_ns
+        if isinstance(self._scale, CameraHeightScale):
+            self._scale.see(*span, self._view, view, relative)
+        return self._scale.between(*span)
 
     def _stands_still(self, relative: RelativePose) -> bool:
         # Two equal images are DEGENERATE to most estimators, for want of any residual.

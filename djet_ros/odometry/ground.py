@@ -1,0 +1,304 @@
+"""
+The ground under a moving camera: how far it went over it, in heights of the camera.
+
+Points X of a plane with m.X = 1 have the inverse depth m.x along their ray x, so that two views
+with X' = R X + t see it as y ~ (R + t m^T) x (Faugeras and Lustman, 1988). With t of length one,
+|m| is the way in heights of the camera over the plane, and m / |m| is its normal. All pixels where
+level ground would be are aligned directly, because roads have few corners.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+from djet_ros.core.geometry import homogeneous, rotation_exp, sphere_tangents
+from djet_ros.core.types import Array, RelativePose, Status, View
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+Image = NDArray[np.float32]
+
+# What is looked at, in heights of the camera over level ground: from so near, and to either side.
+# Roads bend up and down, so that only the nearest is flat: up to so far, or where the nearest that
+# is seen is far already, to so many times that, but not beyond the last.
+_NEAR, _ASIDE = 1.0, 1.5
+_FLAT, _TIMES, _FAR = 6.0, 1.5, 14.0
+
+# Fewer pixels than this see too little; more than this only cost time.
+_LEAST_PIXELS, _PIXELS = 400, 4000
+
+# Ways between two views that are searched, in heights; in steps of a pixel or two.
+_WAYS, _STEP = (0.02, 4.0), 0.03
+
+# Correlation with which ground is seen again. Walls and cars that are taken for ground have less.
+_SEEN = 0.6
+
+# Another way must correlate by so much less, if it is no neighbour by so many steps.
+_CLEARLY, _NEIGHBOURS = 0.1, 6
+
+# Ground that moves by less than this many pixels, while other things show that the camera moves,
+# is none: something that moves with the camera hides it.
+_LEAST_SHIFT = 1.0
+
+# Gray levels at which contrast is noise, and the side in pixels over which it is evened out.
+# Nearer than half of that to the rim of the image, what lies beyond would have to be invented.
+_NOISE, _SIDE = 2.0, 25
+_RIM = _SIDE // 2 + 2
+
+# Normals that the fit of one pair considers, about that of level ground: standard deviation.
+_LEAN = np.radians(3.0)
+
+# Residuals in a cell of this side in pixels err together; and what correlation over longer
+# distances adds: as for the pose.
+_CELL, _INFLATION = 32, 4.0
+
+# Pixels that cells of flat ground are off at most, in the median.
+_UNEVEN = 0.6
+
+_ROUNDS, _RESTS = 10, 1e-3
+
+
+@dataclass(frozen=True)
+class GroundMotion:
+    """
+    What a pair of views says of the ground.
+
+    value: (3,) way in heights of the camera, pitch of the camera (down is positive) and roll
+    against the ground in rad; covariance: (3, 3); correlation of the ground in both views.
+    """
+
+    value: Array
+    covariance: Array
+    correlation: float
+
+
+class Ground:
+    """
+    Where a camera sees the ground, if that is level.
+
+    K: (3, 3) camera matrix; shape: (height, width) of its images; pitch: in rad, by which it looks
+    down. Roll is taken to be small.
+    """
+
+    def __init__(self, K: Array, shape: tuple[int, ...], pitch: float) -> None:
+        """Choose the pixels that see ground."""
+        self._normal = np.array([0.0, np.cos(pitch), np.sin(pitch)])
+        self._forward = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
+        self._reach = _FAR
+        rows, columns = np.mgrid[_RIM:shape[0] - _RIM, _RIM:shape[1] - _RIM]
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+        rays = homogeneous(pixels) @ np.linalg.inv(K).T
+        seen = self._sees(rays)
+        if seen.any():
+            self._reach = max(_FLAT, _TIMES * float(self._ahead(rays[seen]).min()))
+        chosen = np.flatnonzero(self._sees(rays))
+        self.is_in_view = len(chosen) >= _LEAST_PIXELS
+        if not self.is_in_view:
+            return
+        some = np.linspace(0, len(chosen) - 1, min(len(chosen), _PIXELS)).astype(np.int64)
+        self._pixels, self._rays = pixels[chosen[some]], rays[chosen[some]]
+        # Above the ground nothing is looked at, but for what the filters reach.
+        self._top = max(int(self._pixels[:, 1].min()) - _SIDE, 0)
+        self._K = K - [[0, 0, 0], [0, 0, self._top], [0, 0, 0]]
+        self._pixels[:, 1] -= self._top
+        _, self._cells = np.unique((self._pixels // _CELL) @ [1, 1 << 16], return_inverse=True)
+
+    def _ahead(self, rays: Array) -> Array:
+        """Give how far ahead, in heights, rays (N, 3) meet level ground; infinite above it."""
+        inverse = rays @ self._normal
+        ahead = np.where(inverse > 1e-9, rays @ self._forward, np.inf)
+        return np.asarray(ahead / np.maximum(inverse, 1e-9))
+
+    def _sees(self, rays: Array) -> NDArray[np.bool_]:
+        """Tell of rays (N, 3) whether they meet level ground that is looked at."""
+        ahead = self._ahead(rays)
+        aside = np.abs(rays[:, 0]) / np.maximum(rays @ self._normal, 1e-9)
+        return np.asarray((ahead > _NEAR) & (ahead < min(self._reach, _FAR)) & (aside < _ASIDE))
+
+    def motion(self, previous: View, current: View, relative: RelativePose,
+               ways: tuple[float, float] = _WAYS) -> GroundMotion | None:
+        """
+        Find how the ground moves between two views, from the motion between them.
+
+        ways: from which to which way, in heights, is searched first. None where no ground is seen,
+        or where it does not tell.
+        """
+        if not self.is_in_view:
+            return None
+        here, there = self._texture(previous), self._texture(current)
+        wanted = _sampled(here, self._pixels)
+        if relative.status is not Status.OK:
+            return self._standing(wanted, there, relative)
+        start = self._search(wanted, there, relative, ways)
+        if start is None:
+            start = self._search(wanted, there, relative, _WAYS)
+        return None if start is None else self._fit(wanted, there, relative, start)
+
+    def _texture(self, view: View) -> Image:
+        """Image whose contrast is alike everywhere, from the highest row looked at."""
+        gray = cv2.GaussianBlur(view.gray[self._top:], (0, 0), 1.0).astype(np.float32)
+        detail = gray - cv2.blur(gray, (_SIDE, _SIDE))
+        # The running sums of a filter may end a little below zero.
+        power = np.maximum(cv2.blur(detail**2, (_SIDE, _SIDE)), 0.0)
+        inner, rim = np.full(gray.shape, np.nan, np.float32), _SIDE // 2
+        inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + _NOISE))[rim:-rim, rim:-rim]
+        return inner
+
+    def _seen_again(self, R: Array, t: Array, m: Array) -> Array:
+        """Pixels (N, 2) of the points of a plane m in the current view."""
+        seen = (self._rays @ R.T + np.outer(self._rays @ m, t)) @ self._K.T
+        return np.asarray(seen[:, :2] / np.maximum(seen[:, 2:], 1e-9))
+
+    def _standing(self, wanted: Array, there: Image,
+                  relative: RelativePose) -> GroundMotion | None:
+        """Tell whether the ground is where a rotation alone would bring it."""
+        R = relative.R if relative.status is Status.NO_PARALLAX else np.eye(3)
+        correlation = _correlation(
+            wanted, _sampled(there, self._seen_again(R, np.zeros(3), self._normal)))
+        if correlation < _SEEN:
+            return None
+        least = _LEAST_SHIFT / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
+        return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]), correlation)
+
+    def _search(self, wanted: Array, there: Image, relative: RelativePose,
+                ways: tuple[float, float]) -> Array | None:
+        """Plane (3,) of the way under which level ground correlates best, if one stands out."""
+        low, high = max(ways[0], _WAYS[0]), min(ways[1], _WAYS[1])
+        tried = np.exp(np.arange(np.log(low) - _STEP, np.log(max(low, high)) + 2 * _STEP, _STEP))
+        found = np.array([_correlation(wanted, _sampled(there, self._seen_again(
+            relative.R, relative.t, way * self._normal))) for way in tried])
+        best = int(found.argmax())
+        if found[best] < _SEEN or best in (0, len(found) - 1):
+            return None
+        # Textures that repeat have several peaks; slow ground has one, but a broad one.
+        peaks = found == maximum_filter1d(found, 2 * _NEIGHBOURS + 1, mode='nearest')
+        if (peaks & (found > found[best] - _CLEARLY)).sum() > 1:
+            return None
+        return np.asarray(tried[best] * self._normal)
+
+    def _fit(self, wanted: Array, there: Image, relative: RelativePose,
+             m: Array) -> GroundMotion | None:
+        """
+        Fit the plane by Gauss-Newton, together with the motion as far as that is uncertain.
+
+        Robust (Cauchy) residuals of intensity; their noise is taken from their sums over cells, as
+        for the pose, so that the covariance holds however rough the texture is.
+        """
+        known = np.zeros((8, 8))
+        known[3:, 3:] = np.linalg.inv(relative.covariance_5 + 1e-12 * np.eye(5))
+        tangents, theta = sphere_tangents(relative.t), np.zeros(5)
+        gradients = [np.asarray(cv2.Scharr(there, -1, *axis, scale=1 / 32), np.float32)
+                     for axis in ((1, 0), (0, 1))]
+        for _ in range(_ROUNDS):
+            R = rotation_exp(theta[:3]) @ relative.R
+            t = relative.t + tangents @ theta[3:]
+            places = self._seen_again(R, t, m)
+            found = _sampled(there, places)
+            r = found - wanted
+            J = self._jacobian([_sampled(g, places) for g in gradients], R, t, m, tangents)
+            inside = np.isfinite(r) & np.isfinite(J).all(axis=1)
+            if inside.sum() < _LEAST_PIXELS:
+                return None
+            J, r = np.where(inside[:, None], J, 0.0), np.where(inside, r, 0.0)
+            hessian, gradient, spread = self._normal_equations(J, r, inside)
+            lean, offset = _leaning(m, self._normal)
+            prior = known.copy()
+            prior[:3, :3] += lean.T @ lean
+            # The noise that makes residuals and priors comparable.
+            noise = float(np.trace(np.linalg.solve(hessian + 1e-9 * np.eye(8), spread))) / 8
+            total = hessian / noise + prior
+            gradient /= noise
+            gradient[:3] += lean.T @ offset
+            gradient[3:] += known[3:, 3:] @ theta
+            step = -np.linalg.solve(total, gradient)
+            m, theta = m + step[:3], theta + step[3:]
+            if np.linalg.norm(step[:3]) < _RESTS * np.linalg.norm(m):
+                break
+        shift = float(np.median(np.linalg.norm(
+            places - self._seen_again(R, np.zeros(3), m), axis=1)))
+        correlation = _correlation(wanted, found)
+        if correlation < _SEEN or shift < _LEAST_SHIFT or m @ self._normal <= 0 \
+                or self._unevenness(r, J, R, t, m) > _UNEVEN:
+            return None
+        back = np.linalg.inv(total)
+        covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
+        return _described(m, covariance, correlation)
+
+    def _unevenness(self, r: Array, J: Array, R: Array, t: Array, m: Array) -> float:
+        """
+        Median shift in pixels by which cells are still off along their flow.
+
+        A wall may move much as ground does, but not everywhere.
+        """
+        longer = (self._seen_again(R, t, 1.01 * m) - self._seen_again(R, t, m)) / 0.01
+        slope = (J[:, :3] @ m) / np.maximum(np.linalg.norm(longer, axis=1), 1e-9)
+        sums, squares = (np.bincount(self._cells, values) for values in (slope * r, slope**2))
+        told = squares > 0.2 * float(np.median(squares[squares > 0]))
+        return float(np.median(np.abs(sums[told] / squares[told])))
+
+    def _jacobian(self, gradients: list[Array], R: Array, t: Array, m: Array,
+                  tangents: Array) -> Array:
+        """Differentiate intensities by plane, rotation and direction of translation, (N, 8)."""
+        turned, inverse = self._rays @ R.T, self._rays @ m
+        y = turned + np.outer(inverse, t)
+        flow = np.stack(gradients, axis=1) @ self._K[:2, :2]
+        by_point = np.column_stack([flow, -(flow * y[:, :2]).sum(1) / y[:, 2]]) / y[:, 2:]
+        return np.column_stack([
+            (by_point @ t)[:, None] * self._rays, np.cross(turned, by_point),
+            (by_point @ tangents) * inverse[:, None]])
+
+    def _normal_equations(self, J: Array, r: Array,
+                          inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        """Hessian (8, 8), gradient (8,), and the covariance (8, 8) that noise gives the latter."""
+        scale = 1.4826 * float(np.median(np.abs(r[inside]))) + 1e-6
+        weights = 1 / (1 + (r / (2 * scale))**2)
+        scores = np.stack([np.bincount(self._cells, column)
+                           for column in (J * (weights * r)[:, None]).T])
+        parameters, cells = scores.shape
+        inflation = _INFLATION * cells / max(cells - parameters, 1)
+        return ((J * weights[:, None]).T @ J, scores.sum(axis=1),
+                inflation * scores @ scores.T)
+
+
+def _sampled(image: Image, pixels: Array) -> Array:
+    """Values (N,) at pixels (N, 2), NaN outside."""
+    x, y = pixels.T.astype(np.float32)
+    values = cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR,
+                       borderMode=cv2.BORDER_CONSTANT, borderValue=float('nan'))
+    return np.asarray(values[0], np.float64)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    """Correlation of two samples (N,) where the second is there; 0 if that is too little."""
+    there = np.isfinite(b)
+    if there.sum() < max(_LEAST_PIXELS, len(b) / 4):
+        return 0.0
+    a, b = a[there], b[there]
+    power = float(a @ a) * float(b @ b)
+    return float(a @ b) / np.sqrt(power) if power > 0 else 0.0
+
+
+def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
+    """
+    Tell how a plane leans against level ground, in deviations of _LEAN.
+
+    Gives the derivative (2, 3) by the plane, and the lean (2,) itself.
+    """
+    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _LEAN
+    length = float(np.linalg.norm(m))
+    n = m / length
+    return across @ (np.eye(3) - np.outer(n, n)) / length, across @ n
+
+
+def _described(m: Array, covariance: Array, correlation: float) -> GroundMotion:
+    """Way, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
+    length = float(np.linalg.norm(m))
+    x, y, z = (m / length).tolist()
+    upright = np.hypot(y, z)
+    J = np.array([[x, y, z],
+                  [0.0, -z / upright**2 / length, y / upright**2 / length],
+                  [upright / length, -x * y / upright / length, -x * z / upright / length]])
+    return GroundMotion(np.array([length, np.arctan2(z, y), np.arctan2(x, upright)]),
+                        J @ covariance @ J.T, correlation)

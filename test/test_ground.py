@@ -1,0 +1,320 @@
+"""The ground under the camera: how far it moved, how sure that is, and when nothing is said."""
+
+from cards import Cards, K as CARDS_K, pose, REST
+import cv2
+from djet_ros.config import from_flat, OdometryConfig
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.types import RelativePose, Status, View
+from djet_ros.data.decoding import message_type
+from djet_ros.data.kitti import KittiSequence
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.ground import Ground
+from djet_ros.odometry.scale import CameraHeightScale
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.scenes import make_scene
+import numpy as np
+import pytest
+
+K = np.array([[300.0, 0, 199.5], [0, 300.0, 79.5], [0, 0, 1]])
+SIZE = (400, 200)
+HEIGHT = 1.5
+
+
+class Floor:
+    """A flat floor of one texture without end, seen from HEIGHT metres, and nothing else."""
+
+    def __init__(self, seed=0):
+        rng = np.random.default_rng(seed)
+        texture = sum(cv2.resize(rng.normal(0, size, (1024 // grain,) * 2), (1024, 1024))
+                      for grain, size in ((2, 8.0), (4, 12.0), (16, 20.0)))
+        self._texture = np.clip(128 + texture, 0, 255).astype(np.float32)
+
+    def gray(self, pitch=0.0, x=0.0, z=0.0, yaw=0.0, seed=None, height=HEIGHT):
+        """Image from a camera at (x, z) that looks down by pitch and to the right by yaw."""
+        v, u = np.mgrid[:SIZE[1], :SIZE[0]].astype(float)
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+        rays = rays @ floor_pose(pitch, yaw=yaw)[:3, :3].T
+        below = rays[..., 1] > 0.02
+        reach = height / np.where(below, rays[..., 1], 1.0)
+        # 2 cm a pixel
+        places = [((at + reach * ray) / 0.02 % 1024).astype(np.float32)
+                  for at, ray in ((x, rays[..., 0]), (z, rays[..., 2]))]
+        image = np.where(below, cv2.remap(self._texture, *places, cv2.INTER_LINEAR,
+                                          borderMode=cv2.BORDER_WRAP), 200.0)
+        if seed is not None:
+            image = image + np.random.default_rng(seed).normal(0, 2, image.shape)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def floor_pose(pitch, x=0.0, z=0.0, yaw=0.0):
+    """Camera in the floor's axes: x right, y down, z forward."""
+    result = np.eye(4)
+    result[:3, :3] = rotation_exp(np.array([0.0, yaw, 0.0])) @ rotation_exp(
+        np.array([-pitch, 0.0, 0.0]))
+    result[:3, 3] = x, 0.0, z
+    return result
+
+
+def moved(before, after, sigma=1e-3):
+    """Give the true motion between two camera poses, as sure as is said."""
+    M = np.linalg.inv(after) @ before
+    return RelativePose(Status.OK, M[:3, :3], unit(M[:3, 3]), np.eye(5) * sigma**2)
+
+
+def view(gray):
+    return View(gray, K, None, None)
+
+
+@pytest.fixture(scope='module')
+def floor():
+    return Floor()
+
+
+# One pair
+
+@pytest.mark.parametrize('way', [0.15, 0.8, 1.5])
+@pytest.mark.parametrize(('pitch', 'turn'), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.05)])
+def test_the_way_over_the_ground_is_seen_in_heights_of_the_camera(floor, way, pitch, turn):
+    heading = np.array([np.sin(turn / 2), np.cos(turn / 2)]) * way
+    motion = moved(floor_pose(pitch), floor_pose(pitch, *heading, yaw=turn))
+    seen = Ground(K, SIZE[::-1], pitch).motion(
+        view(floor.gray(pitch, seed=1)),
+        view(floor.gray(pitch, *heading, yaw=turn, seed=2)), motion)
+    off, sigmas = seen.value - [way / HEIGHT, pitch, 0.0], np.sqrt(np.diag(seen.covariance))
+    assert (np.abs(off) < 3 * sigmas).all()
+    assert (sigmas < [0.05 * way / HEIGHT, np.radians(1), np.radians(1)]).all()
+
+
+def test_the_camera_may_look_down_by_a_little_more_than_is_said(floor):
+    pitch = np.radians(1.5)
+    motion = moved(floor_pose(pitch), floor_pose(pitch, z=0.8))
+    seen = Ground(K, SIZE[::-1], 0.0).motion(
+        view(floor.gray(pitch)), view(floor.gray(pitch, z=0.8)), motion)
+    assert seen.value[0] == pytest.approx(0.8 / HEIGHT, rel=0.02)
+    assert seen.value[1] == pytest.approx(pitch, abs=np.radians(0.5))
+
+
+def test_the_covariance_of_one_pair_is_that_of_many():
+    """Other floors, other noise, and motions that are off by as much as they say."""
+    rng, ground, errors = np.random.default_rng(3), Ground(K, SIZE[::-1], 0.0), []
+    sigma = 4e-3
+    for seed in range(40):
+        floor, way = Floor(seed), rng.uniform(0.4, 1.6)
+        motion = moved(floor_pose(0.0), floor_pose(0.0, z=way), sigma)
+        off = rng.normal(0, sigma, 5)
+        motion = RelativePose(Status.OK, rotation_exp(off[:3]) @ motion.R,
+                              unit(motion.t + np.array([*off[3:], 0.0])), motion.covariance_5)
+        seen = ground.motion(view(floor.gray(seed=2 * seed)),
+                             view(floor.gray(z=way, seed=2 * seed + 1)), motion)
+        off = seen.value - [way / HEIGHT, 0.0, 0.0]
+        errors.append(off @ np.linalg.solve(seen.covariance, off))
+    # three are expected of each; the inflation is for real roads
+    assert 0.5 < np.mean(errors) < 4.5
+    assert np.max(errors) < 25
+
+
+def test_less_texture_makes_less_sure(floor):
+    sigmas = []
+    for contrast in (1.0, 0.05):
+        before, after = (
+            np.clip(128 + contrast * (floor.gray(z=z).astype(float) - 128)
+                    + np.random.default_rng(int(10 * z)).normal(0, 2, SIZE[::-1]), 0, 255
+                    ).astype(np.uint8) for z in (0.0, 0.8))
+        seen = Ground(K, SIZE[::-1], 0.0).motion(
+            view(before), view(after), moved(floor_pose(0.0), floor_pose(0.0, z=0.8)))
+        if seen is not None:
+            sigmas.append(np.sqrt(seen.covariance[0, 0]))
+    assert len(sigmas) == 1 or sigmas[1] > 2 * sigmas[0]
+
+
+def test_ground_without_texture_tells_nothing():
+    plain = [np.random.default_rng(seed).normal(120, 1, SIZE[::-1]).astype(np.uint8)
+             for seed in (1, 2)]
+    assert Ground(K, SIZE[::-1], 0.0).motion(
+        *map(view, plain), moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
+
+
+@pytest.mark.parametrize('step', [pose(x=0.5), pose(z=1.5), pose(x=0.3, z=-0.8),
+                                  pose(x=0.5, yaw=0.03), pose(x=-0.2, z=1.0)])
+def test_a_wall_is_no_ground(step):
+    """One card, twelve metres ahead."""
+    wall, estimator = Cards(), TwoViewEstimator()
+    del wall._cards[1:]
+    views = [estimator.view(wall.gray(at, noise=i), CARDS_K) for i, at in enumerate((REST, step))]
+    for motion in (moved(REST, step), estimator.estimate(*views)):
+        assert Ground(CARDS_K, (240, 320), 0.0).motion(*views, motion) is None
+
+
+def test_what_moves_with_the_camera_is_no_ground(floor):
+    """A bonnet, or the shadow of the car itself: the same pixels in both images."""
+    before, after = floor.gray(), floor.gray(z=0.8, seed=3)
+    after[100:] = before[100:]
+    assert Ground(K, SIZE[::-1], 0.0).motion(
+        view(before), view(after), moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
+
+
+def test_a_camera_that_sees_no_ground_says_nothing(floor):
+    upwards = Ground(K, SIZE[::-1], np.radians(-30.0))
+    assert not upwards.is_in_view
+    assert upwards.motion(view(floor.gray()), view(floor.gray(z=0.8)),
+                          moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
+
+
+def test_turning_on_the_spot_is_no_way_at_all(floor):
+    R = np.linalg.inv(floor_pose(0.0, yaw=0.05)) @ floor_pose(0.0)
+    seen = Ground(K, SIZE[::-1], 0.0).motion(
+        view(floor.gray(seed=1)), view(floor.gray(yaw=0.05, seed=2)),
+        RelativePose(Status.NO_PARALLAX, R[:3, :3]))
+    assert seen.value[0] == 0.0
+    assert np.sqrt(seen.covariance[0, 0]) < 0.05
+
+
+# From pair to pair
+
+def see_pair(scale, floor, i, z, dz, status=Status.OK, gray=None):
+    """Show the pair of frames i and i + 1, a tenth of a second apart, and give its length."""
+    motion = moved(floor_pose(0.0), floor_pose(0.0, z=dz)) if status is Status.OK \
+        else RelativePose(status)
+    current = view(floor.gray(z=z + dz, seed=i)) if gray is None else view(gray)
+    scale.see(i * 10**8, (i + 1) * 10**8, view(floor.gray(z=z, seed=i + 1)), current, motion)
+    return scale.between(i * 10**8, (i + 1) * 10**8)
+
+
+def test_lengths_are_in_metres_and_as_sure_as_height_and_images_allow(floor):
+    sigmas = {}
+    for share in (0.01, 0.05):
+        scale = CameraHeightScale(HEIGHT, 0.0, share)
+        assert not scale.between(0, 10**8).known
+        for i in range(5):
+            length = see_pair(scale, floor, i, 0.8 * i, 0.8)
+        assert length.known
+        assert length.value == pytest.approx(0.8, rel=0.02)
+        sigmas[share] = length.sigma
+    assert sigmas[0.05] > 0.05 * 0.8
+    assert 0.01 * 0.8 < sigmas[0.01] < sigmas[0.05] / 2
+
+
+def test_speed_may_change_at_once(floor):
+    scale, z = CameraHeightScale(HEIGHT, 0.0), 0.0
+    for i, way in enumerate((0.9, 0.9, 0.3, 0.9, 0.1, 0.9)):
+        length = see_pair(scale, floor, i, z, way)
+        assert length.value == pytest.approx(way, rel=0.04)
+        z += way
+
+
+def test_without_ground_a_length_is_held_for_half_a_second_and_then_unknown(floor):
+    scale = CameraHeightScale(HEIGHT, 0.0)
+    for i in range(3):
+        seen = see_pair(scale, floor, i, 0.8 * i, 0.8)
+    blind = [see_pair(scale, floor, i, 0.8 * i, 0.8, gray=np.full(SIZE[::-1], 90, np.uint8))
+             for i in range(3, 10)]
+    assert [length.known for length in blind] == [True] * 5 + [False] * 2
+    assert all(later.sigma > sooner.sigma for sooner, later in zip([seen, *blind], blind[:6]))
+    assert blind[-1].value == pytest.approx(0.8, rel=0.05)
+    assert blind[-1].sigma > 100
+    again = see_pair(scale, floor, 10, 8.0, 0.8)
+    assert again.known
+    assert again.value == pytest.approx(0.8, rel=0.03)
+    scale.reset()
+    assert not scale.between(10**9, 11 * 10**8).known
+
+
+def test_standing_still_is_a_known_length(floor):
+    scale = CameraHeightScale(HEIGHT, 0.0)
+    see_pair(scale, floor, 0, 0.0, 0.4)
+    for i in range(1, 20):
+        length = see_pair(scale, floor, i, 0.4, 0.0, Status.NO_PARALLAX)
+        assert length.known
+        assert length.value < 0.02
+        assert length.sigma < 0.05
+    assert see_pair(scale, floor, 20, 0.4, 0.5).value == pytest.approx(0.5, rel=0.04)
+
+
+def test_ground_that_leans_all_of_a_sudden_is_none(floor):
+    """A ramp behind which something else may be: its way is not taken for a length."""
+    scale = CameraHeightScale(HEIGHT, 0.0)
+    for i in range(5):
+        before = see_pair(scale, floor, i, 0.8 * i, 0.8)
+    pitch = np.radians(6.0)
+    motion = moved(floor_pose(pitch), floor_pose(pitch, z=0.4))
+    scale.see(5 * 10**8, 6 * 10**8, view(floor.gray(pitch)), view(floor.gray(pitch, z=0.4)),
+              motion)
+    after = scale.between(5 * 10**8, 6 * 10**8)
+    assert after.value == pytest.approx(before.value)
+    assert after.sigma > before.sigma
+
+
+# In the odometry
+
+@pytest.fixture(scope='module')
+def street():
+    """Eight frames of a rendered street, a metre apart, and their poses."""
+    scene = make_scene('road', size=(620, 188))
+    poses = scene.trajectory(8)
+    return scene.K, [scene.render(at, i) for i, at in enumerate(poses)], poses
+
+
+CAR = {'scale': 'camera_height', 'camera_height': 1.65}
+
+
+def drive(street, **config):
+    """Results of all frames but the first."""
+    K, images, _ = street
+    vo = VisualOdometry(EstimatorConfig(max_features=1000), OdometryConfig(**config))
+    return [vo.process(Frame(gray, K, 10**9 + i * 10**8)) for i, gray in enumerate(images)][1:]
+
+
+def test_a_street_is_as_long_as_it_is(street):
+    ways = np.linalg.norm(np.diff(np.array(street[2])[:, :3, 3], axis=0), axis=1)
+    results = drive(street, **CAR)
+    assert all(result.scale_known for result in results)
+    for result, way in zip(results, ways):
+        direction = unit(result.motion[:3, 3])
+        sigma = np.sqrt(direction @ result.motion_covariance[:3, :3] @ direction)
+        assert 0.05 < sigma / result.scale < 0.2
+        assert abs(result.scale - way) < 2 * sigma
+    assert sum(result.scale for result in results) == pytest.approx(ways.sum(), rel=0.06)
+
+
+def test_a_wrong_height_is_a_wrong_length_in_proportion(street):
+    right, wrong = (np.array([result.scale for result in drive(
+        street, scale='camera_height', camera_height=height)]) for height in (1.65, 3.3))
+    # but for how speeds wander, which is in metres
+    assert wrong == pytest.approx(2 * right, rel=0.03)
+
+
+def test_the_choice_is_said_in_the_diagnostics(street):
+    for name in ('none', 'camera_height'):
+        tracker = Tracker(from_flat({'odometry.scale': name}), message_type)
+        assert tracker.diagnosis().values['scale source'] == name
+
+
+def test_the_height_may_be_changed_while_running(street):
+    config = {'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0}
+    tracker = Tracker(from_flat(config), message_type)
+    before = tracker._scale
+    tracker.configure(from_flat(config))
+    assert tracker._scale is before
+    tracker.configure(from_flat({**config, 'odometry.camera_height': 1.65}))
+    assert tracker._scale is not before
+
+
+@pytest.mark.parametrize('name', ['00', '03', '06'])
+def test_real_roads_are_as_long_as_their_ground_truth_says(kitti, name):
+    """The cameras of KITTI are 1.65 m above the road; its roads are not quite flat."""
+    sequence = KittiSequence(kitti / 'sequences' / name)
+    vo = VisualOdometry(odometry=OdometryConfig(**CAR))
+    first = 12
+    results = [vo.process(Frame(sequence.image(i), sequence.K, int(sequence.stamps_ns[i])))
+               for i in range(first, first + 15)][1:]
+    truth = np.array(sequence.poses)[first:first + 15, :3, 3]
+    ways = np.linalg.norm(np.diff(truth, axis=0), axis=1)
+    ratios = np.array([result.scale for result in results]) / ways
+    assert all(result.scale_known for result in results)
+    assert np.median(ratios) == pytest.approx(1, abs=0.04)
+    surprise = [(result.scale - way) / np.sqrt(np.trace(result.motion_covariance[:3, :3]))
+                for result, way in zip(results, ways)]
+    assert np.sqrt(np.mean(np.square(surprise))) < 2
