@@ -108,7 +108,7 @@ def test_two_images_and_a_camera_are_as_good_as_a_sequence(road, tmp_path, capsy
     file = str(tmp_path / 'surfaces.png')
     assert main(['surfaces', *images, '--camera', camera, '--output', file]) == 0
     one = capsys.readouterr().out
-    assert main(['surfaces', str(road), '--pair', '1', '--output', file]) == 0
+    assert main(['surfaces', str(road), '--pair', '1', '--output', file, '--overwrite']) == 0
     assert capsys.readouterr().out == one
 
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from djet_ros.cli.outputs import add_overwrite, check_output
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.bench import bench, QUOTED_POINTS
 from rich.console import Console
@@ -25,13 +26,12 @@ def add_parser(subparsers: Any) -> None:
                         help='where the figures go; the plot goes to FILE.png')
     parser.add_argument('--pairs', type=int, default=40, metavar='N',
                         help='pairs to measure (default: %(default)s)')
-    parser.add_argument('--overwrite', action='store_true', help='replace existing figures')
+    add_overwrite(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write and show the figures."""
-    if args.output.exists() and not args.overwrite:
-        raise DjetError(f'{args.output} exists; give another name or --overwrite')
+    check_output(args.output, args.overwrite)
     if args.pairs < 1:
         raise DjetError(f'--pairs is {args.pairs}; it must be at least 1')
     args.output.parent.mkdir(parents=True, exist_ok=True)

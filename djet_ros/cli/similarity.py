@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from djet_ros.cli.outputs import add_overwrite, check_output
 from djet_ros.config import add_flags, flag_values, from_flat
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.similarity import (
@@ -33,6 +34,7 @@ def add_parser(subparsers: Any) -> None:
                         help='second image of the same place (default: the first)')
     parser.add_argument('--output', type=Path, default=Path('similarity.png'), metavar='FILE',
                         help='PNG to write (default: %(default)s)')
+    add_overwrite(parser)
     parser.add_argument('--points', nargs='+', metavar='X,Y',
                         help='pixels in the first image (default: the strongest keypoints)')
     parser.add_argument('--count', type=int, default=6, metavar='N',
@@ -45,6 +47,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
+    check_output(args.output, args.overwrite, '.png')
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
     points = None if args.points is None else np.array([_point(text) for text in args.points])

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from djet_ros.errors import DjetError
+from djet_ros.cli.outputs import add_overwrite, check_output
 from djet_ros.evaluation.soak import SIZE, soak
 from rich.console import Console
 
@@ -26,13 +26,12 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--max-growth', type=float, default=10.0, metavar='MB',
                         help='resident memory that may come on top of what a fifth of the frames '
                         'took (default: %(default)s)')
-    parser.add_argument('--overwrite', action='store_true', help='replace existing figures')
+    add_overwrite(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Soak, write and show the figures."""
-    if args.output.exists() and not args.overwrite:
-        raise DjetError(f'{args.output} exists; give another name or --overwrite')
+    check_output(args.output, args.overwrite)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     with Console(stderr=True).status('soaking ...') as status:
         figures = soak(args.frames, args.max_growth, lambda done: status.update(

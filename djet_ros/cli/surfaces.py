@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from djet_ros.cli.outputs import add_overwrite, check_output
 from djet_ros.config import add_flags, flag_values, from_flat
 from djet_ros.core.config import PRESETS
 from djet_ros.core.estimator import TwoViewEstimator
@@ -32,6 +33,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2', help='the second image')
     parser.add_argument('--output', type=Path, default=Path('surfaces.png'), metavar='FILE',
                         help='PNG, or GIF for an animation (default: %(default)s)')
+    add_overwrite(parser)
     parser.add_argument('--camera', metavar='FX,FY,CX,CY',
                         help='camera of two images, in pixels')
     parser.add_argument('--pair', type=int, default=0, metavar='I',
@@ -46,9 +48,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
-    draw = {'.png': draw_course, '.gif': animate_course}.get(args.output.suffix.lower())
-    if draw is None:
-        raise DjetError(f"--output is '{args.output}'; its name must end in .png or .gif")
+    check_output(args.output, args.overwrite, '.png', '.gif')
+    draw = draw_course if args.output.suffix.lower() == '.png' else animate_course
     config = from_flat(flag_values(args)).estimator
     first, second, K = _images(args)
     estimator = TwoViewEstimator(config)
