@@ -73,6 +73,9 @@ def camera_frame(config: OdometryConfig, image_frame: str) -> str:
 class Messages:
     """Makes the messages of results; message_type gives the class for a type name."""
 
+    # What the diagnostics are of.
+    component = 'djet_ros: visual odometry'
+
     def __init__(self, message_type: MessageType, config: OdometryConfig) -> None:
         self._type = message_type
         self._config = config
@@ -116,9 +119,12 @@ class Messages:
     def pose_stamped(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the integrated pose in the odom frame."""
         turned, _ = self._turned(result)
+        return self.pose_in(result.stamp_ns, self._config.odom_frame, turned.pose)
+
+    def pose_in(self, stamp: int, frame: str, pose: Array) -> Any:
+        """Make the PoseStamped of a pose (4, 4) in a frame."""
         return self._type('geometry_msgs/msg/PoseStamped')(
-            header=self.header(result.stamp_ns, self._config.odom_frame),
-            pose=self._pose(turned.pose))
+            header=self.header(stamp, frame), pose=self._pose(pose))
 
     def path(self, poses: Sequence[Any]) -> Any:
         """Make the Path of at least one PoseStamped."""
@@ -127,13 +133,16 @@ class Messages:
     def transform(self, result: OdometryResult) -> Any:
         """Make the TFMessage from the odom frame to the camera."""
         turned, frame = self._turned(result)
-        pose = self._pose(turned.pose)
+        return self.frame(result.stamp_ns, self._config.odom_frame, frame, turned.pose)
+
+    def frame(self, stamp: int, parent: str, child: str, pose: Array) -> Any:
+        """Make the TFMessage of one frame in another, pose (4, 4)."""
         return self._type('tf2_msgs/msg/TFMessage')(transforms=[
             self._type('geometry_msgs/msg/TransformStamped')(
-                header=self.header(result.stamp_ns, self._config.odom_frame),
-                child_frame_id=frame,
+                header=self.header(stamp, parent), child_frame_id=child,
                 transform=self._type('geometry_msgs/msg/Transform')(
-                    translation=self._vector(turned.pose[:3, 3]), rotation=pose.orientation))])
+                    translation=self._vector(pose[:3, 3]),
+                    rotation=self._pose(pose).orientation))])
 
     def diagnostics(self, stamp: int, level: str, summary: str,
                     values: dict[str, str]) -> Any:
@@ -142,7 +151,7 @@ class Messages:
         pair = self._type('diagnostic_msgs/msg/KeyValue')
         # The class's own constant is of the type that its field wants: bytes or int.
         status = status_type(
-            level=getattr(status_type, level), name='djet_ros: visual odometry', message=summary,
+            level=getattr(status_type, level), name=self.component, message=summary,
             hardware_id='', values=[pair(key=key, value=value) for key, value in values.items()])
         return self._type('diagnostic_msgs/msg/DiagnosticArray')(
             header=self.header(stamp, ''), status=[status])
@@ -188,12 +197,26 @@ def twist(result: OdometryResult) -> tuple[Array, Array]:
     velocity is zero and nothing is known about it: the covariance is huge.
     """
     if result.previous_stamp_ns is None:
-        return np.zeros(6), np.eye(6) * UNKNOWN_LENGTH_SIGMA**2
+        return twist_of_nothing()
     seconds = (result.stamp_ns - result.previous_stamp_ns) * 1e-9
     R = result.motion[:3, :3]
     velocity = np.concatenate([R.T @ result.motion[:3, 3],
                                Rotation.from_matrix(R).as_rotvec()]) / seconds
     return velocity, rotated(R.T, result.motion_covariance) / seconds**2
+
+
+def begins_anew(odometry: Any) -> bool:
+    """Tell of an Odometry whether it is of no pair, so that its velocity is unknown."""
+    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
+    if any((linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)):
+        return False
+    unknown = twist_of_nothing()[1] + LEAST_COVARIANCE
+    return np.allclose(np.asarray(odometry.twist.covariance), unknown.ravel(), rtol=1e-9, atol=0)
+
+
+def twist_of_nothing() -> tuple[Array, Array]:
+    """Velocity (6,) without a pair, which is zero, and its covariance (6, 6), which is huge."""
+    return np.zeros(6), np.eye(6) * UNKNOWN_LENGTH_SIGMA**2
 
 
 def _plain(values: Array) -> list[float]:

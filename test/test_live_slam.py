@@ -1,0 +1,460 @@
+"""The SLAM beside a live odometry: steps out of messages, a map that grows, and its loops."""
+
+from dataclasses import replace
+
+from cards import Cards, K, pose, REST, SIZE
+from djet_ros.config import Config, from_flat, OdometryConfig
+from djet_ros.core.types import Status
+from djet_ros.data.pose_graph import Edge, PoseGraph
+from djet_ros.data.sources import open_source, pose_of
+from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.scale import GroundTruthScale
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
+from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.scenes import render_sequence
+from djet_ros.slam.live_config import LiveSlamConfig
+from djet_ros.slam.steps import Steps
+import numpy as np
+import pytest
+from ros_messages import camera_info, image, message_type
+
+PERIOD = 100_000_000
+START = 50 * 10**9
+SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
+
+
+class Odometry:
+    """An odometry that is told its motions, and words them as vo_node does."""
+
+    def __init__(self, convention='optical'):
+        self._make = Messages(message_type, OdometryConfig(frame_convention=convention))
+        self.stamp = START
+        self.reset()
+
+    def reset(self):
+        """Begin anew at the origin."""
+        self.here, self.covariance = np.eye(4), np.zeros((6, 6))
+
+    def _result(self, status, motion, covariance, standing=False):
+        return OdometryResult(
+            self.stamp, 'camera', status, self.stamp - PERIOD, None, motion, self.here @ motion,
+            covariance, compose(self.here, self.covariance, motion, covariance), 1.0, True,
+            standing)
+
+    def start(self):
+        """Give the Odometry of a first frame, here."""
+        result = replace(self._result(Status.FIRST_FRAME, np.eye(4), np.zeros((6, 6))),
+                         previous_stamp_ns=None)
+        self.stamp += PERIOD
+        return self._make.odometry(result)
+
+    def move(self, motion, covariance=None, standing=False):
+        """Give (relative pose, Odometry) of the next frame."""
+        covariance = np.diag(SIGMAS**2) if covariance is None else covariance
+        result = self._result(Status.OK, motion, covariance, standing)
+        if not standing:
+            self.here, self.covariance = result.pose, result.pose_covariance
+        self.stamp += PERIOD
+        return self._make.relative_pose_cov(result), self._make.odometry(result)
+
+    def lose_track(self):
+        """Know nothing of how it came to the frame that the next motion is told from."""
+        self.covariance = compose(self.here, self.covariance, np.eye(4), UNKNOWN_MOTION)
+        self.stamp += PERIOD
+
+
+# Steps
+
+def told(steps, *messages):
+    """Give the steps that come of messages."""
+    return [step for message in messages for step in (
+        steps.odometry(message) if hasattr(message, 'twist') else steps.relative_pose(message))]
+
+
+@pytest.mark.parametrize('convention', ['optical', 'body'])
+def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
+    odometry, steps, motion = Odometry(convention), Steps(convention), pose(z=1.0, yaw=0.1)
+    covariance = np.diag(np.arange(1.0, 7)**2) * 1e-6
+    first, = told(steps, odometry.start())
+    second, = told(steps, *odometry.move(motion, covariance))
+    assert first.edge is None
+    assert second.edge.kind == 'odometry'
+    assert second.edge.scale_known
+    assert np.allclose(second.edge.motion, motion)
+    assert np.allclose(second.edge.covariance, covariance, atol=2e-9)
+    assert np.allclose(second.pose, motion)
+
+
+def test_it_does_not_matter_which_of_the_two_messages_comes_first():
+    odometry, steps = Odometry(), Steps('optical')
+    told(steps, odometry.start())
+    for turned in (False, True, False):
+        pair = odometry.move(pose(z=1.0))
+        early, late = reversed(pair) if turned else pair
+        assert not told(steps, early)
+        step, = told(steps, late)
+        assert step.edge.kind == 'odometry'
+    assert steps.missing == 0
+
+
+def test_whoever_comes_late_begins_where_the_odometry_is():
+    odometry, steps = Odometry(), Steps('optical')
+    odometry.start()
+    odometry.move(pose(z=3.0))
+    first, = told(steps, *odometry.move(pose(z=1.0)))
+    assert first.edge is None
+    assert first.pose[2, 3] == 4.0
+
+
+def test_while_the_camera_stands_motions_are_told_from_where_it_came_to_stand():
+    odometry, steps = Odometry(), Steps('optical')
+    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    for _ in range(3):
+        standing, = told(steps, *odometry.move(np.eye(4), standing=True))
+        assert standing.standing
+    step, = told(steps, *odometry.move(pose(x=0.5)))
+    assert (step.standing, step.edge.kind) == (False, 'odometry')
+    assert np.allclose(step.edge.covariance, np.diag(SIGMAS**2), atol=2e-9)
+
+
+def test_nothing_is_known_of_a_motion_over_a_gap():
+    odometry, steps = Odometry(), Steps('optical')
+    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    odometry.lose_track()
+    step, = told(steps, odometry.start())
+    assert (step.edge.kind, step.anew) == ('unknown', True)
+    assert np.array_equal(step.edge.covariance, UNKNOWN_MOTION)
+    after, = told(steps, *odometry.move(pose(z=1.0)))
+    assert after.edge.kind == 'odometry'
+
+
+def test_the_covariance_tells_that_the_odometry_had_lost_track():
+    """The next good pair is told from a frame of which nothing was published."""
+    odometry, steps = Odometry(), Steps('optical')
+    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    odometry.lose_track()
+    step, = told(steps, *odometry.move(pose(z=1.0)))
+    assert (step.edge.kind, step.anew) == ('unknown', False)
+    after, = told(steps, *odometry.move(pose(z=1.0)))
+    assert after.edge.kind == 'odometry'
+
+
+@pytest.mark.parametrize('lost', [0, 1])
+def test_a_message_that_never_came_leaves_a_hole_which_is_counted(lost):
+    odometry, steps = Odometry(), Steps('optical')
+    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    told(steps, odometry.move(pose(z=2.0))[1 - lost])
+    step, = told(steps, *odometry.move(pose(z=1.0)))
+    assert step.edge.kind == 'unknown'
+    assert np.allclose(step.edge.motion, pose(z=3.0))
+    assert steps.missing == (lost == 0)
+
+
+def test_a_length_that_nobody_knows_is_told_by_its_covariance():
+    odometry, steps = Odometry(), Steps('optical')
+    wide = np.diag(SIGMAS**2)
+    wide[2, 2] = 1e6
+    step = told(steps, odometry.start(), *odometry.move(pose(z=1.0), wide))[-1]
+    assert (step.edge.kind, step.edge.scale_known) == ('odometry', False)
+    # nor do its sums look like a hole
+    for _ in range(50):
+        step, = told(steps, *odometry.move(pose(z=1.0, yaw=0.05), wide))
+        assert step.edge.kind == 'odometry'
+
+
+# The map
+
+@pytest.fixture(scope='module')
+def live():
+    """Give the class, for which GTSAM must be installed."""
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.slam.live import LiveSlam
+    return LiveSlam
+
+
+QUICK = LiveSlamConfig(keyframe_distance=0.5, loop_gap=0.5, optimise_period=0.0, path_period=0.0)
+FEW_FEATURES = from_flat({'estimator.max_features': 800})
+
+
+class Drive:
+    """A way past cards, as an odometry that drifts to the right tells it."""
+
+    def __init__(self, live, config=FEW_FEATURES, slam=QUICK, drift=0.01):
+        self.slam = live(config, slam, message_type, 'image_rect')
+        self.slam.camera_info(camera_info(K, SIZE))
+        self.odometry = Odometry(config.odometry.frame_convention)
+        self._cards, self._drift, self._frame = Cards(), pose(x=drift), 0
+        self._true = np.eye(4)
+        self.true, self.told, self.corrections, self.path = {}, {}, {}, None
+
+    def start(self, place=REST):
+        """Begin, or begin anew, at a place."""
+        self._true = place
+        return self._take(lambda: (self.odometry.start(),))
+
+    def go(self, place, *, seen=True):
+        """Go to a place; give what comes of it."""
+        motion = np.linalg.inv(self._true) @ place
+        self._true = place
+        return self._take(lambda: self.odometry.move(motion @ self._drift), seen)
+
+    def _take(self, messages, seen=True):
+        stamp = self.odometry.stamp
+        if seen:
+            self._frame += 1
+            self.slam.image(image(self._cards.gray(self._true, noise=self._frame),
+                                  stamp_ns=stamp))
+        outgoing = []
+        for message in messages():
+            is_odometry = hasattr(message, 'twist')
+            outgoing += (self.slam.odometry(message) if is_odometry
+                         else self.slam.relative_pose(message))
+            if is_odometry:
+                self.told[stamp] = pose_of(message)[1]
+        self.true[stamp] = self._true
+        while not self.slam.idle:
+            outgoing += self.slam.work()
+        for topic, message in outgoing:
+            if topic == '/tf':
+                transform, = message.transforms
+                self.corrections[stamp] = pose_of(transform)[1]
+            elif topic == 'path':
+                self.path = message
+        return outgoing
+
+    @property
+    def said(self):
+        """Values of its diagnostics, as they are now."""
+        message = self.slam.diagnostics(0).message
+        return {pair.key: pair.value for pair in message.status[0].values}
+
+    def to_and_fro(self, steps=8):
+        """Go 2 m to the right on a curve, and back."""
+        ways = [0.25 * i for i in (*range(steps + 1), *range(steps - 1, -1, -1))]
+        self.start()
+        for way in ways[1:]:
+            self.go(pose(x=way, z=0.3 * way**2))
+
+    def errors(self):
+        """Distances from the truth of the path's poses, by odometry and as optimised."""
+        pairs = [pose_of(one) for one in self.path.poses]
+        return [np.array([np.linalg.norm((poses[stamp] - self.true[stamp])[:3, 3])
+                          for stamp, _ in pairs]) for poses in (self.told, dict(pairs))]
+
+
+@pytest.fixture(scope='module')
+def driven(live):
+    drive = Drive(live)
+    drive.to_and_fro()
+    return drive
+
+
+def test_closing_a_loop_takes_the_drift_away(driven):
+    before, after = driven.errors()
+    assert before.max() > 0.12
+    assert after.max() < before.max() / 3
+    assert int(driven.said['loops']) >= 3
+    assert driven.said['state'] == 'mapping'
+
+
+def test_map_to_odom_and_odom_to_camera_make_the_optimised_pose(driven):
+    """As REP 105 has it: nobody but the odometry says where the camera is in its frame."""
+    optimised = dict(pose_of(one) for one in driven.path.poses)
+    newest = max(optimised)
+    correction = driven.slam.map.correction
+    assert np.abs(correction - np.eye(4)).max() > 0.05
+    assert np.allclose(correction @ driven.told[newest], optimised[newest], rtol=0, atol=1e-9)
+    # at all times: each was valid until the next optimisation
+    assert driven.corrections.keys() == driven.told.keys()
+    changes = np.diff([driven.corrections[stamp] for stamp in sorted(driven.corrections)], axis=0)
+    assert 0 < np.count_nonzero(np.abs(changes).max((1, 2))) <= int(driven.said['optimisations'])
+
+
+def test_the_messages_name_their_frames_and_carry_the_stamps_of_the_images(live):
+    drive = Drive(live)
+    drive.start()
+    outgoing = dict(drive.go(pose(x=1.0)))
+    transform, = outgoing['/tf'].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
+    assert pose_of(transform)[0] == START + PERIOD
+    assert outgoing['path'].header.frame_id == 'map'
+    assert [pose_of(one)[0] for one in outgoing['path'].poses] == [START, START + PERIOD]
+
+
+def test_with_body_axes_the_map_is_the_same_along_other_axes(live, driven):
+    drive = Drive(live, from_flat({'estimator.max_features': 800,
+                                   'odometry.frame_convention': 'body'}))
+    drive.to_and_fro()
+    axes = np.eye(4)
+    axes[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    for ours, theirs in zip(drive.path.poses, driven.path.poses, strict=True):
+        assert np.allclose(pose_of(ours)[1], axes @ pose_of(theirs)[1] @ axes.T, atol=1e-6)
+
+
+def test_an_odometry_that_begins_anew_is_put_where_it_was_and_then_where_it_belongs(live):
+    """After a reset of vo_node: another odometry frame, and a motion of which nothing is known."""
+    drive = Drive(live, drift=0.0)
+    drive.start()
+    for i in range(1, 7):
+        drive.go(pose(x=0.5 * i))
+    drive.odometry.reset()
+    drive.start(pose(x=2.0))
+    newest = pose_of(drive.path.poses[-1])[1]
+    assert np.allclose(newest, pose(x=3.0), atol=0.02)
+    for i in range(5):
+        drive.go(pose(x=1.6 - 0.4 * i))
+    assert drive.said['unknown motions'] == '1'
+    assert int(drive.said['loops']) >= 2
+    # in the map's first frame, by loops alone
+    _, after = drive.errors()
+    assert after.max() < 0.1
+
+
+def test_a_step_back_in_time_begins_everything_anew(live):
+    drive = Drive(live)
+    drive.start()
+    drive.go(pose(x=1.0))
+    drive.odometry.stamp = START - 10**9
+    drive.odometry.reset()
+    drive.start()
+    assert [pose_of(one)[0] for one in drive.path.poses] == [START - 10**9]
+    assert drive.said['keyframes'] == '1'
+    assert np.array_equal(drive.corrections[START - 10**9], np.eye(4))
+
+
+def test_the_memory_is_bounded(live):
+    drive = Drive(live, slam=replace(QUICK, max_keyframes=7, image_buffer=3))
+    drive.to_and_fro()
+    for i in range(1, 9):
+        drive.go(pose(x=0.25 * i, z=0.3 * (0.25 * i)**2))
+    graph = drive.slam.map
+    assert len(graph.keyframes) == 7
+    assert graph.first >= 4
+    assert drive.said['keyframes forgotten'] == str(graph.first)
+    ends = {end for edge in graph.edges for end in (edge.source, edge.target)}
+    assert ends == set(range(graph.first, graph.first + 7))
+    before, after = drive.errors()
+    assert after.max() < before.max()
+
+
+@pytest.mark.parametrize(('source', 'target'), [(0, 2), (2, 0)])
+def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target):
+    """With the forgotten one held relative to its heir, an edge costs what it cost before."""
+    from djet_ros.slam.backend import factor_graph, initial_values
+    from djet_ros.slam.live_map import inherited
+    rng = np.random.default_rng(3)
+    poses = np.array([pose(), pose(x=0.3, z=2.0, yaw=0.4), pose(x=-1.0, z=3.0, yaw=-0.7)])
+    spread = rng.normal(size=(6, 6)) * 0.1
+    told = Edge(source, target, np.linalg.inv(poses[source]) @ poses[target],
+                spread @ spread.T + np.eye(6) * 1e-3, 'loop')
+    ours = inherited(told, 0, np.linalg.inv(poses[0]) @ poses[1])
+    assert {ours.source, ours.target} == {1, 2}
+    for _ in range(5):
+        moved = poses.copy()
+        moved[2] = moved[2] @ pose(*rng.normal(size=4) * 1e-3)
+        costs = [factor_graph(PoseGraph(np.arange(3), poses, (edge,))).error(
+            initial_values(moved)) for edge in (told, ours)]
+        assert costs[0] > 0
+        assert costs[1] == pytest.approx(costs[0], rel=0.01)
+
+
+def test_only_a_frame_whose_image_is_there_becomes_a_keyframe(live):
+    drive = Drive(live)
+    drive.start()
+    drive.go(pose(x=0.6), seen=False)
+    assert drive.said['keyframes'] == '1'
+    drive.go(pose(x=0.7))
+    assert (drive.said['keyframes'], drive.said['keyframes without image']) == ('2', '1')
+    edge, = drive.slam.map.edges
+    assert np.allclose(edge.motion, np.linalg.inv(drive.told[START]) @ drive.odometry.here)
+
+
+def test_diagnostics_come_once_a_second_and_when_the_state_changes(live):
+    drive = Drive(live)
+    times = []
+    for i in range(25):
+        stamp = drive.odometry.stamp
+        for topic, message in drive.start() if i == 0 else drive.go(pose(x=0.1 * i)):
+            if topic == '/diagnostics':
+                times.append((stamp - START) / 1e9)
+                assert message.status[0].name == 'djet_ros: pose graph'
+    assert times == [0.0, 1.0, 2.0]
+
+
+def test_it_says_what_it_waits_for(live):
+    slam = live(Config(), QUICK, message_type)
+    assert slam.state == ('WARN', 'waiting for odometry')
+    odometry = Odometry()
+    slam.odometry(odometry.start())
+    assert slam.state == ('WARN', 'waiting for camera_info')
+    slam.camera_info(camera_info(K, SIZE))
+    for message in odometry.move(pose(z=1.0)):
+        outgoing = slam.odometry(message) if hasattr(message, 'twist') \
+            else slam.relative_pose(message)
+        assert '/tf' not in dict(outgoing)
+    assert slam.state == ('WARN', 'waiting for the images of the odometry')
+
+
+def test_messages_that_say_nothing_are_counted_and_named_and_leave_a_hole(live):
+    drive = Drive(live)
+    drive.start()
+    relative, odometry = drive.odometry.move(pose(x=1.0))
+    relative.pose.covariance[:] = 0
+    drive.slam.relative_pose(relative)
+    drive.slam.odometry(odometry)
+    assert drive.slam.state == ('ERROR', 'message rejected')
+    assert 'odometry edge' in str(drive.slam.problem)
+    assert f'{START + PERIOD} ns' in str(drive.slam.problem)
+    relative, odometry = drive.odometry.move(pose(x=1.0))
+    odometry.pose.pose.position.x = float('nan')
+    drive.slam.relative_pose(relative)
+    drive.slam.odometry(odometry)
+    drive.slam.camera_info(camera_info(K, SIZE, k=np.zeros(9), p=np.zeros(12)))
+    assert drive.slam.rejected.total() == 3
+    drive.slam.camera_info(camera_info(K, SIZE))
+    drive.go(pose(x=1.0))
+    assert drive.slam.state == ('OK', 'mapping')
+    assert [edge.kind for edge in drive.slam.map.edges] == ['unknown']
+
+
+# A rendered loop, with the real odometry
+
+def test_on_a_block_driven_twice_the_error_shrinks_by_a_factor(live, tmp_path):
+    """With small images, on which the odometry drifts a lot; lengths are the true ones."""
+    folder = render_sequence('loop', tmp_path, size=(310, 94))
+    config = from_flat({'odometry.scale': 'ground_truth', 'odometry.scale_uncertainty': 0.01,
+                        'estimator.max_features': 800})
+    source = open_source(folder)
+    truth = dict(pose_of(one.message)
+                 for one in source.messages({source.ground_truth_topic}))
+    lengths = GroundTruthScale(np.array([*truth]),
+                               np.array([one[:3, 3] for one in truth.values()]), 0.01)
+    tracker = Tracker(config, message_type, lengths, source.image_topic)
+    slam = live(config, LiveSlamConfig(), message_type, source.image_topic)
+    before, path = {}, None
+    for topic, _, message in source.messages({source.image_topic, source.info_topic}):
+        if topic == source.info_topic:
+            tracker.camera_info(message)
+            slam.camera_info(message)
+        elif topic == source.image_topic:
+            slam.image(message)
+            for name, said in tracker.image(message):
+                if name == 'relative_pose_cov':
+                    slam.relative_pose(said)
+                elif name == 'odometry':
+                    before.update([pose_of(said)])
+                    slam.odometry(said)
+            while not slam.idle:
+                slam.work()
+    path = dict(slam.work(at_once=True))['path']
+    after = dict(pose_of(one) for one in path.poses)
+
+    def error(poses):
+        positions = np.array([poses[stamp][:3, 3] for stamp in after])
+        true = np.array([truth[stamp][:3, 3] for stamp in after])
+        return position_rmse(aligned(positions, true, scaled=False), true)
+
+    assert len(before) == 427
+    assert error(after) < error(before) / 5
