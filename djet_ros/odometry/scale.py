@@ -25,6 +25,9 @@ UNKNOWN_LENGTH_SIGMA = 1e3
 # A speed or a position older than this says nothing any more.
 _LONGEST_HOLD_NS = 500_000_000
 
+# Metres per second that no camera goes; squares of what a broken sensor sends may be infinite.
+_FASTEST = 1e5
+
 # Speeds kept for intervals that are still to come.
 _KEPT_SPEEDS = 10_000
 
@@ -99,8 +102,9 @@ class SpeedScale:
         self.reset()
 
     def add(self, stamp_ns: int, metres_per_second: float) -> None:
-        """Take a measured speed; one that isn't finite or is earlier than the last is ignored."""
-        if not np.isfinite(metres_per_second) or (self._stamps and stamp_ns <= self._stamps[-1]):
+        """Take a measured speed; one beyond any sense or earlier than the last is ignored."""
+        if not abs(metres_per_second) <= _FASTEST \
+                or (self._stamps and stamp_ns <= self._stamps[-1]):
             return
         self._stamps.append(stamp_ns)
         self._speeds.append(abs(float(metres_per_second)))

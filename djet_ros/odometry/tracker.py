@@ -8,6 +8,7 @@ in the same order give the same poses everywhere.
 from __future__ import annotations
 
 from collections import deque
+import math
 from typing import Any, NamedTuple
 
 from djet_ros.config import Config
@@ -19,7 +20,6 @@ from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource, SpeedScale
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
-import numpy as np
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
 
@@ -163,8 +163,7 @@ class Tracker:
         if isinstance(self._scale, SpeedScale):
             linear = (message.twist.twist if hasattr(message.twist, 'twist')
                       else message.twist).linear
-            self._scale.add(stamp_ns(message.header),
-                            float(np.linalg.norm([linear.x, linear.y, linear.z])))
+            self._scale.add(stamp_ns(message.header), math.hypot(linear.x, linear.y, linear.z))
 
     def count_dropped(self, reason: str, number: int = 1) -> None:
         """Count images that a face received and did not hand on."""
