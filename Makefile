@@ -2,6 +2,8 @@
 
 VENV := .venv
 LOWEST := .venv-lowest
+AUDIT := .venv-audit
+FUZZ_SECONDS ?= 30
 SEQUENCE ?=
 PYTEST := python -m pytest -n auto --dist loadfile
 
@@ -14,7 +16,7 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint lowest clean
+.PHONY: demo test lint lowest fuzz audit clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
@@ -31,8 +33,16 @@ lint: $(VENV)/.installed-lint
 lowest: $(LOWEST)/.installed-test
 	$(LOWEST)/bin/$(PYTEST)
 
+# everything that reads what strangers made, for FUZZ_SECONDS each
+fuzz: $(VENV)/.installed-fuzz
+	$(VENV)/bin/python test/fuzz.py --seconds $(FUZZ_SECONDS)
+
+# known vulnerabilities in the newest versions that setup.py allows, the extras' too
+audit: $(AUDIT)/.installed
+	$(AUDIT)/bin/python .ci/audit.py
+
 clean:
-	rm -rf $(VENV) $(LOWEST) build demo *.egg-info
+	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info
 
 $(VENV)/.installed: setup.py | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .
@@ -40,6 +50,10 @@ $(VENV)/.installed: setup.py | $(VENV)/bin/pip
 
 $(VENV)/.installed-%: setup.py | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable '.[$*]'
+	touch $@
+
+$(AUDIT)/.installed: setup.py | $(AUDIT)/bin/pip
+	$(AUDIT)/bin/pip install --quiet --editable '.[audit,cluster,dds,peers,slam]'
 	touch $@
 
 $(LOWEST)/.installed-test: setup.py test/lowest.txt | $(LOWEST)/bin/pip

@@ -37,6 +37,10 @@ setup(
         'scipy>=1.11.2,<2',
     ],
     extras_require={
+        # `make audit`
+        'audit': [
+            'pip-audit>=2.9,<3',
+        ],
         # `djet evaluate --scheduler`
         'cluster': [
             'distributed>=2024.5,<2027',
@@ -44,6 +48,10 @@ setup(
         # `djet live`, `djet play`, `djet echo`
         'dds': [
             'cyclonedds>=11.0.1,<12',
+        ],
+        # `make fuzz`
+        'fuzz': [
+            'atheris>=3.0,<4',
         ],
         # what `djet evaluate` compares with
         'peers': [

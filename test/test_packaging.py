@@ -13,12 +13,14 @@ from xml.etree import ElementTree
 
 import djet_ros
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.egg-info', 'build', 'demo', 'install',
-                                    'log')
+NODES = ('vo_node', 'pose_graph_node')
+NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.egg-info', 'build', 'demo', 'fuzz',
+                                    'install', 'log')
 COLCON = Path(sys.executable).with_name('colcon')
 
 needs_colcon = pytest.mark.skipif(not COLCON.exists(), reason=f'no {COLCON}')
@@ -88,7 +90,8 @@ def shares_its_files(prefix: Path) -> bool:
 def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
     assert run(environment / 'bin' / 'djet', '--version', cwd=environment) == (
         f'djet_ros {djet_ros.__version__}\n')
-    assert (environment / 'bin' / 'vo_node').exists()
+    for node in NODES:
+        assert (environment / 'bin' / node).exists()
     assert not (environment / 'lib' / 'djet_ros').exists()
     assert shares_its_files(environment)
 
@@ -96,7 +99,7 @@ def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
 @needs_colcon
 def test_colcon_puts_the_commands_where_ros2_run_looks(workspace: Path) -> None:
     prefix = workspace / 'install' / 'djet_ros'
-    assert {path.name for path in (prefix / 'lib' / 'djet_ros').iterdir()} == {'djet', 'vo_node'}
+    assert {path.name for path in (prefix / 'lib' / 'djet_ros').iterdir()} == {'djet', *NODES}
     assert not (prefix / 'bin').exists()
     assert shares_its_files(prefix)
 
@@ -147,3 +150,36 @@ def test_every_dependency_is_bounded_and_the_lower_bounds_are_tested(
             lower[requirement.name] = Version(bounds['>='])
     pins = re.findall('^(.+)==(.+)$', (ROOT / 'test' / 'lowest.txt').read_text(), re.MULTILINE)
     assert {name: Version(version) for name, version in pins} == lower
+
+
+def test_the_readme_lists_every_dependency_with_its_bounds(distribution: Distribution) -> None:
+    listed = {}
+    for name, extra, versions, reason in re.findall(
+            r'^\| `([^`]+)`(?:, extra `(\w+)`)? \| (>=\S+) \| (.+) \|$',
+            (ROOT / 'README.md').read_text(), re.MULTILINE):
+        assert len(reason) > 4
+        listed[name.lower(), extra] = SpecifierSet(versions)
+    needed = {}
+    for requirement in map(Requirement, distribution.requires or []):
+        extra = re.search(r'extra == .(\w+)', str(requirement.marker))
+        if not extra or extra[1] not in ('test', 'lint'):
+            needed[requirement.name.lower(), extra[1] if extra else ''] = requirement.specifier
+    assert listed == needed
+
+
+def test_the_audit_takes_a_package_that_nobody_knows_for_no_good_news(tmp_path: Path) -> None:
+    answers = {'clean': '{"dependencies": [{"name": "a", "version": "1", "vulns": []}]}',
+               'unknown': '{"dependencies": [{"name": "a", "skip_reason": "not found"}]}',
+               'bad': '{"dependencies": [{"name": "a", "version": "1", "vulns": [{"id": "X-1", '
+                      '"fix_versions": ["2"]}]}]}',
+               'silent': ''}
+    codes = {}
+    for name, answer in answers.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / 'python').symlink_to(sys.executable)
+        (folder / 'pip-audit').write_text(f"#!/bin/sh\necho '{answer}'\n")
+        (folder / 'pip-audit').chmod(0o755)
+        codes[name] = subprocess.run([folder / 'python', ROOT / '.ci' / 'audit.py'], check=False,
+                                     capture_output=True).returncode
+    assert codes == {'clean': 0, 'unknown': 3, 'bad': 1, 'silent': 3}
