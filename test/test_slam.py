@@ -3,8 +3,10 @@
 from dataclasses import replace
 import json
 import os
+import resource
 import subprocess
 import sys
+import tracemalloc
 
 from cards import Cards, K, pose
 import cv2
@@ -16,9 +18,11 @@ from djet_ros.data.pose_graph import Edge, PoseGraph
 from djet_ros.data.trajectories import read_tum
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.images import Seen, SeenFile
 from djet_ros.slam.keyframes import choose_keyframes
 from djet_ros.slam.loops import EdgeFinder, transferred_length
 from djet_ros.slam.places import PlaceIndex
@@ -166,6 +170,73 @@ def test_votes_come_from_all_keyframes_however_many_there_are(features):
     assert places.votes(features[3], 150)[64:].tolist() == ([*few] * 50)[64:]
 
 
+# Where keyframes are kept
+
+def test_a_file_gives_back_the_keyframes_that_were_put_there():
+    cards, estimator = Cards(), TwoViewEstimator()
+    frames = [cards.frame(0.1 * i, pose(x=0.2 * i)) for i in range(4)]
+    seen = [Seen(frame, estimator.features(frame.gray)) for frame in frames]
+    with SeenFile() as file:
+        file.update(enumerate(seen))
+        del file[1]
+        assert [*file] == [0, 2, 3]
+        for number in (3, 0, 2):
+            frame, features = file[number].frame, file[number].features
+            assert (frame.stamp_ns, frame.frame_id) == (
+                frames[number].stamp_ns, frames[number].frame_id)
+            assert np.array_equal(frame.gray, frames[number].gray)
+            assert np.array_equal(frame.K, K)
+            for name, kept in vars(seen[number].features).items():
+                assert np.array_equal(getattr(features, name), kept), name
+
+
+def test_keyframes_in_a_file_take_no_memory():
+    gray = np.random.default_rng(0).integers(0, 256, (400, 1000), np.uint8)
+    seen = Seen(Frame(gray, K, 1), TwoViewEstimator().features(gray))
+    tracemalloc.start()
+    with SeenFile() as file:
+        for number in range(50):
+            file[number] = seen
+        kept, _ = tracemalloc.get_traced_memory()
+        assert kept < 50 * 2000
+        assert np.array_equal(file[49].frame.gray, gray)
+    tracemalloc.stop()
+
+
+def test_a_folder_without_room_is_said(tmp_path):
+    with pytest.raises(DjetError, match='nowhere'):
+        SeenFile(tmp_path / 'nowhere')
+    with SeenFile(tmp_path) as file, pytest.raises(DjetError, match='make room'):
+        # as long as a file may be, as on a full disk
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+            frame = Cards().frame(0.1)
+            file[0] = Seen(frame, TwoViewEstimator().features(frame.gray))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
+    cards = Cards()
+    poses = [pose(x=0.5 * i) for i in (*range(4), *range(2, -1, -1))]
+    graph = chain(np.array(poses))
+    found = []
+    with SeenFile() as file:
+        for kept in (None, file):
+            finder = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25), kept)
+            edges = []
+            for i, (here, before) in enumerate(zip(poses, (None, *graph.edges))):
+                finder.add(cards.frame(1 + 0.1 * i, here, noise=i), before)
+                edges += finder.loops(i)
+            found.append(edges)
+    assert len(found[0]) >= 3
+    for edge, other in zip(*found, strict=True):
+        assert (edge.source, edge.target) == (other.source, other.target)
+        assert np.array_equal(edge.motion, other.motion)
+        assert np.array_equal(edge.covariance, other.covariance)
+
+
 # Lengths of loops
 
 def seen(points, motion, noise=0.0, seed=0):
@@ -199,6 +270,18 @@ def test_the_length_of_a_loop_is_told_by_the_depths_of_a_step(points, motion):
     noisy = transferred_length(seen(points, step, 0.3, 1), seen(points, motion, 0.3, 2), known, K)
     assert abs(noisy.value - true) < 2 * noisy.sigma
     assert exact.sigma < noisy.sigma < true
+
+
+def test_lengths_of_loops_err_as_much_as_they_say(points):
+    step, motion = pose(z=-1.0, yaw=0.02), pose(x=0.3, z=1.2, yaw=0.05)
+    true, errors = np.linalg.norm(motion[:3, 3]), []
+    for seed in range(100):
+        told = transferred_length(seen(points, step, 0.3, 2 * seed),
+                                  seen(points, motion, 0.3, 2 * seed + 1),
+                                  Length(1.0, 1e-6, True), K)
+        errors.append((told.value - true) / told.sigma)
+    # Points here err independently, which those of images do not; and near ones less than far.
+    assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
 
 def test_a_length_is_unknown_where_too_few_points_are_shared(points):

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         config, frames = load_yaml(results / 'config.yaml'), read_results(results)
         with _bar('keyframes') as progress:
-            slam = run_slam(frames, source, config, parameters, progress)
+            slam = run_slam(frames, source, config, parameters, progress, args.output)
         truth = _truth(source).at(slam.frames.stamps_ns)
     finally:
         source.close()

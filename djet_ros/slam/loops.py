@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import rays, unit
 from djet_ros.core.hamming import smooth
-from djet_ros.core.types import Array, Features, RelativePose, Status, View
+from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.data.pose_graph import Edge
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
@@ -18,6 +18,7 @@ from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
 from djet_ros.slam.config import SlamConfig
+from djet_ros.slam.images import Seen
 from djet_ros.slam.places import PlaceIndex
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,10 @@ _SEARCH_RADIUS = 0.4
 # Points that two pairs of views must share, for the one to tell the other its length.
 _LEAST_SHARED = 20
 
+# Points in a cell of this side in pixels err together; and what correlation over longer distances
+# adds to the variance of a length: both as for the pose.
+_CELL, _INFLATION = 32, 4.0
+
 # Parallax in rad below which a depth is noise (about a pixel of a car's camera).
 _LEAST_PARALLAX = 1.5e-3
 
@@ -37,16 +42,17 @@ class EdgeFinder:
     """
     Estimates edges between keyframes from their images, which are kept until they are forgotten.
 
-    Keyframes have the numbers in which they come: 0, 1 and so on.
+    Keyframes have the numbers in which they come: 0, 1 and so on. seen: where their images and
+    features are kept; in memory unless said otherwise.
     """
 
-    def __init__(self, estimator: EstimatorConfig, config: SlamConfig) -> None:
+    def __init__(self, estimator: EstimatorConfig, config: SlamConfig,
+                 seen: MutableMapping[int, Seen] | None = None) -> None:
         self._config = config
         self._near = TwoViewEstimator(estimator)
         self._wide = TwoViewEstimator(replace(
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
-        self._frames: dict[int, Frame] = {}
-        self._features: dict[int, Features] = {}
+        self._seen: MutableMapping[int, Seen] = {} if seen is None else seen
         self._stamps: list[int] = []
         self._places = PlaceIndex()
         # The neighbour before each keyframe: the motion to it has a length.
@@ -56,18 +62,18 @@ class EdgeFinder:
     def add(self, frame: Frame, before: Edge | None = None) -> None:
         """Take the next keyframe, later than all others, and the edge from its neighbour."""
         number = self._first + len(self._stamps)
-        self._frames[number] = frame
-        self._features[number] = self._near.features(frame.gray)
+        features = self._near.features(frame.gray)
+        self._seen[number] = Seen(frame, features)
         self._stamps.append(frame.stamp_ns)
-        self._places.add(self._features[number])
+        self._places.add(features)
         if before is not None and before.kind == 'odometry':
             self._before[number] = before
 
     def forget(self, first: int) -> None:
         """Forget the keyframes before one; nothing is found between them and others any more."""
         for number in range(self._first, first):
-            for kept in (self._frames, self._features, self._before):
-                kept.pop(number, None)
+            self._seen.pop(number, None)
+            self._before.pop(number, None)
         del self._stamps[:first - self._first]
         self._first = first
         self._places.forget(first)
@@ -81,7 +87,7 @@ class EdgeFinder:
         motion, previous = np.eye(4), current
         for step in range(self._config.links):
             before = self._before.get(previous)
-            if before is None or before.source not in self._frames:
+            if before is None or before.source not in self._seen:
                 return
             motion, previous = before.motion @ motion, before.source
             if step:
@@ -97,7 +103,7 @@ class EdgeFinder:
         config, here = self._config, current - self._first
         latest = self._stamps[here] - config.loop_gap * 1e9
         before = self._first + bisect_left(self._stamps, latest, hi=here)
-        votes = self._places.votes(self._features[current], before)
+        votes = self._places.votes(self._seen[current].features, before)
         votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
         for place in best[votes[best] >= config.loop_votes].tolist():
@@ -116,7 +122,7 @@ class EdgeFinder:
         """Length of a loop's translation, by the points that the last step of the way saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
-        if step is None or step.source not in self._frames or not step.scale_known or not guess:
+        if step is None or step.source not in self._seen or not step.scale_known or not guess:
             return unknown(guess)
         if relative.status is Status.NO_PARALLAX:
             # The same place again: nearer than any step, in whatever direction.
@@ -133,9 +139,10 @@ class EdgeFinder:
                 and inliers >= self._config.loop_share * len(relative.x))
 
     def _view(self, keyframe: int) -> View:
-        frame = self._frames[keyframe]
+        seen = self._seen[keyframe]
+        frame = seen.frame
         # A copy of the features: what they cache of themselves is large.
-        return View(frame.gray, frame.K, replace(self._features[keyframe]), smooth(frame.gray))
+        return View(frame.gray, frame.K, replace(seen.features), smooth(frame.gray))
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
@@ -155,11 +162,14 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
     if len(ratios) < _LEAST_SHARED:
         return unknown(length.value)
     ratio = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
     if ratio <= 0:
         return unknown(length.value)
+    # Standard deviation of a median, if places apart err independently: as for the pose.
+    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
+    places = len(np.unique(step.x[step.inliers][here][told] // _CELL, axis=0))
+    sigma = 1.2533 * spread * np.sqrt(_INFLATION / places)
     return Length(length.value * ratio,
-                  float(np.hypot(length.value * spread, length.sigma * ratio)), length.known)
+                  float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
 
 
 def _pixels(relative: RelativePose) -> NDArray[np.int64]:

@@ -84,10 +84,11 @@ class _Block:
         self.first, self.end = first, first + len(keyframes)
         self._descriptors = np.concatenate(keyframes)
         self._owner = np.repeat(np.arange(len(keyframes)), [*map(len, keyframes)])
-        self._tables = []
+        self._tables: list[tuple[NDArray[np.uint16], NDArray[np.uint16]]] = []
         for keys in _keys(self._descriptors):
             order = np.argsort(keys, kind='stable')
-            self._tables.append((keys[order], order))
+            # A block has fewer descriptors than two bytes can count.
+            self._tables.append((keys[order], order.astype(np.uint16)))
 
     def votes(self, asking: NDArray[np.uint8]) -> Index:
         """Count for each keyframe which of the descriptors (N, 32) have a near one there."""
@@ -111,8 +112,8 @@ class _Block:
         return mine, found
 
 
-def _keys(descriptors: NDArray[np.uint8]) -> Iterator[Index]:
+def _keys(descriptors: NDArray[np.uint8]) -> Iterator[NDArray[np.uint16]]:
     """Buckets (N,) of descriptors (N, 32) in each table."""
     bits = np.unpackbits(descriptors, axis=1)
     for part in _CHOSEN:
-        yield bits[:, part].astype(np.int64) @ (1 << np.arange(_BITS))
+        yield bits[:, part].astype(np.uint16) @ (1 << np.arange(_BITS)).astype(np.uint16)

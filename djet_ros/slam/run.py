@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from djet_ros.config import Config
 from djet_ros.core.types import Array
@@ -11,7 +12,7 @@ from djet_ros.data.pose_graph import PoseGraph
 from djet_ros.data.sources import Source
 from djet_ros.slam.backend import optimise, Solution
 from djet_ros.slam.config import SlamConfig
-from djet_ros.slam.images import frames_at
+from djet_ros.slam.images import frames_at, SeenFile
 from djet_ros.slam.keyframes import choose_keyframes, Keyframes
 from djet_ros.slam.loops import EdgeFinder
 import numpy as np
@@ -50,23 +51,26 @@ class Slam:
 
 
 def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig,
-             progress: Callable[[int, int], None] | None = None) -> Slam:
+             progress: Callable[[int, int], None] | None = None,
+             scratch: Path | None = None) -> Slam:
     """
     Choose keyframes, find links and loops in the recording's images, and optimise.
 
     frames: the graph of the recording's replay with the configuration; progress is called with
-    (keyframes done, keyframes in all). Raises DjetError.
+    (keyframes done, keyframes in all); scratch: a folder with room for the images of the
+    keyframes, while it lasts. Raises DjetError.
     """
     keyframes = choose_keyframes(frames, slam)
     graph = keyframes.graph
-    finder = EdgeFinder(config.estimator, slam)
     edges = [*graph.edges]
     images = frames_at(source, config, graph.stamps_ns)
-    for number, (frame, before) in enumerate(zip(images, (None, *graph.edges))):
-        finder.add(frame, before)
-        edges += [*finder.links(number), *finder.loops(number)]
-        if progress is not None:
-            progress(number + 1, len(graph.poses))
+    with SeenFile(scratch) as seen:
+        finder = EdgeFinder(config.estimator, slam, seen)
+        for number, (frame, before) in enumerate(zip(images, (None, *graph.edges))):
+            finder.add(frame, before)
+            edges += [*finder.links(number), *finder.loops(number)]
+            if progress is not None:
+                progress(number + 1, len(graph.poses))
     return Slam(frames, keyframes, optimise(replace(graph, edges=tuple(edges))))
 
 
