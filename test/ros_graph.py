@@ -93,9 +93,9 @@ class Peer:
             assert value, f'{what} did not come; heard {counts}, last {said}'
         return value
 
-    def call(self, service: str) -> Any:
+    def call(self, service: str, node: str = NODE) -> Any:
         """Call a service of the node under test."""
-        return self.ask('call', service=f'{NODE}/{service}', kind='std_srvs/srv/Trigger')
+        return self.ask('call', service=f'{node}/{service}', kind='std_srvs/srv/Trigger')
 
     def kill(self) -> None:
         """End the process as a crash would."""
@@ -117,14 +117,15 @@ class Peer:
 class NodeProcess:
     """The node under test in a process of its own, with its log."""
 
-    def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any]) -> None:
+    def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any],
+                 module: str = 'djet_ros.ros.vo_node') -> None:
         """Start it with words for ROS, such as remappings, and with parameters by name."""
         self.path = log
         values = [word for name, value in parameters.items()
                   for word in ('-p', f'{name}:={json.dumps(value)}')]
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [sys.executable, '-m', 'djet_ros.ros.vo_node', '--ros-args', *words, *values],
+                [sys.executable, '-m', module, '--ros-args', *words, *values],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 
     @property

@@ -13,6 +13,8 @@ from time import monotonic, sleep
 from typing import Any
 
 from djet_ros.config import from_flat, load_yaml
+from djet_ros.errors import DjetError
+from djet_ros.slam.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
 import pytest
 import yaml
 
@@ -21,6 +23,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
 
 ARGUMENTS = {
     'vo.launch.py': {'image', 'camera_info', 'params_file', 'use_sim_time', 'rviz'},
+    'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'use_sim_time'},
     'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'rviz'},
 }
 
@@ -66,10 +69,12 @@ def environment(tmp_path: Path) -> dict[str, str]:
     share = tmp_path / 'share' / 'djet_ros'
     for folder in ('config', 'launch'):
         shutil.copytree(ROOT / folder, share / folder)
-    node = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
-    node.parent.mkdir(parents=True)
-    node.write_text(f'#!/bin/sh\nexec {sys.executable} -m djet_ros.ros.vo_node "$@"\n')
-    node.chmod(0o755)
+    commands = tmp_path / 'lib' / 'djet_ros'
+    commands.mkdir(parents=True)
+    for name in ('vo_node', 'pose_graph_node'):
+        node = commands / name
+        node.write_text(f'#!/bin/sh\nexec {sys.executable} -m djet_ros.ros.{name} "$@"\n')
+        node.chmod(0o755)
     return {**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}',
             'AMENT_PREFIX_PATH': f'{tmp_path}:{os.environ["AMENT_PREFIX_PATH"]}',
             'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_LOG_DIR': str(tmp_path / 'log')}
@@ -108,3 +113,32 @@ def test_replay_launch_plays_a_bag_into_a_node_that_drops_nothing(
     assert 'queue policy every' in said
     assert re.search(r'bag_player-\d\]: process (started|has died)', said)
     assert re.search(r'vo_node-\d\]: process has finished cleanly', said)
+
+
+@pytest.mark.ros
+def test_slam_launch_feeds_the_pose_graph_with_the_odometry(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    said = launched(environment, tmp_path / 'out', 'slam.launch.py', 'image:=/left/image_raw',
+                    until='odometry from')
+    assert re.search(r'odometry from /vo_node/odometry, images from /left/image_raw, '
+                     'camera_info from /left/camera_info', said)
+    assert 'unknown parameter' not in said
+    for node in ('vo_node-1', 'pose_graph_node-2'):
+        assert f'[{node}]: process has finished cleanly' in said
+
+
+def test_the_parameters_of_the_pose_graph_are_all_listed_with_their_defaults() -> None:
+    text = (ROOT / 'config' / 'slam.yaml').read_text()
+    assert text == dump_slam_yaml()
+    section, = yaml.safe_load(text).values()
+    assert slam_config({f'slam.{name}': value for name, value
+                        in section['ros__parameters']['slam'].items()}) == LiveSlamConfig()
+
+
+def test_a_parameter_of_the_pose_graph_is_refused_by_its_name() -> None:
+    assert slam_config({'slam.loop_gap': 5}) == LiveSlamConfig(loop_gap=5.0)
+    for name, value in (('slam.max_keyframes', 1), ('slam.links', 'two'),
+                        ('slam.publish_tf', 1), ('slam.loop_gap', float('nan'))):
+        with pytest.raises(DjetError, match=name):
+            slam_config({name: value})

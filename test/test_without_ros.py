@@ -13,12 +13,14 @@ import pytest
 PATHS = [path for path in sys.path if not (Path(path) / 'rclpy').exists()]
 
 
+@pytest.mark.parametrize('node', ['vo_node', 'pose_graph_node'])
 @pytest.mark.parametrize('words', [[], ['--help'], ['--ros-args', '-r', 'image:=/camera/image']])
-def test_the_node_says_in_one_line_what_is_missing(tmp_path: Path, words: list[str]) -> None:
+def test_the_nodes_say_in_one_line_what_is_missing(
+        tmp_path: Path, words: list[str], node: str) -> None:
     program = (f'import sys; sys.path[:] = {json.dumps(PATHS)}; '
-               'from djet_ros.ros.vo_node import main; sys.exit(main())')
+               f'from djet_ros.ros.{node} import main; sys.exit(main())')
     done = subprocess.run([sys.executable, '-c', program, *words], capture_output=True, text=True,
                           check=False, cwd=tmp_path)
     assert done.returncode == 2
     line, = done.stderr.splitlines()
-    assert line.startswith('vo_node: error: rclpy is missing: install ROS 2')
+    assert line.startswith(f'{node}: error: rclpy is missing: install ROS 2')

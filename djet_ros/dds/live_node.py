@@ -11,24 +11,20 @@ from typing import Any
 
 from djet_ros.config import Config
 from djet_ros.data.decoding import message_type
-from djet_ros.dds.graph import Graph, Profile, Publisher, Subscription
+from djet_ros.dds.graph import Graph, Profile, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
 from djet_ros.errors import DjetError
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.ros.session import Session
-
-OUTPUTS = {
-    'relative_pose': 'geometry_msgs/msg/PoseStamped',
-    'relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'odometry': 'nav_msgs/msg/Odometry',
-    'debug_image': 'sensor_msgs/msg/Image',
-    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
-    'path': 'nav_msgs/msg/Path',
-    '/tf': 'tf2_msgs/msg/TFMessage',
-}
-IMAGE_TYPES = {'raw': 'sensor_msgs/msg/Image', 'compressed': 'sensor_msgs/msg/CompressedImage'}
-INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+from djet_ros.ros.topics import (
+    full_name,
+    image_topics,
+    IMAGE_TYPES,
+    INFO_TYPE,
+    odometry_outputs,
+    SPEED_TYPES,
+)
 
 _TICK = 1.0
 _GARBAGE_LOG_PERIOD = 5.0
@@ -51,12 +47,12 @@ class LiveNode:
         self._names = names
         self._clock: int | None = None
         self._last_garbage = self._last_tick = -float('inf')
-        image, self._info_topic = _input_topics(names, config)
+        image, self._info_topic = image_topics(names.resolve, names.expand,
+                                               config.ros.image_transport)
         self._session = Session(Tracker(config, message_type, image_topic=image), self,
                                 {'image': image, 'camera_info': self._info_topic})
-        self._outputs = {topic: self._advertise(topic) for topic in OUTPUTS
-                         if not (topic == 'path' and not config.ros.publish_path)
-                         and not (topic == '/tf' and not config.ros.publish_tf)}
+        self._outputs = {topic: graph.advertise(names.resolve(full_name(topic)), kind)
+                         for topic, kind in odometry_outputs(config.ros).items()}
         self._inputs = self._listen(config, image, use_sim_time)
         self._images = self._inputs[-1]
         self._latched: Subscription | None = None
@@ -112,10 +108,6 @@ class LiveNode:
 
     # Inputs and outputs
 
-    def _advertise(self, topic: str) -> Publisher:
-        name = topic if topic.startswith('/') else f'~/{topic}'
-        return self._graph.advertise(self._names.resolve(name), OUTPUTS[topic])
-
     def _listen(self, config: Config, image: str, use_sim_time: bool) -> list[Subscription]:
         """Subscribe to all inputs, the images last: what belongs to one is taken before it."""
         every = config.ros.queue_policy == 'every'
@@ -125,9 +117,8 @@ class LiveNode:
         session, resolve = self._session, self._names.resolve
         inputs = [listen(self._info_topic, INFO_TYPE, session.camera_info)]
         if config.odometry.scale == 'speed':
-            inputs += [
-                listen(resolve('speed'), 'geometry_msgs/msg/TwistStamped', session.speed),
-                listen(resolve('speed_odometry'), 'nav_msgs/msg/Odometry', session.speed)]
+            inputs += [listen(resolve(topic), kind, session.speed)
+                       for topic, kind in SPEED_TYPES.items()]
         if use_sim_time:
             self._clock = 0
             inputs.append(self._graph.listen('/clock', 'rosgraph_msgs/msg/Clock',
@@ -179,19 +170,3 @@ class LiveNode:
                 self.log('error', f'incompatible QoS on {topic}: participant {who} offers '
                                   f'{offered}, {self._names.full_node} asks for {ours}. Nothing '
                                   'is received from it; set ros.qos_reliability')
-
-
-def _input_topics(names: Names, config: Config) -> tuple[str, str]:
-    """
-    Resolve the names of the images and of their CameraInfo.
-
-    As with image_transport, only the image's name needs to be remapped: camera_info is taken
-    beside it, and the compressed images below it.
-    """
-    image = names.resolve('image').removesuffix('/compressed')
-    info = names.resolve('camera_info')
-    if info == names.expand('camera_info'):
-        info = f'{image.rpartition("/")[0]}/camera_info'
-    if config.ros.image_transport == 'compressed':
-        image += '/compressed'
-    return image, info

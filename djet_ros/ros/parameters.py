@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+import difflib
 from importlib.util import find_spec
 from typing import Any
 
 from djet_ros.config import Config, flat, FlatParameter, from_flat, is_ros_own, with_values
 from djet_ros.errors import DjetError
+from djet_ros.slam.live_config import flat_slam, LiveSlamConfig, slam_config
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -20,6 +22,10 @@ from rclpy.parameter import Parameter
 # What a subscription or the queue was made with holds for its life.
 FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
          'ros.queue_size')
+
+# Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
+SHARED = ('preset', 'odometry.rectified', 'odometry.frame_convention', 'ros.image_transport',
+          'ros.qos_reliability')
 
 _KNOWN = flat(Config())
 
@@ -77,11 +83,35 @@ class Parameters:
             self.config = config
 
 
-def descriptor(item: FlatParameter) -> ParameterDescriptor:
+def graph_parameters(node: Node) -> tuple[Config, LiveSlamConfig]:
+    """
+    Declare the parameters of a pose graph, which hold for the node's life, and read them.
+
+    Those that it shares with the odometry may come from the same file. Raises DjetError where a
+    value can't be used; unknown names are only warned of.
+    """
+    given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
+    own = flat_slam(LiveSlamConfig())
+    for name in given:
+        if name not in own and name not in _KNOWN and not is_ros_own(name):
+            node.get_logger().warning(_refusal(name, own))
+    config = from_flat(_ours(given))
+    slam = slam_config({name: value for name, value in given.items() if name in own})
+    shared = [item for item in flat(config).values()
+              if item.name in SHARED or item.name.startswith('estimator.')]
+    for item in (*shared, *flat_slam(slam).values()):
+        if item.name in given:
+            node.undeclare_parameter(item.name)
+        node.declare_parameter(item.name, item.value, descriptor(item, read_only=True),
+                               ignore_override=True)
+    return config, slam
+
+
+def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDescriptor:
     """Describe a parameter to ROS: text, range, choices, and whether it can change."""
     says = item.description
     result = ParameterDescriptor(
-        description=says.text, read_only=item.name in FIXED,
+        description=says.text, read_only=read_only or item.name in FIXED,
         additional_constraints=f'one of: {", ".join(says.choices)}' if says.choices else '')
     if says.minimum is None or says.maximum is None:
         return result
@@ -105,8 +135,10 @@ def _live(config: Config) -> Config:
     return config
 
 
-def _refusal(name: str) -> str:
+def _refusal(name: str, own: Iterable[str] = ()) -> str:
     """Word why an unknown name is unknown."""
+    if near := difflib.get_close_matches(name, own, n=1, cutoff=0.8):
+        return f"unknown parameter '{name}'; did you mean '{near[0]}'?"
     try:
         from_flat({name: None})
     except DjetError as error:

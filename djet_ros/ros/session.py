@@ -61,6 +61,31 @@ class _Received(NamedTuple):
     at: float
 
 
+class Throttle:
+    """A log that says the same only now and then; for one thread at a time."""
+
+    def __init__(self, wiring: Wiring) -> None:
+        self._wiring = wiring
+        self._said: dict[str, float] = {}
+
+    def warn(self, key: str, text: str) -> None:
+        """Say something, unless what goes by the same key was said a short while ago."""
+        now = monotonic()
+        if now - self._said.get(key, -np.inf) >= _LOG_PERIOD:
+            self._said[key] = now
+            self._wiring.log('warning', text)
+
+    def warn_of_missing(self, what: str, topic: str) -> None:
+        """Say that nothing comes over a topic."""
+        count = self._wiring.count_publishers(topic)
+        self.warn(what, f'waiting for {what} on {topic}: ' + (
+            f'{count} publish it, none sends' if count else 'nobody publishes it'))
+
+    def clear(self) -> None:
+        """Forget what was said."""
+        self._said.clear()
+
+
 class Session:
     """
     Works on images in a thread of its own, in the order in which they come.
@@ -86,7 +111,7 @@ class Session:
         self._counted_drops = self._lost = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
-        self._logged: dict[str, float] = {}
+        self._log = Throttle(wiring)
         self._stopping = False
         self._worker = Thread(target=self._work, name='odometry', daemon=True)
 
@@ -141,7 +166,7 @@ class Session:
             self._queue.clear()
             self._speeds.clear()
             self._latencies.clear()
-            self._logged.clear()
+            self._log.clear()
             self._counted_drops, self._lost = self._queue.dropped, 0
             self._tracker.reset()
             self._say()
@@ -197,10 +222,7 @@ class Session:
     def _log_what_is_missing(self, silent: bool) -> None:
         without_info = self._newest_info is None and monotonic() - self._started > SILENCE
         for what in ['image'] * silent + ['camera_info'] * without_info:
-            topic = self._topics[what]
-            count = self._wiring.count_publishers(topic)
-            self._log_throttled(what, f'waiting for {what} on {topic}: ' + (
-                f'{count} publish it, none sends' if count else 'nobody publishes it'))
+            self._log.warn_of_missing(what, self._topics[what])
 
     # In the thread
 
@@ -235,9 +257,8 @@ class Session:
             self._counted_drops += new
             counts = self._tracker.counts
             self._tracker.count_dropped('queue_full', new)
-            self._log_throttled('queue_full', f'{counts.dropped["queue_full"]} of '
-                                f'{counts.received} images dropped: they come faster than they '
-                                'are worked on')
+            self._log.warn('queue_full', f'{counts.dropped["queue_full"]} of {counts.received} '
+                           'images dropped: they come faster than they are worked on')
 
     def _take_info(self, info: Any) -> None:
         if info is not self._taken_info:
@@ -271,11 +292,4 @@ class Session:
         if tracker.state in _SAID_ELSEWHERE or LEVELS[tracker.state] == 'OK':
             return
         summary = tracker.diagnosis().summary
-        self._log_throttled(summary, f'{summary}: {tracker.problem}' if tracker.problem
-                            else summary)
-
-    def _log_throttled(self, key: str, text: str) -> None:
-        now = monotonic()
-        if now - self._logged.get(key, -np.inf) >= _LOG_PERIOD:
-            self._logged[key] = now
-            self._wiring.log('warning', text)
+        self._log.warn(summary, f'{summary}: {tracker.problem}' if tracker.problem else summary)

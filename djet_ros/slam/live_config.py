@@ -48,12 +48,14 @@ def slam_config(values: Mapping[str, Any]) -> LiveSlamConfig:
     range.
     """
     known = flat_slam(LiveSlamConfig())
-    typed = {}
+    typed: dict[str, Any] = {}
     for name, value in values.items():
         kind = known[name].kind
-        if type(value) is not kind and not (kind is float and type(value) is int):
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
             raise DjetError(f'{name} is {value!r:.80}; it must be of type {kind.__name__}')
-        typed[name.removeprefix('slam.')] = kind(value)
+        typed[name.removeprefix('slam.')] = value
     try:
         return LiveSlamConfig(**typed)
     except ValueError as error:
@@ -62,7 +64,7 @@ def slam_config(values: Mapping[str, Any]) -> LiveSlamConfig:
 
 def dump_slam_yaml() -> str:
     """Write the default values as YAML in ROS's layout, each under its description."""
-    lines = ['# Parameters of pose_graph_node, beside those that it shares with vo_node (vo.yaml).',
+    lines = ['# Parameters of pose_graph_node, beside those it shares with vo_node (see vo.yaml).',
              '# Made from djet_ros/slam/live_config.py by its dump_slam_yaml.',
              '/**/pose_graph_node:', '  ros__parameters:', '    slam:']
     for item in flat_slam(LiveSlamConfig()).values():

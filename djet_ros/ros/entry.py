@@ -1,0 +1,58 @@
+"""How the commands of ROS 2 nodes begin and end."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from importlib.util import find_spec
+import signal
+import sys
+from threading import Event
+
+from djet_ros.threads import one_blas_thread
+
+_EPILOG = """\
+Topics, parameters and the rest are given as to every ROS node:
+  {name} --ros-args -r image:=/camera/image_raw --params-file vo.yaml
+"""
+
+
+def run_node(name: str, module: str, description: str, *, without_ros: str,
+             extra: tuple[str, str] | None = None) -> int:
+    """
+    Run the node of a module, by its ``run``, until SIGINT or SIGTERM; gives the exit code.
+
+    2 means something that the user can mend, said in one line; without_ros: what can be had
+    where ROS is missing; extra: a library that it needs, and the extra that brings it.
+    """
+    one_blas_thread()
+    stop = Event()
+    # First of all: the imports take their time, and end no worse than anything later.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if find_spec('rclpy') is None:
+        return _fail(name, "rclpy is missing: install ROS 2 and 'source "
+                           f"/opt/ros/jazzy/setup.bash'; {without_ros}")
+    if extra is not None and find_spec(extra[0]) is None:
+        return _fail(name, f"{extra[0]} is missing: pip install 'djet_ros[{extra[1]}]'")
+
+    from djet_ros.errors import DjetError, one_line
+    try:
+        run = import_module(module).run
+        from rclpy.utilities import remove_ros_args
+    except ImportError as error:
+        # Such as an rclpy that was built for another Python.
+        return _fail(name, f'this Python ({sys.executable}) lacks something: {one_line(error)}')
+    parser = argparse.ArgumentParser(
+        prog=name, description=description, epilog=_EPILOG.format(name=name),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args(remove_ros_args()[1:])
+    try:
+        return 0 if stop.is_set() else int(run(stop))
+    except DjetError as error:
+        return _fail(name, str(error))
+
+
+def _fail(name: str, reason: str) -> int:
+    print(f'{name}: error: {reason}', file=sys.stderr)
+    return 2

@@ -1,0 +1,209 @@
+"""The pose graph on a real ROS graph: camera, odometry, pose graph and listener are processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from time import sleep
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+from djet_ros.data.sources import pose_of
+from djet_ros.odometry.messages import stamp_ns
+import numpy as np
+import pytest
+from ros_graph import ENVIRONMENT, NodeProcess, Peer
+from ros_messages import camera_info, image
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(find_spec('rclpy') is None,
+                       reason='rclpy is missing: no ROS 2 is sourced here'),
+    pytest.mark.skipif(find_spec('gtsam') is None,
+                       reason='GTSAM is not installed: the extra slam')]
+
+IMAGE, INFO = '/camera/image_rect', '/camera/camera_info'
+PATH, ODOMETRY = '/pose_graph_node/path', '/vo_node/odometry'
+TYPES = {
+    PATH: 'nav_msgs/msg/Path',
+    ODOMETRY: 'nav_msgs/msg/Odometry',
+    '/tf': 'tf2_msgs/msg/TFMessage',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+STEP, PERIOD, START = 0.25, 100_000_000, 50 * 10**9
+WAYS = [STEP * i for i in (*range(9), *range(7, -1, -1))]
+ODOMETRY_PARAMETERS = {'estimator.max_features': 800, 'ros.queue_policy': 'every',
+                       'ros.publish_tf': True, 'odometry.scale': 'constant',
+                       'odometry.scale_value': STEP}
+SLAM_PARAMETERS = {'estimator.max_features': 800, 'slam.keyframe_distance': 0.4,
+                   'slam.loop_gap': 0.5, 'slam.path_period': 0.0, 'slam.optimise_period': 0.0}
+
+Heard = dict[str, list[Any]]
+
+
+@pytest.fixture(scope='module')
+def listener() -> Iterator[Peer]:
+    peer = Peer('listener')
+    for topic, kind in TYPES.items():
+        peer.listen(topic, kind)
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def camera() -> Iterator[Peer]:
+    peer = Peer('camera_driver')
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, listener: Peer) -> Iterator[Callable[..., NodeProcess]]:
+    """Give a function that starts a node by name; all have ended cleanly after the test."""
+    started: list[NodeProcess] = []
+
+    def start(name: str, **parameters: Any) -> NodeProcess:
+        one = NodeProcess(tmp_path / f'{name}.log', ['-r', f'image:={IMAGE}'], parameters,
+                          f'djet_ros.ros.{name}')
+        started.append(one)
+        return one
+
+    listener.heard.clear()
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            code, _ = one.end()
+            assert code == 0
+        assert 'Traceback' not in one.log, one.log
+
+
+def see(camera: Peer, ways: list[float], first: int = 0) -> None:
+    """Publish what the camera sees on its way."""
+    cards = Cards()
+    for i, way in enumerate(ways, first):
+        camera.send(IMAGE, image(cards.gray(pose(x=way), noise=i), stamp_ns=START + i * PERIOD))
+        sleep(0.05)
+
+
+def advertise(camera: Peer, listeners: int) -> None:
+    camera.advertise(INFO, 'sensor_msgs/msg/CameraInfo', listeners)
+    camera.advertise(IMAGE, 'sensor_msgs/msg/Image', listeners)
+    for _ in range(3):
+        camera.send(INFO, camera_info(K, SIZE))
+        sleep(0.1)
+
+
+def said(text: str) -> Callable[[Heard], Any]:
+    """Make the condition that the pose graph says something; its value is what it has."""
+    return lambda heard: next((
+        {pair.key: pair.value for pair in message.status[0].values}
+        for message in reversed(heard['/diagnostics'])
+        if message.status[0].name == 'djet_ros: pose graph'
+        and message.status[0].message == text), None)
+
+
+def transforms(heard: Heard, parent: str) -> dict[int, Any]:
+    return dict(pose_of(one) for message in heard['/tf'] for one in message.transforms
+                if one.header.frame_id == parent)
+
+
+def worst(poses: dict[int, Any]) -> float:
+    """Give the largest distance from the way, of poses by stamp."""
+    return max(float(np.linalg.norm(here[:3, 3] - [WAYS[(stamp - START) // PERIOD], 0, 0]))
+               for stamp, here in poses.items())
+
+
+@pytest.fixture
+def driven(listener: Peer, camera: Peer,
+           nodes: Callable[..., NodeProcess]) -> Iterator[NodeProcess]:
+    """Give the pose graph's process, after a way to the right and back."""
+    nodes('vo_node', **ODOMETRY_PARAMETERS)
+    graph = nodes('pose_graph_node', **SLAM_PARAMETERS)
+    listener.wait('both nodes', lambda heard: said('waiting for odometry')(heard), 60)
+    advertise(camera, 2)
+    see(camera, WAYS)
+    last = START + (len(WAYS) - 1) * PERIOD
+    listener.wait('the whole path', lambda heard: heard[PATH] and pose_of(
+        heard[PATH][-1].poses[-1])[0] == last, 60)
+    return graph
+
+
+def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:
+    values = listener.wait('loops', lambda heard: (found := said('mapping')(heard))
+                           and int(found['keyframes waiting']) == 0
+                           and int(found['loops']) >= 3 and found, 60)
+    assert values['relative poses missing'] == values['messages dropped'] == '0'
+    path = listener.heard[PATH][-1]
+    assert path.header.frame_id == 'map'
+    told = dict(pose_of(one) for one in listener.heard[ODOMETRY])
+    assert worst(dict(pose_of(one) for one in path.poses)) < worst(told)
+    # REP 105: odom -> camera is the odometry's alone, and map -> odom carries the correction
+    map_to_odom, odom_to_camera = (transforms(listener.heard, frame) for frame in ('map', 'odom'))
+    assert map_to_odom.keys() == odom_to_camera.keys() == told.keys()
+    for stamp in told:
+        assert np.allclose(told[stamp], odom_to_camera[stamp], atol=1e-12)
+    # the first path to a frame goes out with the frame's own correction
+    first = {}
+    for message in listener.heard[PATH]:
+        stamp, here = pose_of(message.poses[-1])
+        first.setdefault(stamp, here)
+    assert len(first) == len(WAYS)
+    for stamp, here in first.items():
+        assert np.allclose(map_to_odom[stamp] @ odom_to_camera[stamp], here, atol=1e-9)
+
+
+def test_a_reset_forgets_the_map_and_goes_on(
+        listener: Peer, camera: Peer, driven: NodeProcess) -> None:
+    listener.heard.clear()
+    assert camera.call('reset', '/pose_graph_node')['success']
+    listener.wait('the reset', said('waiting for odometry'))
+    listener.heard.clear()
+    see(camera, WAYS[1:6], len(WAYS))
+    path = listener.wait('a path', lambda heard: heard[PATH] and heard[PATH][-1])
+    assert min(stamp_ns(one.header) for one in path.poses) >= START + len(WAYS) * PERIOD
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(
+        driven: NodeProcess, number: signal.Signals) -> None:
+    code, seconds = driven.end(number)
+    assert code == 0
+    assert seconds < 5
+
+
+def test_what_is_missing_is_said_with_its_resolved_name(
+        listener: Peer, nodes: Callable[..., NodeProcess]) -> None:
+    graph = nodes('pose_graph_node')
+    listener.wait('diagnostics', said('waiting for odometry'), 60)
+    for _ in range(100):
+        if 'waiting for relative_pose_cov' in graph.log:
+            break
+        sleep(0.1)
+    for line in (f'waiting for odometry on {ODOMETRY}: nobody publishes it',
+                 f'waiting for image on {IMAGE}: nobody publishes it',
+                 f'waiting for camera_info on {INFO}: nobody publishes it'):
+        assert line in graph.log
+
+
+def node(*words: str, program: str = '') -> subprocess.CompletedProcess[str]:
+    program += ('import sys; from djet_ros.ros.pose_graph_node import main; sys.exit(main())')
+    return subprocess.run([sys.executable, '-c', program, *words], env=ENVIRONMENT, timeout=60,
+                          capture_output=True, text=True, check=False)
+
+
+def test_without_gtsam_it_says_in_one_line_how_to_get_it() -> None:
+    done = node(program='import sys; sys.modules["gtsam"] = None; ')
+    assert (done.returncode, done.stderr) == (
+        2, "pose_graph_node: error: gtsam is missing: pip install 'djet_ros[slam]'\n")
+
+
+def test_what_the_user_can_mend_ends_it_with_one_line() -> None:
+    done = node('--ros-args', '-p', 'slam.links:=0')
+    assert done.returncode == 2
+    assert 'slam.links is 0' in done.stderr.splitlines()[-1]
+    done = node('--ros-args', '-p', 'slam.loop_gaps:=1.0', '-p', 'slam.links:=0')
+    assert "did you mean 'slam.loop_gap'?" in done.stderr
