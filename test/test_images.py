@@ -224,16 +224,17 @@ def test_flipped_bytes_raise_nothing_but_a_reason(extension, at, put):
         gray_image(compressed(bytes(data)))
 
 
-def with_png_chunk_length(length):
+def with_png_chunk_length(kind, length):
     data = encoded('.png')
-    at = data.index(b'IDAT')
+    at = data.index(kind)
     return data[:at - 4] + struct.pack('>I', length) + data[at:]
 
 
+@pytest.mark.parametrize('kind', [b'IDAT', b'IEND'])
 @pytest.mark.parametrize('length', [2**32 - 1, 2**31 - 1, 400_000_000])
-def test_a_png_chunk_that_declares_more_than_there_is_is_not_decoded(length):
+def test_a_png_chunk_that_declares_more_than_there_is_is_not_decoded(kind, length):
     # OpenCV makes room for it first: seconds, and gigabytes.
-    assert reason(compressed(with_png_chunk_length(length))) == 'undecodable'
+    assert reason(compressed(with_png_chunk_length(kind, length))) == 'undecodable'
 
 
 def test_a_jpeg_of_very_many_scans_is_not_decoded():
