@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import json
 import os
 from pathlib import Path
 import re
@@ -12,8 +14,10 @@ import sys
 from time import monotonic, sleep
 from typing import Any
 
-from djet_ros.config import from_flat, load_yaml
+from djet_ros.config import from_flat, load_yaml, NodeConfig
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import Messages
+from djet_ros.ros.topics import graph_outputs, odometry_outputs
 from djet_ros.slam.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
 import pytest
 import yaml
@@ -47,6 +51,38 @@ def test_the_parameters_of_a_replay_are_the_defaults_without_loss_and_with_a_pat
 def test_rviz_shows_what_the_node_publishes() -> None:
     shown = topics(yaml.safe_load((ROOT / 'config' / 'vo.rviz').read_text()))
     assert shown == ['/vo_node/odometry', '/vo_node/path', '/vo_node/debug_image']
+
+
+def texts(value: Any) -> Iterator[str]:
+    """Give all texts in a JSON value, the names of fields among them."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for one in [*value, *value.values()] if isinstance(value, dict) else value:
+            yield from texts(one)
+
+
+def test_foxglove_shows_what_the_nodes_publish_and_the_launch_files_camera() -> None:
+    layout = json.loads((ROOT / 'config' / 'foxglove.json').read_text())
+    outputs = [('vo_node', odometry_outputs(NodeConfig(publish_path=True, publish_tf=True))),
+               ('pose_graph_node', graph_outputs(tf=True))]
+    published = {topic if topic.startswith('/') else f'/{node}/{topic}'
+                 for node, topics_of_node in outputs for topic in topics_of_node}
+    default = re.search("'image', default_value='(.*)'",
+                        (ROOT / 'launch' / 'vo.launch.py').read_text())
+    assert default is not None
+    camera = {default[1], default[1].rpartition('/')[0] + '/camera_info'}
+    shown = {text for text in texts(layout) if text.startswith('/')}
+    assert shown <= published | camera
+    assert shown >= {default[1], '/vo_node/debug_image', '/vo_node/path',
+                     '/pose_graph_node/path', '/diagnostics'}
+    assert Messages.component in texts(layout)
+
+
+def test_every_panel_of_foxglove_has_its_place() -> None:
+    layout = json.loads((ROOT / 'config' / 'foxglove.json').read_text())
+    placed = [text for text in texts(layout['layout']) if '!' in text]
+    assert sorted(placed) == sorted(layout['configById'])
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
