@@ -39,8 +39,9 @@ WAYS = [STEP * i for i in (*range(9), *range(7, -1, -1))]
 ODOMETRY_PARAMETERS = {'estimator.max_features': 800, 'ros.queue_policy': 'every',
                        'ros.publish_tf': True, 'odometry.scale': 'constant',
                        'odometry.scale_value': STEP}
-SLAM_PARAMETERS = {'estimator.max_features': 800, 'slam.keyframe_distance': 0.4,
-                   'slam.loop_gap': 0.5, 'slam.path_period': 0.0, 'slam.optimise_period': 0.0}
+SLAM_PARAMETERS = {'estimator.max_features': 800, 'ros.queue_policy': 'every',
+                   'slam.keyframe_distance': 0.4, 'slam.loop_gap': 0.5,
+                   'slam.path_period': 0.0, 'slam.optimise_period': 0.0}
 
 Heard = dict[str, list[Any]]
 

@@ -9,10 +9,10 @@ from djet_ros.config import NODE_NAME
 from djet_ros.ros.graph_session import GraphSession
 from djet_ros.ros.parameters import graph_parameters
 from djet_ros.ros.topics import graph_input_type, GRAPH_INPUTS, graph_outputs
-from djet_ros.ros.wired_node import message_type, trigger, WiredNode
+from djet_ros.ros.wired_node import input_qos, message_type, trigger, WiredNode
 from djet_ros.ros.wired_node import run as run_node
 from djet_ros.slam.live import LiveSlam
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 # Messages that the middleware keeps while Python is in a long optimisation.
@@ -35,9 +35,8 @@ class PoseGraphNode(WiredNode):
                                                  self.session.relative_pose)):
             self.listen(graph_input_type(name), f'{NODE_NAME}/{name}', callback,
                         QoSProfile(depth=_DEPTH))
-        reliability = QoSReliabilityPolicy[config.ros.qos_reliability.upper()]
         self.listen_to_camera(image, info, config, QoSProfile(
-            depth=slam.image_buffer, reliability=reliability))
+            depth=slam.image_buffer, reliability=input_qos(config).reliability))
         self.create_service(Trigger, '~/reset', partial(trigger, self.session.reset))
         self.get_logger().info(f'odometry from {topics["odometry"]}, images from {image}, '
                                f'camera_info from {info}')

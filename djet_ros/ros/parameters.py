@@ -25,7 +25,7 @@ FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.que
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
 SHARED = ('preset', 'odometry.rectified', 'odometry.frame_convention', 'ros.image_transport',
-          'ros.qos_reliability')
+          'ros.qos_reliability', 'ros.queue_policy')
 
 _KNOWN = flat(Config())
 
