@@ -1,0 +1,131 @@
+"""The pose graph's session: a real map, real threads, and a graph that writes down what comes."""
+
+from time import monotonic, sleep
+
+from cards import Cards, K, pose, SIZE
+from djet_ros.config import from_flat
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.slam.live_config import LiveSlamConfig
+import numpy as np
+import pytest
+from ros_messages import camera_info, image, message_type
+from test_live_slam import Odometry, START
+from test_session import Graph
+
+TOPICS = {'odometry': '/vo_node/odometry', 'relative_pose_cov': '/vo_node/relative_pose_cov',
+          'image': '/left/image_raw', 'camera_info': '/left/camera_info'}
+WAYS = [0.25 * i for i in (*range(7), *range(5, -1, -1))]
+
+
+class Live:
+    """A session at work on a way to the right and back."""
+
+    def __init__(self, **parameters):
+        pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+        from djet_ros.ros.graph_session import GraphSession
+        from djet_ros.slam.live import LiveSlam
+        self.graph = Graph()
+        self.slam = LiveSlam(
+            from_flat({'estimator.max_features': 500}), LiveSlamConfig(
+                keyframe_distance=0.4, loop_gap=0.5, **parameters), message_type, 'image_rect')
+        self.session = GraphSession(self.slam, self.graph, TOPICS)
+        self.session.start()
+        self._cards, self._odometry, self._was = Cards(), Odometry(), None
+
+    def drive(self, ways):
+        self.session.camera_info(camera_info(K, SIZE))
+        for way in ways:
+            stamp, here = self._odometry.stamp, pose(x=way)
+            self.session.image(image(self._cards.gray(here, noise=stamp % 97), stamp_ns=stamp))
+            if self._was is None:
+                self.session.odometry(self._odometry.start())
+            else:
+                relative, odometry = self._odometry.move(np.linalg.inv(self._was) @ here)
+                self.session.relative_pose(relative)
+                self.session.odometry(odometry)
+            self._was = here
+
+
+@pytest.fixture
+def live():
+    """Give a function that begins a session, which is stopped after the test."""
+    started = []
+
+    def start(**parameters):
+        started.append(Live(**parameters))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.session.stop(5)
+
+
+def until(condition):
+    end = monotonic() + 30
+    while not condition():
+        assert monotonic() < end, 'nothing happened'
+        sleep(0.01)
+
+
+def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
+    one = live(optimise_period=0.0)
+    one.drive(WAYS)
+    until(lambda: len(one.graph.heard('/tf')) == len(WAYS))
+    stamps = [stamp_ns(message.transforms[0].header) for message in one.graph.heard('/tf')]
+    assert stamps == [START + i * 100_000_000 for i in range(len(WAYS))]
+    until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
+    assert one.slam.map.imageless == 0
+
+
+def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
+    monkeypatch.setattr('djet_ros.ros.graph_session.SILENCE', 0.0)
+    one = live(optimise_period=1000.0)
+    one.drive(WAYS)
+    until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
+    before = one.slam.map.optimisations
+    one.session.tick()
+    until(lambda: one.slam.map.optimisations == before + 1)
+
+
+def test_what_is_missing_is_said_by_its_topic(live, monkeypatch):
+    monkeypatch.setattr('djet_ros.ros.graph_session.SILENCE', 0.0)
+    one = live()
+    one.session.camera_info(camera_info(K, SIZE))
+    for _ in range(3):
+        one.session.tick()
+    until(lambda: one.graph.heard('/diagnostics'))
+    assert one.graph.lines == [f'warning: waiting for {what} on {TOPICS[what]}: nobody '
+                               'publishes it' for what in TOPICS if what != 'camera_info']
+    assert one.graph.said()['state'] == 'waiting for odometry'
+
+
+def test_a_reset_begins_a_new_map(live):
+    one = live()
+    one.drive(WAYS[:5])
+    until(lambda: len(one.graph.heard('/tf')) == 5)
+    one.session.reset()
+    until(lambda: one.graph.said()['keyframes'] == '0')
+    one.drive(WAYS[5:])
+    until(lambda: len(one.graph.heard('/tf')) == len(WAYS))
+    assert one.slam.map.keyframes[0].stamp_ns == START + 5 * 100_000_000
+
+
+def test_nothing_is_published_after_a_stop(live):
+    one = live()
+    one.drive(WAYS[:3])
+    until(lambda: one.graph.heard('/tf'))
+    one.session.stop(5)
+    count = len(one.graph.batches)
+    one.drive(WAYS[3:])
+    sleep(0.2)
+    assert len(one.graph.batches) == count
+    assert not one.session.failed
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+def test_an_error_in_the_thread_is_no_silent_stall(live):
+    one = live()
+    assert not one.session.failed
+    one.graph.broken = True
+    one.drive(WAYS[:2])
+    until(lambda: one.session.failed)
