@@ -22,6 +22,7 @@ from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 import numpy as np
 import pytest
 from ros_messages import camera_info, image
+from scipy.spatial.transform import Rotation
 
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 FRAMES = 5
@@ -290,3 +291,60 @@ def test_a_graph_that_agrees_with_itself_has_no_error(tmp_path):
     write_graph(exact_graph(), tmp_path / 'graph.g2o', 'g2o')
     factors, values = gtsam.readG2o(str(tmp_path / 'graph.g2o'), True)
     assert factors.error(values) < 1e-18
+
+
+def g2o_errors(path):
+    """
+    Weighted squared errors of the edges of a file, as g2o defines them.
+
+    Its EdgeSE3 takes the translation and the vector part of the quaternion of Z^-1 X_i^-1 X_j.
+    """
+    def motion(numbers):
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
+        return result
+
+    rows = [(words[0], np.array(words[1:], float))
+            for words in map(str.split, path.read_text().splitlines())]
+    poses = {row[0]: motion(row[1:]) for kind, row in rows if kind == 'VERTEX_SE3:QUAT'}
+    errors = {}
+    for kind, row in rows:
+        if kind == 'EDGE_SE3:QUAT':
+            off = np.linalg.inv(poses[row[0]] @ motion(row[2:9])) @ poses[row[1]]
+            error = np.append(off[:3, 3], Rotation.from_matrix(off[:3, :3]).as_quat(
+                canonical=True)[:3])
+            information = np.zeros((6, 6))
+            information[np.triu_indices(6)] = row[9:]
+            information += np.triu(information, 1).T
+            errors[int(row[0]), int(row[1])] = error @ information @ error
+    return errors
+
+
+@pytest.mark.parametrize(('part', 'weight'), [(slice(0, 3), 1.0), (slice(3, 6), 0.25)])
+def test_g2o_weighs_translations_as_gtsam_does_and_rotations_a_quarter_as_much(
+        part, weight, tmp_path):
+    graph, small = exact_graph(), np.zeros(6)
+    small[part] = 1e-3, -2e-3, 1e-3
+    off = np.eye(4)
+    off[:3, 3], off[:3, :3] = small[:3], rotation_exp(small[3:])
+    edge = graph.edges[0]
+    poses = graph.poses.copy()
+    poses[edge.target] = poses[edge.target] @ off
+    write_graph(replace(graph, poses=poses), tmp_path / 'graph.g2o', 'g2o')
+    assert g2o_errors(tmp_path / 'graph.g2o')[edge.source, edge.target] == pytest.approx(
+        weight * small @ graph.information(edge) @ small, rel=1e-4)
+
+
+def test_g2o_itself_reads_the_file_and_finds_the_same_errors(results, unscaled, tmp_path):
+    g2opy = pytest.importorskip('g2opy', reason='g2o is not installed: pip install g2opy')
+    for i, graph in enumerate([random_graph(7), read_results(results), read_results(unscaled)]):
+        path = tmp_path / f'{i}.g2o'
+        write_graph(replace(graph, poses=graph.poses @ STEP @ graph.poses), path, 'g2o')
+        optimizer = g2opy.SparseOptimizer()
+        assert optimizer.load(str(path))
+        assert len(optimizer.vertices()) == len(graph.poses)
+        optimizer.initialize_optimization()
+        optimizer.compute_active_errors()
+        found = {tuple(vertex.id() for vertex in edge.vertices()): edge.chi2()
+                 for edge in optimizer.edges()}
+        assert found == pytest.approx(g2o_errors(path), rel=1e-6)
