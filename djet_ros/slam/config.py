@@ -19,6 +19,10 @@ class SlamConfig:
     links: int = parameter(
         1, 'to how many keyframes before it a keyframe is linked; beyond the last one, by direct '
         'estimates', minimum=1, maximum=10)
+    length_noise: float = parameter(
+        0.02, 'standard deviation by which known lengths differ from one another, as a share; '
+        "what the odometry's scale_uncertainty says beyond it is common to all of them (the "
+        'radius of a wheel, the height of a camera) and bends nothing', minimum=1e-6, maximum=10.0)
     loop_gap: float = parameter(
         20.0, 'seconds that must lie between two keyframes that close a loop',
         minimum=0.0, maximum=1e6)

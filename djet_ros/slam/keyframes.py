@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from djet_ros.core.types import Array
 from djet_ros.data.pose_graph import Edge, PoseGraph
@@ -56,6 +56,27 @@ class Hanging:
         turn = np.degrees(Rotation.from_matrix(self.offset[:3, :3]).magnitude())
         way = np.linalg.norm(self.offset[:3, 3])
         return bool(way >= config.keyframe_distance or turn >= config.keyframe_turn)
+
+
+def without_common_length(frames: PoseGraph, uncertainty: float, noise: float) -> PoseGraph:
+    """
+    Take that part of the lengths' variances away that is an error common to all of them.
+
+    uncertainty: standard deviation of each known length as a share of it, as the edges have it;
+    noise: what of it is each length's own. If all lengths of a graph are too large alike, and with
+    them those of the loops, which come from them, then the graph is as consistent as before, only
+    larger: such an error must not make lengths look as if they could give way one by one.
+    """
+    common = uncertainty**2 - noise**2
+    if common <= 0:
+        return frames
+    edges = []
+    for edge in frames.edges:
+        if edge.scale_known:
+            way = np.pad(edge.motion[:3, 3], (0, 3))
+            edge = replace(edge, covariance=edge.covariance - common * np.outer(way, way))
+        edges.append(edge)
+    return replace(frames, edges=tuple(edges))
 
 
 def choose_keyframes(frames: PoseGraph, config: SlamConfig) -> Keyframes:

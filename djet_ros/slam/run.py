@@ -13,7 +13,7 @@ from djet_ros.data.sources import Source
 from djet_ros.slam.backend import optimise, Solution
 from djet_ros.slam.config import SlamConfig
 from djet_ros.slam.images import frames_at, SeenFile
-from djet_ros.slam.keyframes import choose_keyframes, Keyframes
+from djet_ros.slam.keyframes import choose_keyframes, Keyframes, without_common_length
 from djet_ros.slam.loops import EdgeFinder
 import numpy as np
 
@@ -60,7 +60,8 @@ def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig
     (keyframes done, keyframes in all); scratch: a folder with room for the images of the
     keyframes, while it lasts. Raises DjetError.
     """
-    keyframes = choose_keyframes(frames, slam)
+    keyframes = choose_keyframes(without_common_length(
+        frames, config.odometry.scale_uncertainty, slam.length_noise), slam)
     graph = keyframes.graph
     edges = [*graph.edges]
     images = frames_at(source, config, graph.stamps_ns)
