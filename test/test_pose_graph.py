@@ -8,9 +8,11 @@ import subprocess
 import sys
 
 from cards import Cards, K, pose, SIZE
+from conftest import write_small_kitti
 from djet_ros.config import Config, from_flat
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.data.bags import BagMessage
+from djet_ros.data.bag_writers import ResultBag
+from djet_ros.data.bags import Bag, BagMessage
 from djet_ros.data.pose_graph import Edge, PoseGraph, read_results
 from djet_ros.data.pose_graph_files import write_graph
 from djet_ros.data.replay import Replay
@@ -208,6 +210,60 @@ def test_covariances_that_have_no_inverse_are_refused_with_the_name_of_the_edge(
             write_graph(graph, tmp_path / 'graph', kind)
         assert said in str(refused.value)
     assert not list(tmp_path.iterdir())
+
+
+def spoilt(results, path, spoil):
+    """Results in whose bag the relative pose of the third frame was edited by hand."""
+    shutil.copytree(results, path)
+    shutil.rmtree(path / 'bag')
+    with Bag(results / 'bag') as read, ResultBag(path / 'bag') as written:
+        for topic, stamp, message in read.messages():
+            if topic == '/vo_node/relative_pose_cov' and stamp == 13 * 10**8:
+                covariance = np.array(message.pose.covariance).reshape(6, 6)
+                message.pose.covariance = np.asarray(spoil(covariance, message), float).ravel()
+            written.write(topic, message, stamp)
+    return path
+
+
+def no_orientation(covariance, message):
+    message.pose.pose.orientation.w = message.pose.pose.orientation.y = 0.0
+    return covariance
+
+
+def asymmetric(covariance, message):
+    covariance[0, 4] += 0.5 * np.sqrt(covariance[0, 0] * covariance[4, 4])
+    return covariance
+
+
+SPOILT = [(lambda C, _: C * np.nan, 'is not a finite 6x6 matrix'),
+          (lambda C, _: np.ones((6, 6)), 'is singular'),
+          (lambda C, _: np.zeros((6, 6)), 'has the variance 0'),
+          (lambda C, _: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
+          (asymmetric, 'is not symmetric'),
+          (no_orientation, 'is no pose of finite numbers')]
+
+
+@pytest.mark.parametrize(('spoil', 'said'), SPOILT)
+def test_results_that_were_edited_by_hand_are_refused_with_the_name_of_the_edge(
+        results, spoil, said, tmp_path):
+    graph = read_results(spoilt(results, tmp_path / 'spoilt', spoil))
+    with pytest.raises(DjetError, match=r'odometry edge 1 -> 2 \(1200000000 ns') as refused:
+        graph.check()
+    assert said in str(refused.value)
+    with pytest.raises(DjetError, match='edge 1 -> 2'):
+        write_graph(graph, tmp_path / 'graph', 'g2o')
+
+
+def test_the_commands_say_so_in_a_line_and_write_nothing(results, tmp_path):
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    folder, out = spoilt(results, tmp_path / 'spoilt', asymmetric), tmp_path / 'out'
+    sequence = write_small_kitti(tmp_path / 'dataset')
+    for words in (('export', folder, '--output', out),
+                  ('slam', folder, '--source', sequence, '--output', tmp_path / 'slam')):
+        said = djet(*words, expect=2).stderr
+        assert 'odometry edge 1 -> 2' in said
+        assert len(said.strip().splitlines()) == 1
+    assert not out.exists()
 
 
 # Files

@@ -64,13 +64,22 @@ class PoseGraph:
         return (f'{edge.kind} edge {edge.source} -> {edge.target} '
                 f'({self.stamps_ns[edge.source]} ns -> {self.stamps_ns[edge.target]} ns)')
 
+    def check(self) -> None:
+        """Raise DjetError, naming an edge, unless all have motions and covariances to go by."""
+        for edge in self.edges:
+            self.body_covariance(edge)
+
     def body_covariance(self, edge: Edge) -> Array:
         """
         Covariance (6, 6) of an edge along the axes of its target.
 
         That is the error that g2o and GTSAM minimise, xi in ``motion exp(xi)``. DjetError names
-        the edge if it is none: not finite, not symmetric, or not positive definite.
+        the edge if it is none: not finite, not symmetric, or not positive definite; or if the
+        edge's motion is none.
         """
+        if edge.motion.shape != (4, 4) or not np.isfinite(edge.motion).all():
+            raise DjetError(f'the motion of {self.name(edge)} is no pose of finite numbers; leave '
+                            'the edge out or mend it')
         wrong = _fault(edge.covariance)
         if wrong:
             raise DjetError(f'the covariance of {self.name(edge)} {wrong}, so that its inverse '

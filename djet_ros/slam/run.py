@@ -60,6 +60,8 @@ def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig
     (keyframes done, keyframes in all); scratch: a folder with room for the images of the
     keyframes, while it lasts. Raises DjetError.
     """
+    # Composed with others, what is wrong with an edge would no longer be seen.
+    frames.check()
     keyframes = choose_keyframes(without_common_length(
         frames, config.odometry.scale_uncertainty, slam.length_noise), slam)
     graph = keyframes.graph
