@@ -1,6 +1,7 @@
 """The SLAM beside a live odometry: steps out of messages, a map that grows, and its loops."""
 
 from dataclasses import replace
+import gc
 
 from cards import Cards, K, pose, REST, SIZE
 from djet_ros.config import Config, from_flat, OdometryConfig
@@ -8,6 +9,7 @@ from djet_ros.core.types import Status
 from djet_ros.data.pose_graph import Edge, PoseGraph
 from djet_ros.data.sources import open_source, pose_of
 from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages
 from djet_ros.odometry.scale import GroundTruthScale
 from djet_ros.odometry.tracker import Tracker
@@ -291,6 +293,9 @@ def test_with_body_axes_the_map_is_the_same_along_other_axes(live, driven):
     axes[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     for ours, theirs in zip(drive.path.poses, driven.path.poses, strict=True):
         assert np.allclose(pose_of(ours)[1], axes @ pose_of(theirs)[1] @ axes.T, atol=1e-6)
+    stamp, newest = pose_of(drive.path.poses[-1])
+    drive.go(pose(x=0.01))
+    assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
 
 
 def test_an_odometry_that_begins_anew_is_put_where_it_was_and_then_where_it_belongs(live):
@@ -324,7 +329,12 @@ def test_a_step_back_in_time_begins_everything_anew(live):
     assert np.array_equal(drive.corrections[START - 10**9], np.eye(4))
 
 
+def images_in_memory():
+    return sum(isinstance(one, Frame) for one in gc.get_objects())
+
+
 def test_the_memory_is_bounded(live):
+    others = images_in_memory()
     drive = Drive(live, slam=replace(QUICK, max_keyframes=7, image_buffer=3))
     drive.to_and_fro()
     for i in range(1, 9):
@@ -333,6 +343,7 @@ def test_the_memory_is_bounded(live):
     assert len(graph.keyframes) == 7
     assert graph.first >= 4
     assert drive.said['keyframes forgotten'] == str(graph.first)
+    assert images_in_memory() - others == 7
     ends = {end for edge in graph.edges for end in (edge.source, edge.target)}
     assert ends == set(range(graph.first, graph.first + 7))
     before, after = drive.errors()
@@ -358,6 +369,21 @@ def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target
             initial_values(moved)) for edge in (told, ours)]
         assert costs[0] > 0
         assert costs[1] == pytest.approx(costs[0], rel=0.01)
+
+
+@pytest.mark.parametrize(('told', 'believed', 'kept'), [
+    (0.05, 0.05, 0.02), (0.01, 0.01, 0.01), (0.05, 0.5, 0.02), (0.1, 0.05, 0.0889)])
+def test_an_error_common_to_all_lengths_bends_no_loop(live, told, believed, kept):
+    """Shares of the length: as the odometry says, as the parameter has it, and in the map."""
+    config = from_flat({'estimator.max_features': 800, 'odometry.scale_uncertainty': believed})
+    drive = Drive(live, config, drift=0.0)
+    drive.start()
+    covariance = np.diag(SIGMAS**2)
+    covariance[0, 0] = (2.0 * told)**2
+    drive.odometry.move, move = lambda motion: move(motion, covariance), drive.odometry.move
+    drive.go(pose(x=2.0))
+    edge, = drive.slam.map.edges
+    assert np.sqrt(edge.covariance[0, 0]) / 2.0 == pytest.approx(kept, rel=1e-3)
 
 
 def test_only_a_frame_whose_image_is_there_becomes_a_keyframe(live):

@@ -24,8 +24,9 @@ FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.que
          'ros.queue_size')
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
-SHARED = ('preset', 'odometry.rectified', 'odometry.frame_convention', 'ros.image_transport',
-          'ros.qos_reliability', 'ros.queue_policy')
+SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
+          'odometry.frame_convention', 'ros.image_transport', 'ros.qos_reliability',
+          'ros.queue_policy')
 
 _KNOWN = flat(Config())
 

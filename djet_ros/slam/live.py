@@ -7,16 +7,19 @@ Its poses come from the odometry, its loops from the images of keyframes.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
+from dataclasses import replace
 from typing import Any
 
 from djet_ros.config import Config
 from djet_ros.core.types import Array
+from djet_ros.data.pose_graph import Edge, PoseGraph
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, OPTICAL_TO_BODY, stamp_ns
 from djet_ros.odometry.tracker import Outgoing
+from djet_ros.slam.keyframes import without_common_length
 from djet_ros.slam.live_config import LiveSlamConfig
 from djet_ros.slam.live_map import LiveMap
 from djet_ros.slam.steps import Step, Steps
@@ -30,8 +33,8 @@ class LiveSlam:
     Closes loops while the odometry goes on.
 
     config: that of the odometry, as far as both share it (estimator, odometry.frame_convention,
-    odometry.rectified); message_type gives the class for a type name; image_topic is the resolved
-    name of the images' topic, by which odometry.rectified 'auto' goes.
+    odometry.rectified, odometry.scale_uncertainty); message_type gives the class for a type name;
+    image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
 
     Outgoing topics: /tf (the odometry's frame in the map, for each frame that was tracked), path
     (the optimised poses of the keyframes and of the newest frame), /diagnostics.
@@ -160,6 +163,8 @@ class LiveSlam:
         outgoing = []
         for step in steps:
             self.problem = None
+            if step.edge is not None:
+                step = replace(step, edge=self._with_own_length(step.edge))
             self.map.extend(step, self._frame)
             self._last = step
             if self.slam.publish_tf and self.map.keyframes:
@@ -171,6 +176,18 @@ class LiveSlam:
                 outgoing.append(self._path(step))
             outgoing += self._diagnostics_if_due(step.stamp_ns)
         return outgoing
+
+    def _with_own_length(self, edge: Edge) -> Edge:
+        """Give an edge without what is common to all lengths, but no more than it has."""
+        way = float(np.linalg.norm(edge.motion[:3, 3]))
+        if not edge.scale_known or not way:
+            return edge
+        along = edge.motion[:3, 3] / way
+        share = float(np.sqrt(along @ edge.covariance[:3, :3] @ along)) / way
+        graph = PoseGraph(np.zeros(2, np.int64), np.array([np.eye(4), edge.motion]), (edge,))
+        return without_common_length(
+            graph, min(share, self.config.odometry.scale_uncertainty), self.slam.length_noise
+        ).edges[0]
 
     def _frame(self, stamp: int) -> Frame | None:
         """Frame of the image with a stamp, which waits no longer, nor do those before it."""
