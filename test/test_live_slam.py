@@ -196,6 +196,10 @@ class Drive:
         self._true = place
         return self._take(lambda: (self.odometry.start(),))
 
+    def stand(self):
+        """Stay where it is for a frame."""
+        return self._take(lambda: self.odometry.move(np.eye(4), standing=True))
+
     def go(self, place, *, seen=True):
         """Go to a place; give what comes of it."""
         motion = np.linalg.inv(self._true) @ place
@@ -369,6 +373,16 @@ def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target
             initial_values(moved)) for edge in (told, ours)]
         assert costs[0] > 0
         assert costs[1] == pytest.approx(costs[0], rel=0.01)
+
+
+def test_while_the_camera_stands_nothing_becomes_less_sure(live):
+    drive = Drive(live, drift=0.0)
+    drive.start()
+    for _ in range(10):
+        drive.stand()
+    drive.go(pose(x=1.0))
+    edge, = (edge for edge in drive.slam.map.edges if edge.kind == 'odometry')
+    assert np.allclose(edge.covariance, np.diag(SIGMAS**2), atol=2e-9)
 
 
 @pytest.mark.parametrize(('told', 'believed', 'kept'), [

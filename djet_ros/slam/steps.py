@@ -114,8 +114,7 @@ class Steps:
                           variance - float(np.trace(covariance[3:, 3:])))
         standing = bool(edge and edge.kind == 'odometry' and np.allclose(
             motion, np.eye(4), rtol=0, atol=_ROUNDING**2))
-        if not standing:
-            self._pose, self._rotation_variance = here, variance
+        self._pose, self._rotation_variance = here, variance
         return [Step(stamp, odometry.header.frame_id, here, edge, standing=standing)]
 
     def _edge(self, stamp: int, here: Array, motion: Array, covariance: Array,
