@@ -14,7 +14,7 @@ from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 
-FRAMES = 120
+FRAMES = 100
 
 
 def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
