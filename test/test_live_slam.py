@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 import gc
+from itertools import pairwise
 
 from cards import Cards, K, pose, REST, SIZE
 from djet_ros.config import Config, from_flat, OdometryConfig
+from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
 from djet_ros.data.pose_graph import Edge, PoseGraph
 from djet_ros.data.sources import open_source, pose_of
 from djet_ros.evaluation.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages
-from djet_ros.odometry.scale import GroundTruthScale
+from djet_ros.odometry.scale import GroundTruthScale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import OdometryResult
@@ -333,12 +335,13 @@ def test_a_step_back_in_time_begins_everything_anew(live):
     assert np.array_equal(drive.corrections[START - 10**9], np.eye(4))
 
 
-def images_in_memory():
-    return sum(isinstance(one, Frame) for one in gc.get_objects())
+def in_memory(kind):
+    return sum(isinstance(one, kind) for one in gc.get_objects())
 
 
 def test_the_memory_is_bounded(live):
-    others = images_in_memory()
+    image_type = message_type('sensor_msgs/msg/Image')
+    frames, messages = in_memory(Frame), in_memory(image_type)
     drive = Drive(live, slam=replace(QUICK, max_keyframes=7, image_buffer=3))
     drive.to_and_fro()
     for i in range(1, 9):
@@ -347,7 +350,8 @@ def test_the_memory_is_bounded(live):
     assert len(graph.keyframes) == 7
     assert graph.first >= 4
     assert drive.said['keyframes forgotten'] == str(graph.first)
-    assert images_in_memory() - others == 7
+    assert in_memory(Frame) - frames == 7
+    assert in_memory(image_type) - messages <= 3
     ends = {end for edge in graph.edges for end in (edge.source, edge.target)}
     assert ends == set(range(graph.first, graph.first + 7))
     before, after = drive.errors()
@@ -373,6 +377,40 @@ def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target
             initial_values(moved)) for edge in (told, ours)]
         assert costs[0] > 0
         assert costs[1] == pytest.approx(costs[0], rel=0.01)
+
+
+def test_without_a_scale_the_map_keeps_the_units_of_the_odometry(live):
+    """Directions are mended, as far as they tell; lengths bend, but no motion is turned round."""
+    drive = Drive(live)
+    move = drive.odometry.move
+
+    def move_somehow_far(motion):
+        along = unit(motion[:3, 3])
+        spread = np.pad(np.outer(along, along), (0, 3)) * UNKNOWN_LENGTH_SIGMA**2
+        return move(motion, np.diag(SIGMAS**2) + spread)
+
+    drive.odometry.move = move_somehow_far
+    drive.to_and_fro()
+    assert int(drive.said['loops']) >= 3
+    assert not any(edge.scale_known for edge in drive.slam.map.edges)
+    poses = dict(pose_of(one) for one in drive.path.poses)
+    stamps = sorted(poses)
+    for before, after in pairwise(stamps):
+        ours = poses[after][:3, 3] - poses[before][:3, 3]
+        theirs = drive.told[after][:3, 3] - drive.told[before][:3, 3]
+        assert unit(ours) @ unit(theirs) > 0.9
+        assert 0.3 < np.linalg.norm(ours) / np.linalg.norm(theirs) < 3
+
+
+def test_a_turn_on_the_spot_without_a_scale_leads_nowhere_else(live):
+    """Its way is unknown, but is no more than a step."""
+    drive = Drive(live, drift=0.0)
+    drive.start()
+    wide = np.diag([*[UNKNOWN_LENGTH_SIGMA**2] * 3, *SIGMAS[3:]**2])
+    drive.odometry.move, move = lambda motion: move(motion, wide), drive.odometry.move
+    drive.go(pose(yaw=0.2))
+    edge, = drive.slam.map.edges
+    assert np.allclose(edge.covariance, np.diag([1, 1, 1, *SIGMAS[3:]**2]), atol=2e-9)
 
 
 def test_while_the_camera_stands_nothing_becomes_less_sure(live):

@@ -27,6 +27,9 @@ import numpy as np
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
 
+# Where nobody knows them, steps have this length.
+_UNIT = 1.0
+
 
 class LiveSlam:
     """
@@ -178,16 +181,27 @@ class LiveSlam:
         return outgoing
 
     def _with_own_length(self, edge: Edge) -> Edge:
-        """Give an edge without what is common to all lengths, but no more than it has."""
+        """
+        Give an edge whose length is as sure as it is among those of the map.
+
+        Without what is common to all known lengths, but no more than the edge has of it. A length
+        that nobody knows is in the odometry's units, which the map shares: were it free within
+        the map, loops of a few keyframes could turn motions round.
+        """
         way = float(np.linalg.norm(edge.motion[:3, 3]))
-        if not edge.scale_known or not way:
+        if edge.kind == 'unknown':
+            return edge
+        if not edge.scale_known:
+            covariance = edge.covariance.copy()
+            covariance[:3, :3] = _clipped(covariance[:3, :3], (way or _UNIT)**2)
+            return replace(edge, covariance=covariance)
+        if not way:
             return edge
         along = edge.motion[:3, 3] / way
-        share = float(np.sqrt(along @ edge.covariance[:3, :3] @ along)) / way
+        variance = float(along @ edge.covariance[:3, :3] @ along)
+        uncertainty = min(np.sqrt(variance) / way, self.config.odometry.scale_uncertainty)
         graph = PoseGraph(np.zeros(2, np.int64), np.array([np.eye(4), edge.motion]), (edge,))
-        return without_common_length(
-            graph, min(share, self.config.odometry.scale_uncertainty), self.slam.length_noise
-        ).edges[0]
+        return without_common_length(graph, uncertainty, self.slam.length_noise).edges[0]
 
     def _frame(self, stamp: int) -> Frame | None:
         """Frame of the image with a stamp, which waits no longer, nor do those before it."""
@@ -222,6 +236,12 @@ class LiveSlam:
             return []
         self._said, self._said_stamp = self.state[1], stamp
         return [self.diagnostics(stamp)]
+
+
+def _clipped(covariance: Array, variance: float) -> Array:
+    """Give a covariance with no direction less sure than a variance."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.minimum(values, variance) @ axes.T)
 
 
 class _Messages(Messages):
