@@ -163,6 +163,17 @@ def test_a_camera_that_sees_no_ground_says_nothing(floor):
                           moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
 
 
+@pytest.mark.parametrize('size', [(1, 1), (20, 20), (40, 30)])
+def test_an_image_too_small_for_any_ground_says_nothing(size):
+    assert not Ground(K, size, 0.0).is_in_view
+
+
+def test_two_equal_images_of_a_moving_camera_say_nothing(floor):
+    views = [view(floor.gray())] * 2
+    assert Ground(K, SIZE[::-1], 0.0).motion(
+        *views, moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
+
+
 def test_turning_on_the_spot_is_no_way_at_all(floor):
     R = np.linalg.inv(floor_pose(0.0, yaw=0.05)) @ floor_pose(0.0)
     seen = Ground(K, SIZE[::-1], 0.0).motion(

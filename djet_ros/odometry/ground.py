@@ -10,6 +10,7 @@ level ground would be are aligned directly, because roads have few corners.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import cv2
 from djet_ros.core.geometry import homogeneous, rotation_exp, sphere_tangents
@@ -29,11 +30,17 @@ _FLAT, _TIMES, _FAR = 6.0, 1.5, 14.0
 # Fewer pixels than this see too little; more than this only cost time.
 _LEAST_PIXELS, _PIXELS = 400, 4000
 
+# Pixels of an image from which those are chosen.
+_CANDIDATES = 500_000
+
 # Ways between two views that are searched, in heights; in steps of a pixel or two.
 _WAYS, _STEP = (0.02, 4.0), 0.03
 
 # Correlation with which ground is seen again. Walls and cars that are taken for ground have less.
 _SEEN = 0.6
+
+# Correlation with which images about whose motion nothing is known are of one place.
+_SAME = 0.95
 
 # Another way must correlate by so much less, if it is no neighbour by so many steps.
 _CLEARLY, _NEIGHBOURS = 0.1, 6
@@ -87,7 +94,10 @@ class Ground:
         self._normal = np.array([0.0, np.cos(pitch), np.sin(pitch)])
         self._forward = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
         self._reach = _FAR
-        rows, columns = np.mgrid[_RIM:shape[0] - _RIM, _RIM:shape[1] - _RIM]
+        # Of large images every second row and column, and so on, are more than enough.
+        every = max(math.isqrt(shape[0] * shape[1] // _CANDIDATES), 1)
+        columns, rows = np.meshgrid(np.arange(_RIM, shape[1] - _RIM, every),
+                                    np.arange(_RIM, shape[0] - _RIM, every))
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
         rays = homogeneous(pixels) @ np.linalg.inv(K).T
         seen = self._sees(rays)
@@ -153,11 +163,12 @@ class Ground:
 
     def _standing(self, wanted: Array, there: Image,
                   relative: RelativePose) -> GroundMotion | None:
-        """Tell whether the ground is where a rotation alone would bring it."""
-        R = relative.R if relative.status is Status.NO_PARALLAX else np.eye(3)
+        """Tell whether the ground is where a rotation alone would bring it, or where it was."""
+        turned = relative.status is Status.NO_PARALLAX
+        R = relative.R if turned else np.eye(3)
         correlation = _correlation(
             wanted, _sampled(there, self._seen_again(R, np.zeros(3), self._normal)))
-        if correlation < _SEEN:
+        if correlation < (_SEEN if turned else _SAME):
             return None
         least = _LEAST_SHIFT / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
         return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]), correlation)
@@ -207,7 +218,8 @@ class Ground:
             prior = known.copy()
             prior[:3, :3] += lean.T @ lean
             # The noise that makes residuals and priors comparable.
-            noise = float(np.trace(np.linalg.solve(hessian + 1e-9 * np.eye(8), spread))) / 8
+            noise = max(float(np.trace(np.linalg.solve(hessian + 1e-9 * np.eye(8), spread))) / 8,
+                        1e-9)
             total = hessian / noise + prior
             gradient /= noise
             gradient[:3] += lean.T @ offset
@@ -220,7 +232,7 @@ class Ground:
             places - self._seen_again(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
         if correlation < _SEEN or shift < _LEAST_SHIFT or m @ self._normal <= 0 \
-                or self._unevenness(r, J, R, t, m) > _UNEVEN:
+                or not self._unevenness(r, J, R, t, m) <= _UNEVEN:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
