@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -120,12 +121,18 @@ def launched(environment: dict[str, str], log: Path, *words: str, until: str) ->
     """Run ros2 launch until a text is in its output, then end it by Ctrl-C; gives the output."""
     with log.open('w') as file:
         process = subprocess.Popen(['ros2', 'launch', 'djet_ros', *words], env=environment,
-                                   stdout=file, stderr=subprocess.STDOUT)
-    end = monotonic() + 30
-    while until not in log.read_text() and monotonic() < end and process.poll() is None:
-        sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    process.wait(20)
+                                   stdout=file, stderr=subprocess.STDOUT,
+                                   start_new_session=True)
+    try:
+        end = monotonic() + 30
+        while until not in log.read_text() and monotonic() < end and process.poll() is None:
+            sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        process.wait(20)
+    finally:
+        # No node may be left on the graph of the next test.
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     return log.read_text()
 
 
