@@ -18,9 +18,9 @@ from djet_ros.cli import kitti_to_bag
 from djet_ros.data.bag_writers import (
     camera_info, mono8, OPTICAL, pose_stamped, ResultBag, STORAGES, write_kitti_bag)
 from djet_ros.data.bags import Bag, BagSource
-from djet_ros.data.decoding import jazzy, message_type
+from djet_ros.data.decoding import decoder, jazzy, message_type, MOST_ELEMENTS
 from djet_ros.data.kitti import KittiSequence
-from djet_ros.data.storages.base import LARGEST_PIECE
+from djet_ros.data.storages.base import BrokenFile, Connection, LARGEST_PIECE
 from djet_ros.data.storages.compression import zstd
 from djet_ros.errors import DjetError
 import numpy as np
@@ -777,3 +777,31 @@ def test_a_sequence_that_declares_more_than_the_message_holds_is_refused(tmp_pat
 
 def test_storage_plugins_are_those_that_rosbags_has():
     assert set(STORAGES.values()) == set(StoragePlugin)
+
+
+def outer(count, element, size=0, encoding='ros1'):
+    """Try to read a message that declares so many elements of a type of its own."""
+    definition = f'Inner[] all\n{"=" * 80}\nMSG: some/Inner\n{element}\n'
+    head = b'' if encoding == 'ros1' else b'\0\1\0\0'
+    read = decoder(Connection(0, '/all', 'some/msg/Outer', encoding, definition, 1))
+    return read(memoryview(head + struct.pack('<I', count) + bytes(size)))
+
+
+def test_elements_that_take_no_bytes_are_refused():
+    # Few enough for this machine, should they be read.
+    with pytest.raises(BrokenFile, match='sequences of elements that take no bytes'):
+        outer(3_000_000, '')
+    with pytest.raises(BrokenFile, match='sequences of elements that take no bytes'):
+        outer(3_000_000, f'Nothing[3] nothing\n{"=" * 80}\nMSG: some/Nothing\n')
+
+
+@pytest.mark.parametrize(('encoding', 'element', 'size'), [
+    ('ros1', 'uint8 x', MOST_ELEMENTS + 1), ('cdr', 'uint8 x', MOST_ELEMENTS + 1),
+    ('ros1', 'string x', 4 * MOST_ELEMENTS + 1), ('ros1', 'float64[3] x', 25 * MOST_ELEMENTS)])
+def test_messages_that_may_unfold_to_more_than_memory_holds_are_refused(encoding, element, size):
+    with pytest.raises(BrokenFile, match='may unfold to more than memory holds'):
+        outer(2**20, element, size, encoding)
+
+
+def test_sequences_of_messages_are_read():
+    assert [inner.x for inner in outer(3, 'uint8 x', 3).all] == [0, 0, 0]

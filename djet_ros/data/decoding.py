@@ -8,11 +8,11 @@ name into Jazzy's class: ROS 1's ``K`` becomes ``k``, its ``header.seq`` is left
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any, TypeAlias
 
-from djet_ros.data.storages.base import BrokenFile, Connection
+from djet_ros.data.storages.base import BrokenFile, Connection, LARGEST_PIECE
 from djet_ros.data.storages.compression import decompress_message, ZSTD_MAGIC
 from djet_ros.errors import one_line
 import numpy as np
@@ -26,6 +26,17 @@ Decoder: TypeAlias = Callable[[memoryview], Any]
 # or strings. Real definitions have a few kB with their comments, and hardly such arrays.
 LONGEST_DEFINITION = 32 << 10
 MOST_FIXED_ELEMENTS = 256
+
+# Each element of a sequence of messages or strings becomes an object of a hundred bytes or more,
+# and may have taken a single byte, or none, of the message.
+MOST_ELEMENTS = 1 << 22
+
+# Least bytes of the basic types; all others have one.
+BYTES = {'int16': 2, 'uint16': 2, 'int32': 4, 'uint32': 4, 'float32': 4, 'string': 4, 'int64': 8,
+         'uint64': 8, 'float64': 8}
+
+# What rosbags adds to a type without fields, and reads from no byte of a ROS 1 message.
+NO_FIELD = 'structure_needs_at_least_one_member'
 
 FAMILIES = {'bool': 'bool', 'string': 'text', 'float32': 'float', 'float64': 'float'}
 
@@ -51,20 +62,24 @@ def decoder(connection: Connection) -> Decoder:
         if connection.msgtype not in store.types:
             raise ValueError('it is unknown, and the bag holds no definition of it')
         store.get_msgdef(connection.msgtype)
+        largest = _largest_message(store, connection.msgtype)
     except Exception as error:
         raise BrokenFile(f"its type '{connection.msgtype[:80]}' can't be used: "
                          f'{type(error).__name__} {one_line(error)[:120]}') from error
     convert: Callable[[Any], Any] = _identity
     if store is not jazzy() and connection.msgtype in jazzy().types:
         convert = _converter(store, connection.msgtype)
-    return partial(_decode, connection, store, convert)
+    return partial(_decode, connection, store, convert, largest)
 
 
 def _decode(connection: Connection, store: Typestore, convert: Callable[[Any], Any],
-            data: memoryview) -> Any:
+            largest: int, data: memoryview) -> Any:
     ros1 = connection.encoding == 'ros1'
     if not ros1 and data[:4] == ZSTD_MAGIC:
         data = decompress_message(data)
+    if len(data) > largest:
+        raise BrokenFile(f'it has {len(data)} bytes; a {connection.msgtype} of more than '
+                         f'{largest} may unfold to more than memory holds')
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     # As above: the code that reads the bytes was generated from what the file says.
     try:
@@ -89,6 +104,39 @@ def _store(connection: Connection) -> Typestore:
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
+
+
+def _largest_message(store: Typestore, msgtype: str) -> int:
+    """Bytes of a message beyond which it might have more than MOST_ELEMENTS elements."""
+    least = min(_elements(store, (Nodetype.NAME, msgtype)), default=LARGEST_PIECE)
+    if least == 0:
+        raise ValueError('it has sequences of elements that take no bytes')
+    return min(least * MOST_ELEMENTS, LARGEST_PIECE)
+
+
+def _elements(store: Typestore, kind: Any) -> Iterator[int]:
+    """Least bytes of the elements of all sequences in a kind of field that become objects."""
+    node, detail = kind
+    if node == Nodetype.NAME:
+        for _, inner in store.fielddefs[detail][1]:
+            yield from _elements(store, inner)
+    elif node != Nodetype.BASE:
+        inner = detail[0]
+        if node == Nodetype.SEQUENCE and (inner[0] != Nodetype.BASE or inner[1][0] == 'string'):
+            yield _least_bytes(store, inner)
+        yield from _elements(store, inner)
+
+
+def _least_bytes(store: Typestore, kind: Any) -> int:
+    """Bytes that a kind of field takes at least."""
+    node, detail = kind
+    if node == Nodetype.NAME:
+        return sum(_least_bytes(store, inner) for name, inner in store.fielddefs[detail][1]
+                   if name != NO_FIELD)
+    if node == Nodetype.BASE:
+        return BYTES.get(detail[0], 1)
+    # A sequence may be empty, but has its length.
+    return 4 if node == Nodetype.SEQUENCE else detail[1] * _least_bytes(store, detail[0])
 
 
 def _fixed_elements(definition: Any) -> int:
