@@ -336,7 +336,7 @@ def test_a_step_back_in_time_begins_everything_anew(live):
 
 
 def in_memory(kind):
-    return sum(isinstance(one, kind) for one in gc.get_objects())
+    return sum(type(one) is kind for one in gc.get_objects())
 
 
 def test_the_memory_is_bounded(live):
