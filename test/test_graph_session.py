@@ -122,6 +122,23 @@ def test_nothing_is_published_after_a_stop(live):
     assert not one.session.failed
 
 
+def test_what_is_in_work_at_a_stop_is_not_published(live):
+    one = live()
+    odometry = one.slam.odometry
+
+    def slowly(message):
+        sleep(0.5)
+        return odometry(message)
+
+    one.slam.odometry = slowly
+    one.drive(WAYS[:1])
+    sleep(0.1)
+    one.session.stop(0.05)
+    until(lambda: one.slam.map.keyframes)
+    sleep(0.2)
+    assert not one.graph.batches
+
+
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
 def test_an_error_in_the_thread_is_no_silent_stall(live):
     one = live()
