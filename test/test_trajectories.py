@@ -1,6 +1,7 @@
 """Trajectory files: exact, and never lost."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -94,3 +95,21 @@ def test_a_wrong_tum_line_is_named(tmp_path, line, said):
     (tmp_path / 'a.tum').write_text(f'# stamp pose\n{line}\n')
     with pytest.raises(DjetError, match=said):
         read_tum(tmp_path / 'a.tum')
+
+
+def test_of_a_line_that_the_disk_has_no_room_for_nothing_stays(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with TumWriter(tmp_path / 'full.txt') as writer:
+        for i in range(20):
+            writer.write(i, np.eye(4))
+        whole = (tmp_path / 'full.txt').read_bytes()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 7, limits[1]))
+        try:
+            for _ in range(2):
+                with pytest.raises(DjetError, match='what it holds so far is whole'):
+                    writer.write(20, np.eye(4))
+                assert (tmp_path / 'full.txt').read_bytes() == whole
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        writer.write(20, np.eye(4))
+    assert len(read_tum(tmp_path / 'full.txt')[0]) == 21

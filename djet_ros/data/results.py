@@ -23,6 +23,7 @@ from typing import Any, Self
 from djet_ros.config import Config, dump_yaml, NODE_NAME
 from djet_ros.core.types import Array
 from djet_ros.data.bag_writers import ResultBag
+from djet_ros.data.text import LineFile
 from djet_ros.data.trajectories import KittiWriter, TumWriter
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.pair_errors import Pair, PairErrors
@@ -57,7 +58,7 @@ class ResultsFolder:
         try:
             _make_room(path, overwrite)
             (path / 'config.yaml').write_text(dump_yaml(config))
-            self._table = (path / 'frames.csv').open('x', buffering=1, newline='')
+            self._table = LineFile(path / 'frames.csv')
         except OSError as error:
             raise _blame(path, error) from error
         self.finish({'complete': False, 'error': 'the run did not come to its end'})

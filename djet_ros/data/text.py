@@ -77,6 +77,36 @@ def _unfolded(node: Any, known: dict[int, int]) -> int:
     return count
 
 
+class LineFile:
+    """
+    A new text file that holds whole lines only.
+
+    Each line is handed to the operating system as it is written, so that a kill loses nothing; of
+    one that a disk has no room for nothing stays. Creating, writing and closing raise OSError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, which must not exist."""
+        self._file = path.open('xb', buffering=0)
+
+    def write(self, line: str) -> int:
+        """Append a line, with its end."""
+        begin = self._file.tell()
+        rest = line.encode()
+        try:
+            while rest:
+                rest = rest[self._file.write(rest):]
+        except OSError:
+            self._file.truncate(begin)
+            self._file.seek(begin)
+            raise
+        return len(line)
+
+    def close(self) -> None:
+        """Close the file; writing has already been done line by line."""
+        self._file.close()
+
+
 def lines(path: Path) -> Iterator[tuple[int, str]]:
     """Non-empty lines that are no comment, stripped, with their numbers from 1."""
     for number, line in enumerate(read_text(path).splitlines(), 1):

@@ -12,10 +12,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TextIO
+from typing import Self
 
 from djet_ros.core.types import Array
-from djet_ros.data.text import check_positions, nanoseconds, stamped_rows
+from djet_ros.data.text import check_positions, LineFile, nanoseconds, stamped_rows
 from djet_ros.errors import DjetError
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ class TrajectoryWriter(ABC):
         """Create the file; DjetError where it can't be or exists."""
         self.path = path
         try:
-            self._file: TextIO = path.open('x', buffering=1, encoding='ascii', newline='\n')
+            self._file = LineFile(path)
         except OSError as error:
             raise DjetError(f'{path} could not be created: {error.strerror}') from error
 
@@ -47,7 +47,7 @@ class TrajectoryWriter(ABC):
                             'holds so far is whole') from error
 
     def close(self) -> None:
-        """Close the file; writing has already been done line by line."""
+        """Close the file."""
         self._file.close()
 
     def __enter__(self) -> Self:
