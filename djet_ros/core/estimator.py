@@ -9,7 +9,7 @@ from time import perf_counter
 
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.covariance import pose_covariance
-from djet_ros.core.features import detect_orb, match_features
+from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.geometry import (
     epipolar_lines,
     fit_rotation,
@@ -69,8 +69,10 @@ class TwoViewEstimator:
 
     def match(self, previous: View, current: View) -> tuple[Array, Array]:
         """Match the features of two views: pixels x and y (N, 2) in the one and the other."""
-        radius = self.config.search_radius * max(current.gray.shape)
-        matches = match_features(previous.features, current.features, radius)
+        share = self.config.search_radius
+        matches = (match_everywhere(previous.features, current.features) if share >= 1 else
+                   match_nearby(previous.features, current.features,
+                                share * max(current.gray.shape)))
         return previous.features.points[matches[:, 0]], current.features.points[matches[:, 1]]
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 from djet_ros.core.types import Array, Features
@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 # Features of the previous image that are compared at once; bounds the memory of a comparison.
 _STRIP = 128
 
-# Taken off the similarity (within +-256) of features that are too far apart; subtracting is many
-# times faster than assigning by mask.
-_FAR = np.float32(1000.0)
+# How many octaves of ORB's pyramid a feature may change: one more is a factor of 1.2 in size.
+_OCTAVES = 1
+
+# Bits that a feature at the search radius has to agree in beyond one that has not moved.
+_DISTANCE_BITS = 32
 
 
 def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20) -> Features:
@@ -39,53 +41,84 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
         descriptors=np.asarray(descriptors, np.uint8))
 
 
-def match_features(previous: Features, current: Features,
-                   search_radius: float) -> NDArray[np.int64]:
+def match_everywhere(previous: Features, current: Features) -> NDArray[np.int64]:
+    """
+    Match all features with all by Hamming distance, with cross-check, as the paper does.
+
+    Gives (M, 2) indices into the previous and the current features, in the order of the former.
+    """
+    if not len(previous) or not len(current):
+        return np.empty((0, 2), np.int64)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
+        previous.descriptors, current.descriptors)
+    return np.array([(m.queryIdx, m.trainIdx) for m in matches], np.int64).reshape(-1, 2)
+
+
+def match_nearby(previous: Features, current: Features,
+                 search_radius: float) -> NDArray[np.int64]:
     """
     Match by Hamming distance with cross-check, among features at most search_radius pixels apart.
 
     Gives (M, 2) indices into the previous and the current features, in the order of the former.
-    Distances are taken as matrix products of +-1 descriptors, exactly, in vertical strips:
-    several times faster than brute force over all pairs, and with fewer chances to be wrong.
+    Only features of like size are compared, and the nearer of two that look alike is preferred.
+    Matrix products of +-1 descriptors, in strips of the image, give the distances: several times
+    faster than brute force over all pairs, and with fewer chances to be wrong.
     """
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)
-    rows, columns = _from_left_to_right(previous), _from_left_to_right(current)
+    rows, columns = _by_octave_and_column(previous), _by_octave_and_column(current)
     there, here = previous.points[rows], current.points[columns]
-    signs_there, signs_here = previous.signs[rows], current.signs[columns]
-    forward = np.full(len(rows), -1, np.int64)
-    backward = np.full(len(columns), -1, np.int64)
-    best = np.full(len(columns), -_FAR, np.float32)
-    for start in range(0, len(rows), _STRIP):
-        strip = slice(start, start + _STRIP)
-        left, right = there[strip][[0, -1], 0] + (-search_radius, search_radius)
-        near = slice(np.searchsorted(here[:, 0], left), np.searchsorted(here[:, 0], right))
-        if near.start == near.stop:
-            continue
-        similarity = signs_there[strip] @ signs_here[near].T
-        apart = _squared_distances(there[strip], here[near]) > search_radius**2
-        similarity -= apart * _FAR
+    left, right = _comparable(previous, rows, current, columns, search_radius)
+    claim, best_there = np.zeros(len(rows), np.int64), np.full(len(rows), -np.inf, np.float32)
+    best_here = np.full(len(columns), -np.inf, np.float32)
+    for strip, near in _neighbourhoods(previous.octaves[rows], there[:, 0],
+                                       current.octaves[columns], here[:, 0], search_radius):
+        similarity = left[strip] @ right[near].T
         nearest = similarity.argmax(1)
-        found = np.take_along_axis(similarity, nearest[:, None], 1)[:, 0] > -_FAR / 2
-        forward[strip] = np.where(found, nearest + near.start, -1)
-        # A current feature keeps the best claim of all strips.
-        claimant = similarity.argmax(0)
-        claim = np.take_along_axis(similarity, claimant[None], 0)[0]
-        backward[near] = np.where(claim > best[near], claimant + start, backward[near])
-        best[near] = np.maximum(claim, best[near])
-    mutual = np.flatnonzero((forward >= 0) & (backward[forward] == np.arange(len(forward))))
-    matches = np.stack([rows[mutual], columns[forward[mutual]]], axis=1)
-    return matches[np.argsort(matches[:, 0])]
+        highest = similarity[np.arange(len(nearest)), nearest]
+        claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
+        np.maximum(best_there[strip], highest, out=best_there[strip])
+        np.maximum(best_here[near], similarity.max(0), out=best_here[near])
+    apart = np.linalg.norm(here[claim] - there, axis=1)
+    mutual = np.isfinite(best_there) & (best_there == best_here[claim]) & (apart <= search_radius)
+    matches = np.stack([rows[mutual], columns[claim[mutual]]], axis=1)
+    _, first = np.unique(matches[:, 1], return_index=True)  # twins claim the same feature
+    return matches[first][np.argsort(matches[first, 0])]
 
 
-def _from_left_to_right(features: Features) -> NDArray[np.int64]:
-    return np.argsort(features.points[:, 0], kind='stable')
+def _by_octave_and_column(features: Features) -> NDArray[np.int64]:
+    return np.lexsort((features.points[:, 0], features.octaves))
 
 
-def _squared_distances(a: Array, b: Array) -> NDArray[np.float32]:
-    """Squared distances (N, M) between points (N, 2) and (M, 2), as one small matrix product."""
-    centre = a.mean(0)  # keeps the terms small, so that single precision is enough
-    a, b = a - centre, b - centre
-    left = np.column_stack([-2 * a, (a * a).sum(1), np.ones(len(a))]).astype(np.float32)
-    right = np.column_stack([b, np.ones(len(b)), (b * b).sum(1)]).astype(np.float32)
-    return np.asarray(left @ right.T)
+def _comparable(previous: Features, rows: NDArray[np.int64], current: Features,
+                columns: NDArray[np.int64],
+                search_radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """
+    Factors (N, 260) and (M, 260) whose product is the similarity of features.
+
+    256 - 2 Hamming distances, less 2 _DISTANCE_BITS (distance / search_radius)^2.
+    """
+    centre = previous.points.mean(0)  # keeps the numbers small: single precision is enough
+    weight = np.sqrt(2 * _DISTANCE_BITS) / search_radius
+    a, b = ((f.points[order] - centre) * weight
+            for f, order in ((previous, rows), (current, columns)))
+    a_columns = [2 * a, -(a * a).sum(1, keepdims=True), -np.ones((len(a), 1))]
+    b_columns = [b, np.ones((len(b), 1)), (b * b).sum(1, keepdims=True)]
+    return (np.concatenate([previous.signs[rows], *a_columns], axis=1, dtype=np.float32),
+            np.concatenate([current.signs[columns], *b_columns], axis=1, dtype=np.float32))
+
+
+def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,
+                    octaves_here: NDArray[np.int32], x_here: Array,
+                    search_radius: float) -> Iterator[tuple[slice, slice]]:
+    """Give strips of features of one octave, each with those in the other image to compare."""
+    for octave in np.unique(octaves_there):
+        start, end = np.searchsorted(octaves_there, (octave, octave + 1))
+        for first in range(start, end, _STRIP):
+            strip = slice(first, min(first + _STRIP, end))
+            reach = x_there[strip][[0, -1]] + (-search_radius, search_radius)
+            for other in range(octave - _OCTAVES, octave + _OCTAVES + 1):
+                there, after = np.searchsorted(octaves_here, (other, other + 1))
+                near = there + np.searchsorted(x_here[there:after], reach)
+                if near[0] < near[1]:
+                    yield strip, slice(*near.tolist())

@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 from djet_ros.core.config import preset
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.features import match_features
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.types import Array, RelativePose, View
@@ -176,11 +175,9 @@ def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
     """First two frames with very many matches, in random order: any first n are a fair n."""
     crowd = _estimator(max_features=4 * max(POINTS), fast_threshold=5)
     previous, current = (crowd.view(sequence.image(i), sequence.K) for i in (0, 1))
-    radius = crowd.config.search_radius * max(previous.gray.shape)
-    matches = match_features(previous.features, current.features, radius)
-    matches = np.random.default_rng(0).permutation(matches)
-    return (previous, current, previous.features.points[matches[:, 0]],
-            current.features.points[matches[:, 1]])
+    x, y = crowd.match(previous, current)
+    order = np.random.default_rng(0).permutation(len(x))
+    return previous, current, x[order], y[order]
 
 
 def _stage_ms(previous: View, current: View, x: Array, y: Array, name: str,
