@@ -8,6 +8,7 @@ from djet_ros.core.geometry import (
     essential,
     fit_rotation,
     fundamental,
+    growth,
     homogeneous,
     in_front,
     line_distances,
@@ -119,6 +120,15 @@ def test_chirality_is_told_for_each_point_by_itself():
     far_away = rays(K, seen.x) @ seen.R.T
     rays_y[behind] = 2 * far_away[behind] - rays_y[behind]
     assert np.array_equal(in_front(seen.R, seen.t, rays(K, seen.x), rays_y), ~behind)
+
+
+@pytest.mark.parametrize('t', [FORWARD, BACKWARD, SIDEWAYS])
+def test_growth_is_depth_before_over_depth_after(t):
+    seen = two_views(np.random.default_rng(6), t=t, near=3, far=30)
+    depths = seen.points[:, 2], (seen.points @ seen.R.T + seen.t)[:, 2]
+    for sign in (1, -1):  # t and -t have the same essential matrix
+        found = growth(seen.R, sign * seen.t, rays(K, seen.x), rays(K, seen.y))
+        assert np.allclose(found, depths[0] / depths[1])
 
 
 def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():

@@ -11,6 +11,7 @@ from djet_ros.core.hamming import (
     descriptor_bits,
     hamming_surfaces,
     match_distances,
+    resized_descriptor_bits,
     smooth,
 )
 from djet_ros.core.orb_pattern import REACH, TESTS
@@ -116,6 +117,25 @@ def test_many_points_at_once_are_as_one_at_a_time():
     for k in (0, 2047, 2048, 4095, 4096, 4999):
         alone = hamming_surfaces(bits[:, k:k + 1], image_b, points[k:k + 1], 2)
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
+
+
+def test_a_patch_seen_at_another_size_is_tested_that_much_nearer_or_further_away():
+    smoothed = smooth(pictures()['textured'])
+    points, growth = np.array([[60, 50], [90, 60], [70, 70]]), np.array([1.0, 1.25, 0.8])
+    bits = resized_descriptor_bits(smoothed, points, growth)
+    assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
+
+    def between(x, y):
+        column, row = int(np.floor(x)), int(np.floor(y))
+        corner = smoothed[row:row + 2, column:column + 2].astype(float)
+        return np.array([1 - (y - row), y - row]) @ corner @ np.array([1 - (x - column),
+                                                                      x - column])
+
+    for k in (1, 2):
+        for test, bit in zip(TESTS, bits[:, k]):
+            p, q = (between(*(points[k] + test[i:i + 2] / growth[k])) for i in (0, 2))
+            # OpenCV rounds intensities to whole gray levels
+            assert bit == (p < q) or abs(p - q) < 1.5
 
 
 def test_no_points_have_no_descriptors():

@@ -100,11 +100,27 @@ def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.boo
     Only signs are taken, so that far points count like near ones: cv2.recoverPose ignores points
     beyond 50 baselines and then decides forward motion on a handful.
     """
+    depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
+    return np.asarray((depth_x > 0) & (depth_y > 0))
+
+
+def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
+    """
+    Tell, (N,), how many times larger the surroundings of points are seen in B than in A.
+
+    That is depth in A over depth in B, whatever the length and the sign of t: next to 1 for far
+    points, negative where a point is in front of one camera alone, NaN where it is anywhere.
+    """
+    depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return np.asarray(depth_x / depth_y)
+
+
+def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
+    """Depths (N,) in A and in B, both times the same positive number for a point."""
     m = rays_x @ R.T
     normal = np.cross(m, rays_y)
-    depth_x = -(np.cross(t, rays_y) * normal).sum(1)
-    depth_y = -(np.cross(t, m) * normal).sum(1)
-    return np.asarray((depth_x > 0) & (depth_y > 0))
+    return -(np.cross(t, rays_y) * normal).sum(1), -(np.cross(t, m) * normal).sum(1)
 
 
 def rotation_angle(Ra: Array, Rb: Array) -> float:

@@ -20,6 +20,11 @@ Pixels = NDArray[np.int64]
 _BLOCK = 2048
 
 
+# Tests per pass over the points: enough to spare calls, few enough to stay in the cache. All 256
+# at once would overflow the bytes in which they are counted.
+_TESTS_AT_ONCE = 32
+
+
 def smooth(gray: Image) -> Image:
     """
     Smooth an (H, W) image the way ORB does before its binary tests, bit for bit.
@@ -48,6 +53,22 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
     patches = _gather_patches(smoothed, points, REACH)
     px, py, qx, qy = TESTS.T + REACH
     return np.asarray(patches[py, px] < patches[qy, qx])
+
+
+def resized_descriptor_bits(smoothed: Image, points: Pixels, growth: Array) -> NDArray[np.bool_]:
+    """
+    Descriptors d(x), as (256, N) bits, of patches as they look when seen `growth` times as large.
+
+    points: (N, 2) whole pixels; growth: (N,). The tests reach for intensities between pixels,
+    1 / growth as far from the point; beyond the image its border goes on.
+    """
+    if not len(points):
+        return np.zeros((256, 0), bool)
+    reach = (1 / growth).astype(np.float32)
+    ends = TESTS.reshape(512, 2).astype(np.float32)
+    x, y = (points[:, axis].astype(np.float32) + ends[:, axis, None] * reach for axis in (0, 1))
+    values = cv2.remap(smoothed, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values[0::2] < values[1::2])
 
 
 def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
@@ -103,18 +124,16 @@ def _gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
 def _count_differing_tests(bits: NDArray[np.bool_], patches: Image,
                            radius: int) -> NDArray[np.uint16]:
     side = 2 * radius + 1
-    shape = (side, side, patches.shape[2])
-    total = np.zeros(shape, np.uint16)
-    outcome = np.empty(shape, bool)
-    tests = list(zip((TESTS + REACH).tolist(), bits))
-    for half in (tests[:128], tests[128:]):  # all 256 tests at once would overflow a byte
-        count = np.zeros(shape, np.uint8)
-        for (px, py, qx, qy), bit in half:
+    total = np.zeros((side, side, patches.shape[2]), np.uint16)
+    outcomes = np.empty((_TESTS_AT_ONCE, *total.shape), bool)
+    tests = (TESTS + REACH).tolist()
+    for first in range(0, len(tests), _TESTS_AT_ONCE):
+        some = slice(first, first + _TESTS_AT_ONCE)
+        for outcome, (px, py, qx, qy) in zip(outcomes, tests[some]):
             np.less(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
                     out=outcome)
-            np.not_equal(outcome, bit, out=outcome)
-            np.add(count, outcome.view(np.uint8), out=count)
-        total += count
+        np.not_equal(outcomes, bits[some, None, None], out=outcomes)
+        total += np.add.reduce(outcomes.view(np.uint8), axis=0, dtype=np.uint8)
     return total
 
 
