@@ -103,6 +103,44 @@ def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(
             assert np.array_equal(getattr(asked, name), getattr(fresh, name)), name
 
 
+def magnified(factor):
+    """Give a wall, the wall seen `factor` times as large, and where its points (N, 2) went."""
+    image = textured(np.random.default_rng(38), (320, 240))
+    middle = np.array([160.0, 120.0])
+    M = cv2.getRotationMatrix2D(tuple(middle), 0, factor)
+    grid = np.stack(np.meshgrid(np.arange(60, 260, 9), np.arange(60, 180, 9)), -1)
+    x = grid.reshape(-1, 2).astype(float)
+    return view(image), view(cv2.warpAffine(image, M, (320, 240), flags=cv2.INTER_CUBIC)), x, (
+        (x - middle) * factor + middle)
+
+
+@pytest.mark.parametrize('factor', [0.85, 1.2])
+def test_descriptors_are_found_nearer_to_the_truth_where_the_reference_is_resized(factor):
+    previous, current, x, y = magnified(factor)
+    errors = {}
+    for growth in (None, np.full(len(x), factor)):
+        surface = DescriptorSurface(previous, current, x, EstimatorConfig())
+        fitted, _ = with_minimum(surface.around(y, growth), 'project')
+        errors[growth is None] = np.median(np.linalg.norm(fitted.minima() - y, axis=1))
+    assert errors[False] < 0.7 * errors[True]
+
+
+@pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
+@pytest.mark.parametrize('factor', [0.85, 1.2])
+def test_patches_look_more_alike_where_the_reference_is_resized(kind, factor):
+    previous, current, x, y = magnified(factor)
+    plain, resized = (np.median(kind(previous, current, x, EstimatorConfig()).around(y, growth).c)
+                      for growth in (None, np.full(len(x), factor)))
+    assert resized < plain
+
+
+def test_a_growth_of_one_changes_nothing(pair):
+    x = np.array([[60.4, 50.0], [90.0, 70.6]])
+    plain, same = (DescriptorSurface(*pair, x, EstimatorConfig()).around(x + 2.0, growth)
+                   for growth in (None, np.ones(2)))
+    assert np.array_equal(plain.A, same.A) and np.array_equal(plain.c, same.c)
+
+
 @pytest.mark.parametrize('side', [3, 7])
 def test_points_without_descriptors_at_the_border_have_no_surface(pair, side):
     margin, (width, height) = REACH + side // 2, SIZE

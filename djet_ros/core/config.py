@@ -30,7 +30,8 @@ class EstimatorConfig:
         minimum=1, maximum=255)
     search_radius: float = parameter(
         0.15, 'how far a feature is sought from its place in the previous image, as a share of '
-        'the longer image side; 1 searches the whole image', minimum=0.01, maximum=1.0)
+        'the longer image side, among those of like size; 1 matches all with all',
+        minimum=0.01, maximum=1.0)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)
     ransac_threshold: float = parameter(
@@ -46,6 +47,9 @@ class EstimatorConfig:
         minimum=0.0, maximum=15.0)
     snap_reference: bool = parameter(
         True, 'take geometry from the whole pixel at which the reference descriptor was sampled')
+    resize_reference: bool = parameter(
+        True, 'see each reference patch as large as the pose of the round before makes it, and '
+        'leave out matches whose size would have changed by more than a factor of 2')
     indefinite: str = parameter(
         'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
@@ -81,7 +85,8 @@ class EstimatorConfig:
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
     'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
-    'snap_reference': False, 'indefinite': 'drop', 'cull_outside': False, 'loss': 'none',
+    'snap_reference': False, 'resize_reference': False, 'indefinite': 'drop',
+    'cull_outside': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
 }
 

@@ -14,7 +14,7 @@ _CELL = 32
 
 # What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
 # once, as the normalised squared error on rendered streets; tests hold it on other scenes.
-_INFLATION = 4.0
+_INFLATION = 2.2
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,

@@ -12,7 +12,12 @@ from typing import Protocol
 
 import cv2
 from djet_ros.core.config import EstimatorConfig
-from djet_ros.core.hamming import describable, descriptor_bits, hamming_surfaces
+from djet_ros.core.hamming import (
+    describable,
+    descriptor_bits,
+    hamming_surfaces,
+    resized_descriptor_bits,
+)
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
     indefinite,
@@ -22,6 +27,11 @@ from djet_ros.core.paraboloid import (
 from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+
+# The outermost of a descriptor's tests is 13 pixels off, and moves by a quarter of a pixel.
+_GROWTH_STEP = 0.02
 
 
 class ResidualSurface(Protocol):
@@ -33,8 +43,13 @@ class ResidualSurface(Protocol):
 
     x: Array
 
-    def around(self, y: Array) -> Paraboloids:
-        """Paraboloids of the residual, valid in the neighbourhood of y (N, 2)."""
+    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+        """
+        Paraboloids of the residual, valid in the neighbourhood of y (N, 2).
+
+        growth: (N,) how many times larger the surroundings of x are seen around y; None where
+        that is not known, and for surfaces that are to be as the paper has them.
+        """
         ...
 
 
@@ -47,25 +62,35 @@ class DescriptorSurface:
         self._bits = np.zeros((256, len(x)), bool)
         self._bits[:, self._has_reference] = descriptor_bits(
             previous.smoothed, pixels[self._has_reference])
-        self._smoothed = current.smoothed
+        self._previous, self._smoothed = previous.smoothed, current.smoothed
+        self._pixels, self._growth = pixels, np.ones(len(x))
         self._radius = config.window // 2
         self._sigma = config.window_sigma
         self._latest = _no_paraboloids(len(x))
         self.x = pixels.astype(float) if config.snap_reference else x
 
-    def around(self, y: Array) -> Paraboloids:
+    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
         """Fit paraboloids to the Hamming surfaces around the whole pixels next to y."""
+        resized = np.zeros(len(y), bool) if growth is None else self._resize(growth)
         centres = np.rint(y).astype(np.int64)
         usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
         # Most windows stay on their pixel from one round to the next, and so does their fit.
-        moved = usable & (centres != self._latest.centres).any(1)
-        surfaces = hamming_surfaces(self._bits[:, moved], self._smoothed, centres[moved],
+        stale = usable & (resized | (centres != self._latest.centres).any(1))
+        surfaces = hamming_surfaces(self._bits[:, stale], self._smoothed, centres[stale],
                                     self._radius)
-        fitted = fit_paraboloids(surfaces, centres[moved].astype(float), self._sigma)
-        self._latest = replace(_put(self._latest, fitted, moved), usable=usable)
+        fitted = fit_paraboloids(surfaces, centres[stale].astype(float), self._sigma)
+        self._latest = replace(_put(self._latest, fitted, stale), usable=usable)
         # A match that never had a surface stays where it is.
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
+
+    def _resize(self, growth: Array) -> NDArray[np.bool_]:
+        """Sample reference descriptors at another size; tells, (N,) bool, where it mattered."""
+        resized = self._has_reference & (np.abs(growth / self._growth - 1) > _GROWTH_STEP)
+        self._bits[:, resized] = resized_descriptor_bits(
+            self._previous, self._pixels[resized], growth[resized])
+        self._growth = np.where(resized, growth, self._growth)
+        return resized
 
 
 class PhotometricSurface:
@@ -75,18 +100,21 @@ class PhotometricSurface:
         radius = config.window // 2
         steps = np.arange(-radius, radius + 1, dtype=np.float32)
         offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        self._radius = radius
+        self._radius, self._offsets = radius, offsets
         self._weights = _weight_window(offsets, config.window_sigma)
         self._image = current.smoothed.astype(np.float32)
         self._gradient = [
             np.asarray(cv2.Scharr(self._image, cv2.CV_32F, *order, scale=1 / 32), np.float32)
             for order in ((1, 0), (0, 1))]
-        self._reference = self._sample(previous.smoothed.astype(np.float32), x)
+        self._previous = previous.smoothed.astype(np.float32)
+        self._reference = self._sample(self._previous, x)
         self._has_reference = self._inside(x, previous.smoothed.shape)
         self.x = x
 
-    def around(self, y: Array) -> Paraboloids:
+    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
+        if growth is not None:
+            self._reference = self._sample(self._previous, self.x, growth)
         difference = self._reference - self._sample(self._image, y)
         gx, gy = (self._sample(component, y) for component in self._gradient)
         W = self._weights
@@ -97,25 +125,16 @@ class PhotometricSurface:
         usable = self._has_reference & self._inside(y, self._image.shape)
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
-    def _sample(self, image: NDArray[np.float32], points: Array) -> NDArray[np.float32]:
+    def _sample(self, image: NDArray[np.float32], points: Array,
+                growth: Array | None = None) -> NDArray[np.float32]:
         """
-        Bilinear samples (N, P^2) of the window around each point; anything for points outside.
+        Bilinear samples (N, P^2) of the window around each point, as it looks when grown.
 
         Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
         """
-        inside = self._inside(points, image.shape)
-        if not inside.any():
-            # The image may be smaller than a window.
-            return np.zeros((len(points), self._weights.size), np.float32)
-        places = np.where(inside[:, None], points, self._radius + 1)
-        corners = np.floor(places).astype(np.int64)
-        fx, fy = (places - corners).astype(np.float32).T[:, :, None, None]
-        side = 2 * self._radius + 2
-        windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
-        patches = windows[corners[:, 1] - self._radius, corners[:, 0] - self._radius]
-        rows = (1 - fy) * patches[:, :-1] + fy * patches[:, 1:]
-        samples = (1 - fx) * rows[:, :, :-1] + fx * rows[:, :, 1:]
-        return np.asarray(samples.reshape(len(points), self._weights.size))
+        reach = np.ones(len(points)) if growth is None else 1 / growth
+        places = points.T[:, :, None] + reach[:, None] * self._offsets.T[:, None]
+        return np.asarray(map_coordinates(image, places[::-1], order=1, mode='nearest'))
 
     def _inside(self, points: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         margin = self._radius + 1
@@ -130,7 +149,7 @@ class ReprojectionSurface:
         self.x = x
         self._y = y
 
-    def around(self, y: Array) -> Paraboloids:
+    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
         """Give the same circular paraboloid wherever the keypoint has moved."""
         n = len(y)
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from djet_ros.core.config import EstimatorConfig
-from djet_ros.core.geometry import epipolar_lines, fundamental, homogeneous
+from djet_ros.core.geometry import epipolar_lines, fundamental, growth, homogeneous, rays
 from djet_ros.core.jet import (
     epipolar_residuals,
     jet_problem,
@@ -39,6 +39,10 @@ _REFINED_STARTS = 3
 
 # Steps after which the costs of several starts tell their basins apart.
 _STEPS_TO_COMPARE = 7
+
+# A patch that would be seen this many times larger or smaller, or by one camera from behind, is a
+# false match.
+_MOST_GROWTH = 2.0
 
 # A match agrees with a pose within this many robust standard deviations.
 _INLIER = 3.0
@@ -86,13 +90,16 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     """
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     alive = np.ones(len(y), bool)
-    poses = starts
+    poses, grown = starts, None
+    plausible = np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
-        paraboloids, no_minimum = with_minimum(surface.around(keypoints), config.indefinite)
+        paraboloids, no_minimum = with_minimum(
+            surface.around(keypoints, grown), config.indefinite)
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive &= paraboloids.usable
-        voting = alive & (_minimum_inside(paraboloids, config) | (not config.cull_outside))
+        voting = alive & plausible & (
+            _minimum_inside(paraboloids, config) | (not config.cull_outside))
         if voting.sum() < config.min_matches:
             return None
         # Step 2: global pose optimisation.
@@ -107,6 +114,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         if converged or iteration == config.max_iterations:
             break
         keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
+        if config.resize_reference:
+            grown, plausible = _growth(pose, K, surface.x, optimum)
     return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
                  no_minimum, iteration)
 
@@ -162,6 +171,14 @@ def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array
     # Beyond the sampled window a paraboloid says nothing, so no step is longer than that.
     longest = 1.0 if config.step == 'pixel' else config.window / 2
     return np.asarray(keypoints + way * np.minimum(1.0, longest / np.maximum(length, 1e-12)))
+
+
+def _growth(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Tell how much larger patches are seen at y than at x, 1 where that is not plausible."""
+    seen = growth(pose.R, pose.t, rays(K, x), rays(K, y))
+    seen = np.where(np.isnan(seen), 1.0, seen)  # without any parallax, or on the epipole
+    plausible = (seen > 1 / _MOST_GROWTH) & (seen < _MOST_GROWTH)
+    return np.where(plausible, seen, 1.0), plausible
 
 
 def _change(before: Pose, after: Pose) -> float:

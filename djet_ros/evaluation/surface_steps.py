@@ -8,7 +8,7 @@ from pathlib import Path
 
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances
-from djet_ros.core.hamming import describable, descriptor_bits, hamming_surfaces
+from djet_ros.core.hamming import describable, hamming_surfaces, resized_descriptor_bits
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.starts import five_point, several
 from djet_ros.core.surfaces import DescriptorSurface, ResidualSurface
@@ -46,12 +46,14 @@ class Round:
     """
     A round of Algorithm 1 for all N matches.
 
-    keypoints: (N, 2) where the surfaces were sampled around; fits: the paraboloids there; lines:
-    (N, 3) epipolar lines of the pose found on them; optima: (N, 2) places y + v_opt.
+    keypoints: (N, 2) where the surfaces were sampled around; fits: the paraboloids there;
+    growth: (N,) size at which the reference patches were seen; lines: (N, 3) epipolar lines of
+    the pose found on them; optima: (N, 2) places y + v_opt.
     """
 
     keypoints: Array
     fits: Paraboloids
+    growth: Array
     lines: Array
     optima: Array
 
@@ -77,12 +79,12 @@ class _Observed:
 
     def __init__(self, surface: ResidualSurface) -> None:
         self.x = surface.x
-        self.seen: list[tuple[Array, Paraboloids]] = []
+        self.seen: list[tuple[Array, Paraboloids, Array]] = []
         self._surface = surface
 
-    def around(self, y: Array) -> Paraboloids:
-        fits = self._surface.around(y)
-        self.seen.append((y.copy(), fits))
+    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+        fits = self._surface.around(y, growth)
+        self.seen.append((y.copy(), fits, np.ones(len(y)) if growth is None else growth))
         return fits
 
 
@@ -118,9 +120,9 @@ def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorC
 
 
 def _round(track: Track, surface: _Observed, K: Array) -> Round:
-    keypoints, fits = surface.seen[-1]
+    keypoints, fits, growth = surface.seen[-1]
     lines = epipolar_lines(fundamental(K, track.pose.R, track.pose.t), surface.x)
-    return Round(keypoints, fits, lines, track.y_opt)
+    return Round(keypoints, fits, growth, lines, track.y_opt)
 
 
 def telling_match(course: Course, window: int) -> int:
@@ -192,8 +194,8 @@ def _draw_round(axes: Axes, course: Course, match: int, index: int, window: int)
     step = course.rounds[index]
     centre = np.rint(course.y[match]).astype(np.int64)
     pixels = np.rint(course.x[[match]]).astype(np.int64)
-    surface = hamming_surfaces(descriptor_bits(course.previous.smoothed, pixels),
-                               course.current.smoothed, centre[None], RADIUS)[:, :, 0]
+    bits = resized_descriptor_bits(course.previous.smoothed, pixels, step.growth[[match]])
+    surface = hamming_surfaces(bits, course.current.smoothed, centre[None], RADIUS)[:, :, 0]
     draw_patch(axes, course.current.gray, centre, RADIUS)
     draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:
