@@ -484,3 +484,16 @@ def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, pr
     if result.status == Status.OK:
         variances = np.linalg.eigvalsh(result.covariance_5)
         assert variances[0] > -1e-8 * variances[-1] and variances[-1] > 0
+
+
+@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('method', ['djet', 'rpe'])
+def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
+    """Some hundred matches of noise always fit some essential matrix."""
+    estimator = TwoViewEstimator(preset(preset_name, method=method))
+    rng = np.random.default_rng(57)
+    camera = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    views = [estimator.view(rng.integers(0, 256, (240, 320), dtype=np.uint8), camera)
+             for _ in range(2)]
+    result = estimator.estimate(*views)
+    assert result.status in (Status.TOO_FEW_MATCHES, Status.DEGENERATE)

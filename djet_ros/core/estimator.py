@@ -31,6 +31,10 @@ from djet_ros.core.types import Array, Features, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
+# Bits that differ between the descriptors of matches beyond which they are no better than chance:
+# 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
+_CHANCE_BITS = 112
+
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
 
@@ -127,8 +131,10 @@ class TwoViewEstimator:
 
         covariance_5, covariance_6 = pose_covariance(
             track.residuals, track.loss, x[track.voting], t, flipped)
+        hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
         status = Status.OK
-        if inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all():
+        if (inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all()
+                or _by_chance(hamming[inliers])):
             status, t = Status.DEGENERATE, np.zeros(3)
         else:
             # Where a rotation alone explains the matches, any direction of t would do.
@@ -140,9 +146,14 @@ class TwoViewEstimator:
         return RelativePose(
             status, R, t, covariance_5, covariance_6, x=x, y=y, y_opt=track.y_opt,
             inliers=inliers, residuals=line_distances(lines, y),
-            hamming=match_distances(previous.smoothed, x, current.smoothed, track.y_opt),
-            losses=track.losses, culled=int((~track.voting).sum()), indefinite=track.indefinite,
-            iterations=track.iterations)
+            hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
+            indefinite=track.indefinite, iterations=track.iterations)
+
+
+def _by_chance(hamming: Array) -> bool:
+    """Tell of descriptor distances (N,), NaN where there is none, whether chance explains them."""
+    known = hamming[np.isfinite(hamming)]
+    return bool(known.size and np.median(known) > _CHANCE_BITS)
 
 
 def _pose(prior: RelativePose | None) -> Pose | None:
