@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 import pickle
 
+from cards import Cards, K as CARDS_K, pose
 import cv2
 from djet_ros.core.config import EstimatorConfig, METHODS, preset
 from djet_ros.core.estimator import TwoViewEstimator
@@ -20,7 +21,7 @@ from djet_ros.core.geometry import (
     sphere_tangents,
 )
 from djet_ros.core.hamming import dense_descriptors
-from djet_ros.core.starts import Pose, several
+from djet_ros.core.starts import five_point, planar, Pose, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import RelativePose, Status
@@ -497,3 +498,40 @@ def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
              for _ in range(2)]
     result = estimator.estimate(*views)
     assert result.status in (Status.TOO_FEW_MATCHES, Status.DEGENERATE)
+
+
+@pytest.mark.parametrize('goes', [pose(x=0.25), pose(x=0.2, z=0.1, yaw=-0.01),
+                                  pose(x=0.1, z=0.3)])
+def test_the_twin_motion_of_a_plane_is_not_taken_for_the_cameras(goes):
+    """Three planes, one of them behind most of the matches: it looks alike under two motions."""
+    cards, estimator = Cards(), TwoViewEstimator()
+    true = np.linalg.inv(goes)
+    for seed in range(6):
+        views = [estimator.view(cards.gray(where, noise=2 * seed + i), CARDS_K)
+                 for i, where in enumerate((pose(), goes))]
+        result = estimator.estimate(*views)
+        assert errors_of(result, true[:3, :3], true[:3, 3])[1] < 10
+
+
+def test_a_plane_starts_from_its_motion_among_others():
+    rng = np.random.default_rng(58)
+    x = rng.uniform((0, 0), SIZE, (200, 2))
+    R, t = Rotation.from_rotvec(TURN).as_matrix(), np.array([0.3, 0.1, -0.2])
+    H = K @ (R + np.outer(t, [0.1, 0.2, 0.15])) @ np.linalg.inv(K)
+    y = np.column_stack([x, np.ones(200)]) @ H.T
+    starts = planar(K, x, y[:, :2] / y[:, 2:], 1.0)
+    assert 2 <= len(starts) <= 4
+    errors = [rotation_angle(start.R, R) + direction_angle(start.t, t) for start in starts]
+    assert min(errors) < 1e-3
+
+
+def test_points_without_any_plane_have_no_planar_start():
+    assert planar(K, np.zeros((30, 2)), np.ones((30, 2)), 1.0) == []
+
+
+def test_a_camera_matrix_cut_out_of_a_larger_one_is_as_good_as_any():
+    seen = two_views(np.random.default_rng(59))
+    P = np.hstack([K, np.ones((3, 1))])
+    for robust in (False, True):
+        whole, cut = (five_point(camera, seen.x, seen.y, 1.0, robust) for camera in (K, P[:, :3]))
+        assert np.array_equal(whole[0].R, cut[0].R) and np.array_equal(whole[0].t, cut[0].t)

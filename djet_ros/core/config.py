@@ -38,7 +38,7 @@ class EstimatorConfig:
         1.0, 'inlier threshold of the 5-point RANSAC start, in pixels', minimum=0.05, maximum=20.0)
     starts: str = parameter(
         'several', 'starting poses: five_point (RANSAC inliers only), or several (robust 5-point, '
-        'previous motion, pure forward; all matches)', choices=('several', 'five_point'))
+        'planes, previous motion, pure forward; all matches)', choices=('several', 'five_point'))
     window: int = parameter(
         5, 'side of the square in which a residual surface is sampled, in pixels',
         minimum=3, maximum=15, odd=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-from djet_ros.core.geometry import in_front, rays
+from djet_ros.core.geometry import in_front, rays, unit
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,8 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     None where no essential matrix was found.
     """
     method = cv2.USAC_MAGSAC if robust else cv2.RANSAC
-    E, mask = cv2.findEssentialMat(x, y, K, method=method, prob=0.999, threshold=threshold)
+    E, mask = cv2.findEssentialMat(x, y, np.ascontiguousarray(K), method=method, prob=0.999,
+                                   threshold=threshold)  # a view of a 3x4 matrix finds nothing
     if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
         return None
     inliers = mask.ravel() > 0
@@ -40,6 +41,21 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     rays_x, rays_y = rays(K, x[inliers]), rays(K, y[inliers])
     best = max(candidates, key=lambda p: int(in_front(p.R, p.t, rays_x, rays_y).sum()))
     return best, inliers
+
+
+def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
+    """
+    Start from the motions of a plane that many matches may lie on (at most four).
+
+    A plane is seen alike under two motions (its twin); RANSAC may take the wrong one of them.
+    x, y: (N, 2) pixels; threshold in pixels.
+    """
+    H, _ = cv2.findHomography(x, y, cv2.USAC_MAGSAC, 2 * threshold)
+    if H is None or not np.isfinite(H).all():
+        return []
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.ascontiguousarray(K))
+    return [Pose(np.asarray(R, float), unit(np.ravel(t)))
+            for R, t in zip(rotations, translations) if np.linalg.norm(t) > 1e-6]
 
 
 def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:

@@ -34,10 +34,10 @@ _EPIPOLE_BLUR = 5.0
 # motion in the scene fits many matches loosely, the camera's own fits most of them closely.
 _TIGHT = 1.0
 
-# Starts that are refined; of five, two are as a rule in the basin of another.
-_REFINED_STARTS = 3
-
-# Steps after which the costs of several starts tell their basins apart.
+# All starts make a few steps, the most promising of them some more: where a start lies says
+# little of its basin.
+_STEPS_TO_SKETCH = 4
+_REFINED_STARTS = 2
 _STEPS_TO_COMPARE = 7
 
 # A patch that would be seen this many times larger or smaller, or by one camera from behind, is a
@@ -136,8 +136,8 @@ def _cheapest(problem: JetProblem, starts: list[Pose],
     residuals = [epipolar_residuals(problem, s.R, s.t) for s in starts]
     scale = min(_scale(r) for r in residuals)
     tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
-    costs = [float(tight(r.r**2)[0].sum()) for r in residuals]
-    promising = [starts[i] for i in np.argsort(costs, kind='stable')[:_REFINED_STARTS]]
+    sketched = [minimise(problem, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts]
+    promising = sorted(sketched, key=lambda solution: solution.cost)[:_REFINED_STARTS]
     best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in promising),
                key=lambda solution: solution.cost)
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
