@@ -19,7 +19,6 @@ Pixels = NDArray[np.int64]
 # Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
 _BLOCK = 2048
 
-
 # Tests per pass over the points: enough to spare calls, few enough to stay in the cache. All 256
 # at once would overflow the bytes in which they are counted.
 _TESTS_AT_ONCE = 32
@@ -90,7 +89,9 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
         patches = _gather_patches(smoothed, centres[block], REACH + radius)
-        surfaces[:, :, block] = _count_differing_tests(bits[:, block], patches, radius)
+        # Bits chosen by a mask come points first, which is three times slower to count.
+        surfaces[:, :, block] = _count_differing_tests(
+            np.ascontiguousarray(bits[:, block]), patches, radius)
     return surfaces
 
 
