@@ -54,8 +54,15 @@ def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     if H is None or not np.isfinite(H).all():
         return []
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.ascontiguousarray(K))
-    return [Pose(np.asarray(R, float), unit(np.ravel(t)))
-            for R, t in zip(rotations, translations) if np.linalg.norm(t) > 1e-6]
+    return [Pose(_nearest_rotation(R), unit(np.ravel(t)))
+            for R, t in zip(rotations, translations)
+            if np.isfinite(R).all() and np.linalg.norm(t) > 1e-6]
+
+
+def _nearest_rotation(R: Array) -> Array:
+    """Give the rotation next to a matrix (3, 3): OpenCV's are off by as much as 1e-8."""
+    U, _, Vt = np.linalg.svd(np.asarray(R, float))
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:
