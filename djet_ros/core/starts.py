@@ -54,14 +54,14 @@ def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     if H is None or not np.isfinite(H).all():
         return []
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.ascontiguousarray(K))
-    return [Pose(_nearest_rotation(R), unit(np.ravel(t)))
+    return [Pose(_nearest_rotation(np.asarray(R, float)), unit(np.ravel(np.asarray(t, float))))
             for R, t in zip(rotations, translations)
             if np.isfinite(R).all() and np.linalg.norm(t) > 1e-6]
 
 
 def _nearest_rotation(R: Array) -> Array:
     """Give the rotation next to a matrix (3, 3): OpenCV's are off by as much as 1e-8."""
-    U, _, Vt = np.linalg.svd(np.asarray(R, float))
+    U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
