@@ -380,11 +380,12 @@ def test_split_bags_are_read_in_order_with_and_without_metadata(tmp_path):
         record(tmp_path / 'x', ((f'/part{part % 2}', pose(s), s) for s in stamps))
         shutil.move(tmp_path / 'x' / 'x.mcap', bag / f'bag_{part}.mcap')
         shutil.rmtree(tmp_path / 'x')
-    for metadata in (None, [f'bag_{part}.mcap' for part in range(11)],
+    for metadata in (None, [], [f'bag_{part}.mcap' for part in range(11)],
                      [f'bag/bag_{part}.mcap' for part in range(11)]):
-        if metadata:
+        if metadata is not None:  # an empty file is what a full disk leaves
             (bag / 'metadata.yaml').write_text(
-                f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}')
+                f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}'
+                if metadata else '')
         delivered, said = read_until_broken(bag)
         assert said is None
         assert [m.stamp_ns for m in delivered] == list(range(1, 34))

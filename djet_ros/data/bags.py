@@ -253,8 +253,9 @@ def _storage_files(folder: Path) -> list[Path]:
 def _listed(folder: Path) -> list[Path]:
     """Storage files of a rosbag2 folder as its metadata.yaml lists them."""
     metadata = folder / 'metadata.yaml'
-    if not metadata.exists():
-        # It is written last: a recorder that was killed leaves the storage files only.
+    if not metadata.exists() or not metadata.stat().st_size:
+        # It is written last: a recorder that was killed, or found the disk full, leaves the
+        # storage files only.
         if files := _storage_files(folder):
             return files
         raise DjetError(f'{folder} is no bag: it has neither metadata.yaml nor .mcap or .db3 '
