@@ -219,7 +219,9 @@ def test_other_programs_read_the_bag_of_an_interrupted_run(drive, tmp_path):
     trajectory = results / 'trajectory_tum.txt'
     wait_for(lambda: trajectory.exists() and trajectory.read_bytes().count(b'\n') >= 5)
     process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 130
+    assert process.wait(60) == 130
     with AnyReader([results / 'bag']) as reader:
         odometry = [c for c in reader.connections if c.topic == POSE_TOPIC]
-        assert sum(1 for _ in reader.messages(odometry)) == len(read_tum(trajectory)[0])
+        messages = sum(1 for _ in reader.messages(odometry))
+    # The interrupt may fall between the two files of one image.
+    assert abs(messages - len(read_tum(trajectory)[0])) <= 1
