@@ -14,14 +14,12 @@ from typing import Any, NamedTuple
 
 from djet_ros.odometry.frame_queue import FrameQueue
 from djet_ros.odometry.tracker import Outgoing
-from djet_ros.ros.session import SILENCE, Throttle, Wiring
+from djet_ros.ros.session import Latencies, SILENCE, Throttle, Wiring
 from djet_ros.slam.live import LiveSlam
 import numpy as np
 
 # Messages of the odometry that may wait while a graph is optimised.
 _WAITING = 1000
-
-_LATENCIES = 100
 
 
 class _Task(NamedTuple):
@@ -48,7 +46,7 @@ class GraphSession:
         # Taken by the thread before anything else: what waits here costs it nothing.
         self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._infos: deque[Any] = deque(maxlen=1)
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._latencies = Latencies()
         self._heard = dict.fromkeys(topics, -np.inf)
         self._stopping = False
         self._worker = Thread(target=self._work, name='pose_graph', daemon=True)
@@ -123,7 +121,7 @@ class GraphSession:
                 continue
             self._slam.face_values = self._face_values()
             self._publish(task.do())
-            self._latencies.append(monotonic() - task.since)
+            self._latencies.add(task.since)
             if self._slam.problem is not None:
                 self._log.warn(type(self._slam.problem).__name__, str(self._slam.problem))
 
@@ -143,12 +141,7 @@ class GraphSession:
         return [*self._slam.work(at_once=True), self._slam.diagnostics(time_ns())]
 
     def _face_values(self) -> dict[str, str]:
-        values = {'messages dropped': str(self._queue.dropped)}
-        if self._latencies:
-            median, high = np.percentile(self._latencies, (50, 95)) * 1e3
-            values.update({'latency, median (ms)': f'{median:.1f}',
-                           'latency, 95 % (ms)': f'{high:.1f}'})
-        return values
+        return {'messages dropped': str(self._queue.dropped), **self._latencies.values()}
 
     def _publish(self, outgoing: Sequence[Outgoing]) -> None:
         if outgoing and not self._stopping:

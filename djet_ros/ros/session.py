@@ -86,6 +86,28 @@ class Throttle:
         self._said.clear()
 
 
+class Latencies:
+    """How long the newest pieces of work took, from receipt to publication."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_LATENCIES)
+
+    def add(self, since: float) -> None:
+        """Take a piece of work that came in at a moment (monotonic seconds) and is done now."""
+        self._seconds.append(monotonic() - since)
+
+    def clear(self) -> None:
+        """Forget what was taken."""
+        self._seconds.clear()
+
+    def values(self) -> dict[str, str]:
+        """Give what diagnostics say of them; nothing where there are none."""
+        if not self._seconds:
+            return {}
+        median, high = np.percentile(self._seconds, (50, 95)) * 1e3
+        return {'latency, median (ms)': f'{median:.1f}', 'latency, 95 % (ms)': f'{high:.1f}'}
+
+
 class Session:
     """
     Works on images in a thread of its own, in the order in which they come.
@@ -109,7 +131,7 @@ class Session:
         self._taken_info: Any = None
         self._speeds: deque[Any] = deque(maxlen=_WAITING_SPEEDS)
         self._counted_drops = self._lost = 0
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
         self._log = Throttle(wiring)
         self._stopping = False
@@ -246,7 +268,7 @@ class Session:
         while self._speeds:
             tracker.speed(self._speeds.popleft())
         self._publish(tracker.image(received.image))
-        self._latencies.append(monotonic() - received.at)
+        self._latencies.add(received.at)
         self._log_trouble()
         if self._wiring.wants_debug_image() and (picture := tracker.debug_image()):
             self._publish([picture])
@@ -267,13 +289,9 @@ class Session:
             self._log_trouble()
 
     def _face_values(self) -> dict[str, str]:
-        values = {'frames lost on the way': str(self._lost),
-                  'queue policy': self._tracker.config.ros.queue_policy}
-        if self._latencies:
-            median, high = np.percentile(self._latencies, (50, 95)) * 1e3
-            values.update({'latency, median (ms)': f'{median:.1f}',
-                           'latency, 95 % (ms)': f'{high:.1f}'})
-        return values
+        return {'frames lost on the way': str(self._lost),
+                'queue policy': self._tracker.config.ros.queue_policy,
+                **self._latencies.values()}
 
     def _publish(self, outgoing: Sequence[Outgoing]) -> None:
         if self._stopping or not outgoing:
