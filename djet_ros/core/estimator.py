@@ -19,7 +19,7 @@ from djet_ros.core.geometry import (
     rays,
 )
 from djet_ros.core.hamming import match_distances, smooth
-from djet_ros.core.starts import five_point, planar, Pose, several
+from djet_ros.core.starts import five_point, Pose, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorSurface,
     PhotometricSurface,
@@ -93,8 +93,8 @@ class TwoViewEstimator:
             wide = config.starts == 'several' and config.method != 'five_point'
             found = five_point(K, x, y, config.ransac_threshold, robust=wide)
             if wide:
-                starts = [*several(found[0] if found else None, _pose(prior)),
-                          *planar(K, x, y, config.ransac_threshold)]
+                starts = starting_poses(K, x, y, config.ransac_threshold,
+                                        found[0] if found else None, _pose(prior))
             elif found:
                 starts, inliers = [found[0]], found[1]
                 x, y = x[inliers], y[inliers]

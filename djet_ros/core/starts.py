@@ -43,6 +43,17 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     return best, inliers
 
 
+def starting_poses(K: Array, x: Array, y: Array, threshold: float, robust: Pose | None,
+                   prior: Pose | None) -> list[Pose]:
+    """
+    Collect all starting poses of the preset ``best``.
+
+    x, y: (N, 2) pixels; threshold in pixels; robust, prior: what RANSAC found, and the previous
+    motion, if there are any.
+    """
+    return [*several(robust, prior), *planar(K, x, y, threshold)]
+
+
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     """
     Start from the motions of a plane that many matches may lie on (at most four).

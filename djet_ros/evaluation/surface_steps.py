@@ -10,7 +10,7 @@ from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances
 from djet_ros.core.hamming import describable, hamming_surfaces, resized_descriptor_bits
 from djet_ros.core.paraboloid import indefinite, Paraboloids
-from djet_ros.core.starts import five_point, planar, several
+from djet_ros.core.starts import five_point, starting_poses
 from djet_ros.core.surfaces import DescriptorSurface, ResidualSurface
 from djet_ros.core.tracking import Track, track_jointly
 from djet_ros.core.types import Array, View
@@ -102,7 +102,7 @@ def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorC
     pose, agreeing = found
     if not wide:
         x, y = x[agreeing], y[agreeing]
-    starts = ([*several(pose, None), *planar(K, x, y, config.ransac_threshold)] if wide
+    starts = (starting_poses(K, x, y, config.ransac_threshold, pose, None) if wide
               else [pose])
     rounds: list[Round] = []
     inliers = np.zeros(len(x), bool)
