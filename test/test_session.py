@@ -239,7 +239,7 @@ def test_a_stop_does_not_wait_for_ever(live, drive):
     one.send(drive[:1])
     start = monotonic()
     one.session.stop(0.2)
-    assert monotonic() - start < 1
+    assert monotonic() - start < 5
 
 
 def test_images_that_wait_for_room_do_not_hold_up_a_stop(live, drive):
@@ -258,7 +258,7 @@ def test_an_error_in_the_thread_is_no_silent_stall(live, drive):
     assert not one.session.failed
     one.graph.broken = True
     one.send(drive[:3])
-    end = monotonic() + 5
+    end = monotonic() + 20
     while not one.session.failed and monotonic() < end:
         sleep(0.01)
     assert one.session.failed
@@ -282,12 +282,11 @@ def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(l
 
 
 def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatch):
-    monkeypatch.setattr(sessions, 'SILENCE', 0.05)
     one = live()
     one.session.camera_info(None)
     one.session.tick()
     assert one.graph.lines == []
-    sleep(0.1)
+    monkeypatch.setattr(sessions, 'SILENCE', 0.0)
     for _ in range(3):
         one.session.tick()
     assert one.graph.lines == [
@@ -309,7 +308,8 @@ def test_a_camera_that_falls_silent_is_said_in_the_diagnostics(live, drive, monk
     assert 'rate (Hz)' not in one.graph.said()
 
 
-def test_diagnostics_are_not_said_twice_a_second(live, drive):
+def test_diagnostics_are_not_said_twice_in_a_period(live, drive, monkeypatch):
+    monkeypatch.setattr(sessions, '_DIAGNOSTICS_PERIOD', 60.0)
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -320,10 +320,9 @@ def test_diagnostics_are_not_said_twice_a_second(live, drive):
 
 
 def test_an_uncalibrated_camera_is_said_before_any_image_comes(live, monkeypatch):
-    monkeypatch.setattr(sessions, 'SILENCE', 0.05)
+    monkeypatch.setattr(sessions, 'SILENCE', 0.0)
     one = live()
     one.session.camera_info(camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12)))
-    sleep(0.1)
     one.session.tick()
     status = one.graph.heard('/diagnostics')[-1].status[0]
     assert (status.level, status.message) == (2, 'message rejected: uncalibrated')
