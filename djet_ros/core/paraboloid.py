@@ -79,11 +79,18 @@ def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
 
 def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
     """Raise the eigenvalues of A' to a small positive floor: every surface gets a minimum."""
-    eigenvalues, vectors = np.linalg.eigh(paraboloids.A)
+    A = paraboloids.A
+    mean = (A[:, 0, 0] + A[:, 1, 1]) / 2
+    spread = np.hypot((A[:, 0, 0] - A[:, 1, 1]) / 2, A[:, 0, 1])
+    eigenvalues = np.concatenate([mean - spread, mean + spread])
     positive = eigenvalues[eigenvalues > 0]
     floor = _CURVATURE_FLOOR * (float(np.median(positive)) if len(positive) else 1.0)
-    raised = vectors * np.maximum(eigenvalues, floor)[:, None, :]
-    return replace(paraboloids, A=raised @ vectors.transpose(0, 2, 1))
+    low = mean - spread < floor
+    eigenvalues, vectors = np.linalg.eigh(A[low])
+    raised = A.copy()
+    raised[low] = (vectors * np.maximum(eigenvalues, floor)[:, None, :]
+                   @ vectors.transpose(0, 2, 1))
+    return replace(paraboloids, A=raised)
 
 
 def inverse_2x2(A: Array) -> Array:
