@@ -19,6 +19,7 @@ from djet_ros.core.geometry import (
     rays,
 )
 from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.parallel import both
 from djet_ros.core.starts import five_point, Pose, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorSurface,
@@ -88,22 +89,23 @@ class TwoViewEstimator:
         if len(x) < config.min_matches:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
-        # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
-        with _timed(timings, 'starts'):
-            wide = config.starts == 'several' and config.method != 'five_point'
-            found = five_point(K, x, y, config.ransac_threshold, robust=wide)
-            if wide:
-                starts = starting_poses(K, x, y, config.ransac_threshold,
-                                        found[0] if found else None, _pose(prior))
-            elif found:
-                starts, inliers = [found[0]], found[1]
-                x, y = x[inliers], y[inliers]
-            else:
+        if config.starts == 'several' and config.method != 'five_point':
+            # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
+            # The first surfaces need no pose, and are sampled meanwhile.
+            starts, surface = both(
+                lambda: self._starts(K, x, y, prior, timings),
+                lambda: self._surface(previous, current, x, y, timings))
+        else:
+            # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
+            with _timed(timings, 'starts'):
+                found = five_point(K, x, y, config.ransac_threshold, robust=False)
+            if found is None:
                 return RelativePose(Status.DEGENERATE, x=x, y=y)
+            starts, x, y = [found[0]], x[found[1]], y[found[1]]
+            surface = self._surface(previous, current, x, y, timings)
 
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):
-            surface = self._surface(previous, current, x, y)
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
                      else track_jointly(surface, K, y, starts, config))
         if track is None:
@@ -111,12 +113,21 @@ class TwoViewEstimator:
         with _timed(timings, 'result'):
             return self._result(previous, current, surface, y, track)
 
-    def _surface(self, previous: View, current: View, x: Array, y: Array) -> ResidualSurface:
-        if self.config.method == 'djet':
-            return DescriptorSurface(previous, current, x, self.config)
-        if self.config.method == 'pjet':
-            return PhotometricSurface(previous, current, x, self.config)
-        return ReprojectionSurface(x, y)
+    def _starts(self, K: Array, x: Array, y: Array, prior: RelativePose | None,
+                timings: dict[str, float]) -> list[Pose]:
+        with _timed(timings, 'starts'):
+            return starting_poses(K, x, y, self.config.ransac_threshold, _pose(prior))
+
+    def _surface(self, previous: View, current: View, x: Array, y: Array,
+                 timings: dict[str, float]) -> ResidualSurface:
+        with _timed(timings, 'jet'):
+            if self.config.method == 'djet':
+                surface = DescriptorSurface(previous, current, x, self.config)
+                surface.around(y)  # it keeps them: the first round of tracking finds them done
+                return surface
+            if self.config.method == 'pjet':
+                return PhotometricSurface(previous, current, x, self.config)
+            return ReprojectionSurface(x, y)
 
     def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
                 track: Track) -> RelativePose:
@@ -174,4 +185,4 @@ def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
     try:
         yield
     finally:
-        timings[stage] = perf_counter() - start
+        timings[stage] = timings.get(stage, 0.0) + perf_counter() - start

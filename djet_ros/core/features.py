@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import cv2
+from djet_ros.core.parallel import both, each
 from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
     return Features(
-        points=np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2),
+        points=np.array(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2),
         octaves=np.array([k.octave for k in keypoints], np.int32),
         angles=np.array([k.angle for k in keypoints], np.float32),
         responses=np.array([k.response for k in keypoints], np.float32),
@@ -61,7 +62,7 @@ def match_nearby(previous: Features, current: Features,
 
     Gives (M, 2) indices into the previous and the current features, in the order of the former.
     Only features of like size are compared, and the nearer of two that look alike is preferred.
-    Matrix products of +-1 descriptors, in strips of the image, give the distances: several times
+    Matrix products of +-1/2 bits, in strips of the image, give the distances: several times
     faster than brute force over all pairs, and with fewer chances to be wrong.
     """
     if not len(previous) or not len(current):
@@ -71,19 +72,26 @@ def match_nearby(previous: Features, current: Features,
     left, right = _comparable(previous, rows, current, columns, search_radius)
     claim, best_there = np.zeros(len(rows), np.int64), np.full(len(rows), -np.inf, np.float32)
     best_here = np.full(len(columns), -np.inf, np.float32)
-    for strip, near in _neighbourhoods(previous.octaves[rows], there[:, 0],
-                                       current.octaves[columns], here[:, 0], search_radius):
-        similarity = left[strip] @ right[near].T
-        nearest = similarity.argmax(1)
-        highest = similarity[np.arange(len(nearest)), nearest]
+    neighbourhoods = list(_neighbourhoods(previous.octaves[rows], there[:, 0],
+                                          current.octaves[columns], here[:, 0], search_radius))
+    compared = each(lambda n: _compare(left[n[0]], right[n[1]]), neighbourhoods)
+    for (strip, near), (nearest, highest, highest_here) in zip(neighbourhoods, compared):
         claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
         np.maximum(best_there[strip], highest, out=best_there[strip])
-        np.maximum(best_here[near], similarity.max(0), out=best_here[near])
+        np.maximum(best_here[near], highest_here, out=best_here[near])
     apart = np.linalg.norm(here[claim] - there, axis=1)
     mutual = np.isfinite(best_there) & (best_there == best_here[claim]) & (apart <= search_radius)
     matches = np.stack([rows[mutual], columns[claim[mutual]]], axis=1)
     _, first = np.unique(matches[:, 1], return_index=True)  # twins claim the same feature
     return matches[first][np.argsort(matches[first, 0])]
+
+
+def _compare(left: NDArray[np.float32], right: NDArray[np.float32],
+             ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Which of the right each of the left is most similar to, how similar, and vice versa."""
+    similarity = left @ right.T
+    nearest = similarity.argmax(1)
+    return nearest, similarity[np.arange(len(nearest)), nearest], similarity.max(0)
 
 
 def _by_octave_and_column(features: Features) -> NDArray[np.int64]:
@@ -96,16 +104,24 @@ def _comparable(previous: Features, rows: NDArray[np.int64], current: Features,
     """
     Factors (N, 260) and (M, 260) whose product is the similarity of features.
 
-    256 - 2 Hamming distances, less 2 _DISTANCE_BITS (distance / search_radius)^2.
+    64 - Hamming distance / 2, less _DISTANCE_BITS / 2 (distance / search_radius)^2.
     """
     centre = previous.points.mean(0)  # keeps the numbers small: single precision is enough
-    weight = np.sqrt(2 * _DISTANCE_BITS) / search_radius
+    weight = np.sqrt(_DISTANCE_BITS / 2) / search_radius
     a, b = ((f.points[order] - centre) * weight
             for f, order in ((previous, rows), (current, columns)))
-    a_columns = [2 * a, -(a * a).sum(1, keepdims=True), -np.ones((len(a), 1))]
-    b_columns = [b, np.ones((len(b), 1)), (b * b).sum(1, keepdims=True)]
-    return (np.concatenate([previous.signs[rows], *a_columns], axis=1, dtype=np.float32),
-            np.concatenate([current.signs[columns], *b_columns], axis=1, dtype=np.float32))
+    one_a, one_b = np.ones((len(a), 1)), np.ones((len(b), 1))
+    square_a, square_b = ((p * p).sum(1, keepdims=True) for p in (a, b))
+    return both(lambda: _factor(previous.descriptors[rows], [2 * a, -square_a, -one_a]),
+                lambda: _factor(current.descriptors[columns], [b, one_b, square_b]))
+
+
+def _factor(descriptors: NDArray[np.uint8], places: list[Array]) -> NDArray[np.float32]:
+    """Bits as +-1/2, so that their products count the differing ones; then four more columns."""
+    factor = np.empty((len(descriptors), 260), np.float32)
+    np.subtract(np.unpackbits(descriptors, axis=1), np.float32(0.5), out=factor[:, :256])
+    np.concatenate(places, axis=1, out=factor[:, 256:], casting='same_kind')
+    return factor
 
 
 def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,

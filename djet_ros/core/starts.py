@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 # Translation X_B = X_A + t of a camera that drives straight ahead.
 FORWARD = np.array([0.0, 0.0, -1.0])
 
+# As many matches tell a motion from the false ones; all of them are for the optimisation.
+_RANSAC_MATCHES = 600
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -43,15 +46,17 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     return best, inliers
 
 
-def starting_poses(K: Array, x: Array, y: Array, threshold: float, robust: Pose | None,
+def starting_poses(K: Array, x: Array, y: Array, threshold: float,
                    prior: Pose | None) -> list[Pose]:
     """
     Collect all starting poses of the preset ``best``.
 
-    x, y: (N, 2) pixels; threshold in pixels; robust, prior: what RANSAC found, and the previous
-    motion, if there are any.
+    x, y: (N, 2) pixels; threshold in pixels; prior: the previous motion, if there is one.
     """
-    return [*several(robust, prior), *planar(K, x, y, threshold)]
+    some = slice(None, None, -(-len(x) // _RANSAC_MATCHES))
+    x, y = x[some], y[some]
+    found = five_point(K, x, y, threshold, robust=True)
+    return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
 
 
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:

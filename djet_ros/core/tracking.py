@@ -34,10 +34,12 @@ _EPIPOLE_BLUR = 5.0
 # motion in the scene fits many matches loosely, the camera's own fits most of them closely.
 _TIGHT = 1.0
 
-# All starts make a few steps, the most promising of them some more: where a start lies says
-# little of its basin.
+# All starts make a few steps on some of the matches, the most promising of them some more on all:
+# where a start lies says little of its basin.
 _STEPS_TO_SKETCH = 4
+_MATCHES_TO_SKETCH = 800
 _REFINED_STARTS = 2
+_SAME_BASIN = 0.02  # rad
 _STEPS_TO_COMPARE = 7
 
 # A patch that would be seen this many times larger or smaller, or by one camera from behind, is a
@@ -133,15 +135,26 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 def _cheapest(problem: JetProblem, starts: list[Pose],
               config: EstimatorConfig) -> tuple[Solution, Loss]:
     """Refine the most promising starts, and the cheapest of them to the end."""
-    residuals = [epipolar_residuals(problem, s.R, s.t) for s in starts]
-    scale = min(_scale(r) for r in residuals)
+    some = problem.subset(slice(None, None, -(-len(problem.blur) // _MATCHES_TO_SKETCH)))
+    scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
     tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
-    sketched = [minimise(problem, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts]
-    promising = sorted(sketched, key=lambda solution: solution.cost)[:_REFINED_STARTS]
-    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in promising),
+    if len(starts) > 1:
+        sketched = [minimise(some, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts]
+        starts = _promising(sketched)
+    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts),
                key=lambda solution: solution.cost)
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
+
+
+def _promising(sketched: list[Solution]) -> list[Pose]:
+    """Choose the cheapest poses that lie in different basins."""
+    chosen: list[Pose] = []
+    for solution in sorted(sketched, key=lambda solution: solution.cost):
+        pose = Pose(solution.R, solution.t)
+        if all(_change(other, pose) > _SAME_BASIN for other in chosen):
+            chosen.append(pose)
+    return chosen[:_REFINED_STARTS]
 
 
 def _scale(residuals: Residuals) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +42,6 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.points)
-
-    @cached_property
-    def signs(self) -> NDArray[np.float32]:
-        """Descriptors as (N, 256) of +-1: their dot product is 256 - 2 Hamming distances."""
-        bits = np.unpackbits(self.descriptors, axis=1)
-        return bits.astype(np.float32) * 2 - 1
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def view_bytes(view: View) -> int:
     features = view.features
     arrays: tuple[NDArray[Any], ...] = (
         view.gray, view.smoothed, features.points, features.octaves, features.angles,
-        features.responses, features.descriptors, features.signs)
+        features.responses, features.descriptors)
     return sum(array.nbytes for array in arrays)
 
 

@@ -94,16 +94,15 @@ def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorC
 
     Raises DjetError where no pose is found.
     """
-    wide = config.starts == 'several'
     K = current.K
-    found = five_point(K, x, y, config.ransac_threshold, robust=wide)
-    if found is None:
-        raise DjetError('the 5-point method finds no pose for this pair; choose another --pair')
-    pose, agreeing = found
-    if not wide:
-        x, y = x[agreeing], y[agreeing]
-    starts = (starting_poses(K, x, y, config.ransac_threshold, pose, None) if wide
-              else [pose])
+    if config.starts == 'several':
+        starts = starting_poses(K, x, y, config.ransac_threshold, None)
+    else:
+        found = five_point(K, x, y, config.ransac_threshold, robust=False)
+        if found is None:
+            raise DjetError('the 5-point method finds no pose for this pair; choose another '
+                            '--pair')
+        starts, x, y = [found[0]], x[found[1]], y[found[1]]
     rounds: list[Round] = []
     inliers = np.zeros(len(x), bool)
     for count in range(1, config.max_iterations + 1):

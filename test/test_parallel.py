@@ -1,0 +1,44 @@
+"""What is done side by side is done as in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from threading import Barrier, BrokenBarrierError, get_ident
+
+import cv2
+from djet_ros.core.parallel import both, each
+import pytest
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(request.param)
+    yield request.param
+    cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 7])
+def test_results_come_in_the_order_of_the_tasks(threads: int, count: int) -> None:
+    assert each(lambda task: task**2, range(count)) == [task**2 for task in range(count)]
+
+
+def test_two_things_are_under_way_at_once_where_opencv_may_take_two_threads(threads: int) -> None:
+    meeting = Barrier(2)
+
+    def meet() -> int:
+        meeting.wait(20 if threads == 2 else 0.05)
+        return get_ident()
+
+    if threads == 1:
+        with pytest.raises(BrokenBarrierError):
+            both(meet, meet)
+    else:
+        here, there = both(meet, meet)
+        assert here == get_ident() != there
+
+
+@pytest.mark.parametrize('bad', [0, 1])
+def test_an_error_in_either_of_two_things_comes_out(threads: int, bad: int) -> None:
+    with pytest.raises(ZeroDivisionError):
+        both(lambda: 1 // bad, lambda: 1 // (1 - bad))
