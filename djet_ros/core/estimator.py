@@ -107,7 +107,7 @@ class TwoViewEstimator:
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
-                     else track_jointly(surface, K, y, starts, config))
+                     else track_jointly(surface, K, y, starts, config, _pose(prior)))
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
         with _timed(timings, 'result'):

@@ -42,6 +42,10 @@ _REFINED_STARTS = 2
 _SAME_BASIN = 0.02  # rad
 _STEPS_TO_COMPARE = 7
 
+# Costs that differ by less, in variances of a residual, tell nothing: matches of one neighbourhood
+# err alike. A plane seen by few matches leaves such a choice, between its own motion and its twin.
+_UNDECIDED = 10.0
+
 # A patch that would be seen this many times larger or smaller, or by one camera from behind, is a
 # false match.
 _MOST_GROWTH = 2.0
@@ -83,12 +87,13 @@ class Track:
 
 
 def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-                  config: EstimatorConfig) -> Track | None:
+                  config: EstimatorConfig, prior: Pose | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
-    on. None where too few matches have a usable surface.
+    on; of those that cost the same the one next to the prior, the previous motion. None where too
+    few matches have a usable surface.
     """
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     alive = np.ones(len(y), bool)
@@ -106,8 +111,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
             return None
         # Step 2: global pose optimisation.
         problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting), _EPIPOLE_BLUR)
-        solution, loss = _cheapest(problem, poses, config)
-        pose = Pose(solution.R, solution.t)
+        solution, loss = _cheapest(problem, poses, config, prior)
+        pose = _pose(solution)
         # Keypoints go towards their optimum on the epipolar line of the new pose.
         optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
         losses[alive] = paraboloids.values(optimum)[alive]
@@ -132,8 +137,8 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
                  paraboloids.values(optimum), 0, 0)
 
 
-def _cheapest(problem: JetProblem, starts: list[Pose],
-              config: EstimatorConfig) -> tuple[Solution, Loss]:
+def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
+              prior: Pose | None) -> tuple[Solution, Loss]:
     """Refine the most promising starts, and the cheapest of them to the end."""
     some = problem.subset(slice(None, None, -(-len(problem.blur) // _MATCHES_TO_SKETCH)))
     scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
@@ -141,8 +146,12 @@ def _cheapest(problem: JetProblem, starts: list[Pose],
     if len(starts) > 1:
         sketched = [minimise(some, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts]
         starts = _promising(sketched)
-    best = min((minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts),
-               key=lambda solution: solution.cost)
+    refined = [minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts]
+    best = min(refined, key=lambda solution: solution.cost)
+    if prior is not None:
+        undecided = best.cost + _UNDECIDED * _scale(best.residuals)**2
+        best = min((solution for solution in refined if solution.cost < undecided),
+                   key=lambda solution: _apart(prior, _pose(solution)))
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
 
@@ -151,10 +160,14 @@ def _promising(sketched: list[Solution]) -> list[Pose]:
     """Choose the cheapest poses that lie in different basins."""
     chosen: list[Pose] = []
     for solution in sorted(sketched, key=lambda solution: solution.cost):
-        pose = Pose(solution.R, solution.t)
-        if all(_change(other, pose) > _SAME_BASIN for other in chosen):
+        pose = _pose(solution)
+        if all(_apart(other, pose) > _SAME_BASIN for other in chosen):
             chosen.append(pose)
     return chosen[:_REFINED_STARTS]
+
+
+def _pose(solution: Solution) -> Pose:
+    return Pose(solution.R, solution.t)
 
 
 def _scale(residuals: Residuals) -> float:
@@ -198,6 +211,11 @@ def _change(before: Pose, after: Pose) -> float:
     """Measure ||p - p_prev||: rotation and direction together, in rad to first order."""
     return float(np.linalg.norm(np.concatenate([(after.R - before.R).ravel() / np.sqrt(2),
                                                 after.t - before.t])))
+
+
+def _apart(a: Pose, b: Pose) -> float:
+    """Measure how different two motions are while the sign of t is not yet settled."""
+    return min(_change(a, b), _change(a, Pose(b.R, -b.t)))
 
 
 def _take(paraboloids: Paraboloids, chosen: NDArray[np.bool_]) -> Paraboloids:
