@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 _CELL = 32
 
 # What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
-# once, as the normalised squared error on rendered streets; tests hold it on other scenes.
-_INFLATION = 2.2
+# once, as the normalised squared error on a rendered street; tests hold it on other scenes.
+_INFLATION = 1.9
+
+# Of what is known in a direction of the pose, the matches of one cell may make up all but this.
+_LEAST_SUPPORT = 1e-6
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
@@ -24,26 +27,33 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
 
     places: (N, 2) pixels of the matches; t: (3,) the direction that was settled on, `flipped`
     where it is the opposite of the optimiser's. Gives (5, 5) in the basis ``sphere_tangents(t)``,
-    and (6, 6) over (rotation vector, t), of rank 5 because t keeps its length. The sandwich
-    H^-1 (sum over cells of s s^T) H^-1, with s the summed gradients of a cell's matches, takes
-    the noise from the residuals themselves (cluster-robust, Liang and Zeger, Biometrika 1986).
-    All NaN where the matches do not determine the pose, or lie in too few cells.
+    and (6, 6) over (rotation vector, t), of rank 5 because t keeps its length. All NaN where the
+    matches do not determine the pose, only those of one cell do, or they lie in too few cells.
+
+    The noise is taken from the matches themselves: from how far the pose would move without those
+    of a cell, cell by cell (delete-a-group jackknife, to first order; Bell and McCaffrey, Survey
+    Methodology 2002). One match that alone decides about a direction is found out by that: its
+    residual is next to nothing, because the pose follows it wherever it lies.
     """
     J = residuals.jacobian
     squared = residuals.r**2
     _, weights = loss(squared)
     # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
     flattening = loss.curvature(squared).mean() / weights.mean() if len(squared) else 0.0
-    H = flattening * (J * weights) @ J.T
+    H = (J * weights) @ J.T
     unknown = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e14:
         return unknown
-    scores, cells = _summed_by_cell(J * (weights * residuals.r), places)
-    if cells <= 5:  # the gradients sum to zero, so these leave some direction without any noise
+    H_cells, gradients = _summed_by_cell(
+        places, J[:, None] * (J * weights), J * (weights * residuals.r))
+    cells = len(gradients)
+    if cells <= 5:  # so many are gone with the pose's own freedom
         return unknown
-    H_inverse = np.linalg.inv(H)
-    covariance = H_inverse @ (scores @ scores.T) @ H_inverse
-    covariance *= _INFLATION * cells / (cells - 5)
+    whitening = np.linalg.inv(np.linalg.cholesky(H))
+    if np.linalg.eigvalsh(whitening @ H_cells @ whitening.T).max() > 1 - _LEAST_SUPPORT:
+        return unknown
+    moves = np.linalg.solve(H - H_cells, gradients[:, :, None])[:, :, 0] / flattening
+    covariance = _INFLATION * (1 - 1 / cells) * moves.T @ moves
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = _blocks(-residuals.tangents if flipped else residuals.tangents)
@@ -59,9 +69,11 @@ def _blocks(tangents: Array) -> Array:
     return lift
 
 
-def _summed_by_cell(scores: Array, places: Array) -> tuple[Array, int]:
-    """Sum scores (5, N) over the cells of the image; gives (5, C) and C."""
+def _summed_by_cell(places: Array, *values: Array) -> list[Array]:
+    """Sum values (..., N) over the C cells of the image that have matches; each (C, ...)."""
     cells: NDArray[np.int64] = (places // _CELL).astype(np.int64)
     _, cell = np.unique(cells[:, 0] * 2**32 + cells[:, 1], return_inverse=True)
-    count = int(cell.max()) + 1
-    return np.stack([np.bincount(cell, row, count) for row in scores]), count
+    order = np.argsort(cell, kind='stable')
+    first = np.searchsorted(cell[order], np.arange(cell.max() + 1))
+    return [np.moveaxis(np.add.reduceat(value[..., order], first, axis=-1), -1, 0)
+            for value in values]
