@@ -29,6 +29,7 @@ COMMANDS = {
     'soak': 'run many frames through the odometry: does memory or latency grow?',
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
+    'closure': 'how well the rotations of three frames agree: no ground truth needed',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",
     'surfaces': 'draw one match on its Hamming surface, round by round',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',

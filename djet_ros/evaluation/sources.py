@@ -88,10 +88,15 @@ def _frames_in(folder: Path) -> FrameSequence:
 def pair_of_frames(path: Path, index: int, workspace: Path
                    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Images (H, W) of frames index and index + 1 of any dataset, and their camera matrix."""
-    sequence = _frames_in(_readable(path, workspace / 'frames'))
+    sequence = readable_frames(path, workspace)
     if not 0 <= index < len(sequence) - 1:
         raise DjetError(f'pair {index} was asked for, {path} has pairs 0 to {len(sequence) - 2}')
     return sequence.image(index), sequence.image(index + 1), sequence.K
+
+
+def readable_frames(path: Path, workspace: Path) -> FrameSequence:
+    """Open any dataset so that its frames can be had in any order, a bag's in the workspace."""
+    return _frames_in(_readable(path, workspace / 'frames'))
 
 
 def _readable(path: Path, place: Path) -> Path:

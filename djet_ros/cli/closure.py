@@ -1,0 +1,106 @@
+"""``djet closure``: how well the rotations of three frames agree, without ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.pair_runs import split
+from djet_ros.core.config import METHODS
+from djet_ros.errors import DjetError
+from djet_ros.evaluation.closure import closures, summary, Triangle
+from djet_ros.evaluation.entrants import check_names, TITLES
+from djet_ros.evaluation.sources import readable_frames
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+# The 5-point method has no covariance of its own worth the name, and no surfaces.
+CHOICES = tuple(name for name in METHODS if name != 'five_point')
+
+DESCRIPTION = """\
+Rotations from frame to frame and across two frames have to agree, whatever the camera did. Show
+by how much they do not, by method: a lower bound of their error on any recording, no ground truth
+needed, and a test of what the covariances claim. Writes all triangles as JSON and a plot beside
+them.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the subcommand to the subparsers of ``djet``."""
+    parser = subparsers.add_parser('closure', description=DESCRIPTION)
+    parser.add_argument('source', type=Path, metavar='SOURCE', help='a sequence or a bag')
+    parser.add_argument('--output', type=Path, required=True, metavar='FILE.json',
+                        help='where the triangles go; the plot goes to FILE.png')
+    parser.add_argument('--methods', default=','.join(CHOICES), metavar='LIST',
+                        help='(default: %(default)s)')
+    parser.add_argument('--frames', type=int, default=150, metavar='N',
+                        help='how many frames to use, from the first (default: %(default)s)')
+    add_overwrite(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate the triangles, write and show them."""
+    check_output(args.output, args.overwrite)
+    if args.frames < 3:
+        raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
+    methods = split(args.methods)
+    check_names('method', methods, CHOICES)
+    with TemporaryDirectory() as workspace:
+        sequence = readable_frames(args.source, Path(workspace))
+        args.output.parent.mkdir(parents=True, exist_ok=True)
+        with Progress(console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task('triangles', total=max(min(args.frames, len(sequence)) - 2, 1))
+            found = closures(sequence, methods, args.frames,
+                             lambda done: bar.update(task, completed=done))
+    summaries = {method: summary(triangles) for method, triangles in found.items()}
+    args.output.write_text(json.dumps(
+        {'source': sequence.name, 'summary': summaries, 'triangles': {
+            method: [triangle and asdict(triangle) for triangle in triangles]
+            for method, triangles in found.items()}}, indent=2) + '\n', encoding='utf-8')
+    plot = args.output.with_suffix('.png')
+    draw(found, sequence.name, plot)
+    Console().print(_table(sequence.name, summaries))
+    print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '
+          'average if true;\noff truth: error of single rotations, median, where there is ground '
+          'truth')
+    print(f'triangles: {args.output}\nplot: {plot}')
+    return 0
+
+
+def _table(title: str, summaries: dict[str, dict[str, Any]]) -> Table:
+    table = Table(title=f'{title}: rotation left by three frames, deg')
+    for heading in ('', 'median', '95 %', 'claimed', 'square (3)', 'triangles', 'off truth'):
+        table.add_column(heading, justify='right' if heading else 'left')
+    for method, one in summaries.items():
+        table.add_row(
+            TITLES[method], f"{one['median_deg']:.4f}", f"{one['p95_deg']:.4f}",
+            f"{one['claimed_median_deg']:.4f}", f"{one['normalised_square_mean']:.1f}",
+            f"{one['triangles']} of {one['triangles'] + one['without']}",
+            '' if np.isnan(one['error_median_deg']) else f"{one['error_median_deg']:.4f}")
+    return table
+
+
+def draw(found: dict[str, list[Triangle | None]], title: str, path: Path) -> None:
+    """Plot which share of the triangles leaves less than an angle, and what was claimed."""
+    from djet_ros.evaluation.style import COLOURS, DASHES, figure
+    with figure(path, 8.0, 3.2) as empty:
+        left, right = empty.subplots(1, 2)
+        for method, triangles in found.items():
+            look = {'label': TITLES[method], 'color': COLOURS[method], 'ls': DASHES[method]}
+            closed = [triangle for triangle in triangles if triangle is not None]
+            shares = 100 * np.arange(1, len(closed) + 1) / len(triangles)
+            left.step(np.sort([t.angle for t in closed]), shares, where='post', **look)
+            right.plot([t.first for t in closed],
+                       [t.angle / t.claimed for t in closed], lw=0.8, **look)
+        left.set(xscale='log', xlabel='rotation left by three frames [deg]', ylim=(0, 100),
+                 ylabel='share of triangles [%]', title=title)
+        left.legend()
+        right.set(xlabel='first frame', ylabel='left / claimed', ylim=(0, None),
+                  title='against the covariances')

@@ -1,0 +1,90 @@
+"""Triangles of rotations: what remains, what was claimed, and the command that shows it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.data.datasets import open_sequence
+from djet_ros.evaluation.closure import closures, remaining_rotation, summary
+from djet_ros.scenes.sequence import render_sequence
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+FRAMES = 6
+
+
+@pytest.fixture(scope='module')
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_sequence('road', tmp_path_factory.mktemp('road'), FRAMES, size=(620, 188))
+
+
+def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
+    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
+    return subprocess.run([sys.executable, '-c', code, 'closure', *map(str, arguments)],
+                          capture_output=True, text=True, timeout=300, check=False)
+
+
+def motion(R: Rotation, sigma: float) -> RelativePose:
+    return RelativePose(Status.OK, R.as_matrix(), covariance_5=sigma**2 * np.eye(5))
+
+
+def test_what_remains_is_the_error_of_the_three_and_as_large_as_claimed() -> None:
+    rng = np.random.default_rng(0)
+    squares = []
+    for _ in range(300):
+        before, after = Rotation.random(2, random_state=rng)
+        sigmas = rng.uniform(1e-4, 1e-3, 3)
+        motions = [motion(Rotation.from_rotvec(rng.normal(0, sigma, 3)) * true, sigma)
+                   for true, sigma in zip((before, after, after * before), sigmas)]
+        remains, covariance = remaining_rotation(*motions)
+        squares.append(remains @ np.linalg.solve(covariance, remains))
+    # 300 chi-squared of 3 degrees of freedom: within 4.5 of their standard deviations
+    assert np.mean(squares) == pytest.approx(3, abs=4.5 * np.sqrt(6 / 300))
+
+
+def test_rotations_that_follow_from_one_another_leave_nothing() -> None:
+    a, b = Rotation.from_euler('xyz', [[1, 2, 3], [-2, 1, 0.5]], degrees=True)
+    assert np.allclose(remaining_rotation(*(motion(R, 1e-3) for R in (a, b, b * a)))[0], 0)
+
+
+def test_what_remains_on_a_street_is_no_more_than_the_errors_themselves(road: Path) -> None:
+    sequence = open_sequence(road)
+    one = summary(closures(sequence, ['djet'], FRAMES)['djet'])
+    assert one['triangles'] == FRAMES - 2 and one['without'] == 0
+    assert 0 < one['error_median_deg'] < 0.1
+    assert 0 < one['median_deg'] < 3 * one['error_median_deg']
+
+
+def test_the_command_writes_triangles_and_a_plot(road: Path, tmp_path: Path) -> None:
+    output = tmp_path / 'deep' / 'closure.json'
+    answer = djet(road, '--output', output, '--methods', 'djet,rpe', '--frames', 4)
+    assert answer.returncode == 0, answer.stderr
+    written = json.loads(output.read_text())
+    assert list(written['summary']) == ['djet', 'rpe']
+    first, second = written['triangles']['rpe']
+    assert (first['first'], second['first']) == (0, 1)
+    assert first['angle'] > 0
+    assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+    assert 'D-JET' in answer.stdout and 'RP-E' in answer.stdout
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (('--frames', 2), '--frames is 2'), (('--methods', 'djet,poselib'), "'poselib'"),
+    (('--output', '.'), 'is a folder')])
+def test_what_can_be_mended_is_one_line_and_exit_code_2(
+        road: Path, tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+    answer = djet(road, '--output', tmp_path / 'closure.json', *arguments)
+    assert answer.returncode == 2
+    assert said in answer.stderr and answer.stderr.count('\n') == 1
+
+
+def test_two_frames_are_no_triangle(tmp_path: Path) -> None:
+    pair = render_sequence('road', tmp_path, 2, size=(320, 96))
+    answer = djet(pair, '--output', tmp_path / 'closure.json')
+    assert answer.returncode == 2
+    assert 'a triangle needs three' in answer.stderr
