@@ -52,7 +52,7 @@ NOISE = 0.5  # pixels, in each coordinate of y
 TRIALS = 200
 
 # The factor by which the covariance is meant to exceed what independent matches would give.
-CAUTION = 1.9
+CAUTION = 1.6
 
 
 def errors_of(result, R, t):
@@ -229,9 +229,9 @@ class WatchedSurface(DescriptorSurface):
         super().__init__(*arguments)
         self.asked = []
 
-    def around(self, y, growth=None):
+    def around(self, y, warp=None):
         self.asked.append(y)
-        return super().around(y, growth)
+        return super().around(y, warp)
 
 
 class Wall:

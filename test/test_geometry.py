@@ -12,11 +12,13 @@ from djet_ros.core.geometry import (
     homogeneous,
     in_front,
     line_distances,
+    patch_warp,
     rays,
     rotation_angle,
     rotation_exp,
     skew,
     sphere_tangents,
+    stretches,
     unit,
 )
 from hypothesis import example, given
@@ -26,7 +28,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SKEWED, two_views
+from two_view import BACKWARD, FORWARD, K, project, SIDEWAYS, SKEWED, two_views
 
 vectors = arrays(float, 3, elements=st.floats(-3, 3))
 directions = vectors.filter(lambda v: np.linalg.norm(v) > 1e-3).map(unit)
@@ -129,6 +131,25 @@ def test_growth_is_depth_before_over_depth_after(t):
     for sign in (1, -1):  # t and -t have the same essential matrix
         found = growth(seen.R, sign * seen.t, rays(K, seen.x), rays(K, seen.y))
         assert np.allclose(found, depths[0] / depths[1])
+
+
+@pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
+def test_a_patch_that_faces_one_camera_is_warped_as_its_points_move(t):
+    seen = two_views(np.random.default_rng(7), t=t, near=3, far=30)
+    grown = growth(seen.R, seen.t, rays(K, seen.x), rays(K, seen.y))
+    warp = patch_warp(K, seen.R, seen.y, grown)
+    step = 1e-4
+    for axis in (0, 1):
+        x = seen.x + step * np.eye(2)[axis]
+        moved, _ = project(K, (rays(K, x) * seen.points[:, 2:]) @ seen.R.T + seen.t)
+        assert np.allclose((moved - seen.y) / step, warp[:, :, axis], atol=1e-4)
+
+
+def test_stretches_are_the_singular_values():
+    warps = np.random.default_rng(8).normal(size=(50, 2, 2))
+    warps[0] = 2 * np.eye(2)
+    expected = np.linalg.svd(warps, compute_uv=False)
+    assert np.allclose(stretches(warps), expected.T[::-1])
 
 
 def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():

@@ -11,8 +11,8 @@ from djet_ros.core.hamming import (
     descriptor_bits,
     hamming_surfaces,
     match_distances,
-    resized_descriptor_bits,
     smooth,
+    warped_descriptor_bits,
 )
 from djet_ros.core.orb_pattern import REACH, TESTS
 import numpy as np
@@ -119,10 +119,11 @@ def test_many_points_at_once_are_as_one_at_a_time():
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
 
 
-def test_a_patch_seen_at_another_size_is_tested_that_much_nearer_or_further_away():
+def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
     smoothed = smooth(pictures()['textured'])
-    points, growth = np.array([[60, 50], [90, 60], [70, 70]]), np.array([1.0, 1.25, 0.8])
-    bits = resized_descriptor_bits(smoothed, points, growth)
+    points = np.array([[60, 50], [90, 60], [70, 70]])
+    warps = np.array([np.eye(2), 1.25 * np.eye(2), [[0.9, 0.2], [-0.1, 1.1]]])
+    bits = warped_descriptor_bits(smoothed, points, warps)
     assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
 
     def between(x, y):
@@ -133,7 +134,8 @@ def test_a_patch_seen_at_another_size_is_tested_that_much_nearer_or_further_away
 
     for k in (1, 2):
         for test, bit in zip(TESTS, bits[:, k]):
-            p, q = (between(*(points[k] + test[i:i + 2] / growth[k])) for i in (0, 2))
+            p, q = (between(*(points[k] + np.linalg.solve(warps[k], test[i:i + 2])))
+                    for i in (0, 2))
             # OpenCV rounds intensities to whole gray levels
             assert bit == (p < q) or abs(p - q) < 1.5
 

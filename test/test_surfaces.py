@@ -16,6 +16,7 @@ from djet_ros.core.surfaces import (
 )
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from two_view import K, textured
 
 SIZE = (160, 120)
@@ -103,41 +104,46 @@ def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(
             assert np.array_equal(getattr(asked, name), getattr(fresh, name)), name
 
 
-def magnified(factor):
-    """Give a wall, the wall seen `factor` times as large, and where its points (N, 2) went."""
+WARPS = {'smaller': 0.85 * np.eye(2), 'larger': 1.2 * np.eye(2),
+         'turned': Rotation.from_euler('z', 8, degrees=True).as_matrix()[:2, :2],
+         'seen aslant': np.array([[1.15, 0.05], [0.0, 0.95]])}
+
+
+def warped(warp):
+    """Give a wall, the wall seen through a warp, and where its points (N, 2) went."""
     image = textured(np.random.default_rng(38), (320, 240))
     middle = np.array([160.0, 120.0])
-    M = cv2.getRotationMatrix2D(tuple(middle), 0, factor)
-    grid = np.stack(np.meshgrid(np.arange(60, 260, 9), np.arange(60, 180, 9)), -1)
+    M = np.column_stack([warp, middle - warp @ middle])
+    grid = np.stack(np.meshgrid(np.arange(70, 250, 9), np.arange(70, 170, 9)), -1)
     x = grid.reshape(-1, 2).astype(float)
     return view(image), view(cv2.warpAffine(image, M, (320, 240), flags=cv2.INTER_CUBIC)), x, (
-        (x - middle) * factor + middle)
+        (x - middle) @ warp.T + middle, np.repeat(warp[None], len(x), axis=0))
 
 
-@pytest.mark.parametrize('factor', [0.85, 1.2])
-def test_descriptors_are_found_nearer_to_the_truth_where_the_reference_is_resized(factor):
-    previous, current, x, y = magnified(factor)
+@pytest.mark.parametrize('name', WARPS)
+def test_descriptors_are_found_nearer_to_the_truth_where_the_reference_is_warped(name):
+    previous, current, x, (y, warps) = warped(WARPS[name])
     errors = {}
-    for growth in (None, np.full(len(x), factor)):
+    for warp in (None, warps):
         surface = DescriptorSurface(previous, current, x, EstimatorConfig())
-        fitted, _ = with_minimum(surface.around(y, growth), 'project')
-        errors[growth is None] = np.median(np.linalg.norm(fitted.minima() - y, axis=1))
+        fitted, _ = with_minimum(surface.around(y, warp), 'project')
+        errors[warp is None] = np.median(np.linalg.norm(fitted.minima() - y, axis=1))
     assert errors[False] < 0.7 * errors[True]
 
 
 @pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
-@pytest.mark.parametrize('factor', [0.85, 1.2])
-def test_patches_look_more_alike_where_the_reference_is_resized(kind, factor):
-    previous, current, x, y = magnified(factor)
-    plain, resized = (np.median(kind(previous, current, x, EstimatorConfig()).around(y, growth).c)
-                      for growth in (None, np.full(len(x), factor)))
-    assert resized < plain
+@pytest.mark.parametrize('name', WARPS)
+def test_patches_look_more_alike_where_the_reference_is_warped(kind, name):
+    previous, current, x, (y, warps) = warped(WARPS[name])
+    plain, seen = (np.median(kind(previous, current, x, EstimatorConfig()).around(y, warp).c)
+                   for warp in (None, warps))
+    assert seen < plain
 
 
-def test_a_growth_of_one_changes_nothing(pair):
+def test_no_warp_changes_nothing(pair):
     x = np.array([[60.4, 50.0], [90.0, 70.6]])
-    plain, same = (DescriptorSurface(*pair, x, EstimatorConfig()).around(x + 2.0, growth)
-                   for growth in (None, np.ones(2)))
+    plain, same = (DescriptorSurface(*pair, x, EstimatorConfig()).around(x + 2.0, warp)
+                   for warp in (None, np.repeat(np.eye(2)[None], 2, axis=0)))
     assert np.array_equal(plain.A, same.A) and np.array_equal(plain.c, same.c)
 
 

@@ -47,9 +47,9 @@ class EstimatorConfig:
         minimum=0.0, maximum=15.0)
     snap_reference: bool = parameter(
         True, 'take geometry from the whole pixel at which the reference descriptor was sampled')
-    resize_reference: bool = parameter(
-        True, 'see each reference patch as large as the pose of the round before makes it, and '
-        'leave out matches whose size would have changed by more than a factor of 2')
+    warp_reference: bool = parameter(
+        True, 'see each reference patch as the pose of the round before stretches it, and leave '
+        'out matches that would be stretched or shrunk by more than a factor of 2')
     indefinite: str = parameter(
         'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
@@ -85,7 +85,7 @@ class EstimatorConfig:
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
     'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
-    'snap_reference': False, 'resize_reference': False, 'indefinite': 'drop',
+    'snap_reference': False, 'warp_reference': False, 'indefinite': 'drop',
     'cull_outside': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
 }

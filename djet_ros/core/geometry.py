@@ -116,6 +116,25 @@ def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
         return np.asarray(depth_x / depth_y)
 
 
+def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
+    """
+    Tell how patches that face camera A are seen in B: the derivatives dy/dx, (N, 2, 2).
+
+    y: (N, 2) pixels in B; growth: (N,) see there. Depth is taken to be the same all over a patch,
+    so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, the derivative is
+    Z_A / Z_B (M_12 - y m_3^T), with M_12 the first two rows of M and m_3 the third.
+    """
+    M = K @ R @ np.linalg.inv(K)
+    return np.asarray(growth[:, None, None] * (M[:2, :2] - y[:, :, None] * M[2, :2]))
+
+
+def stretches(warp: Array) -> tuple[Array, Array]:
+    """Give by how much warps (N, 2, 2) stretch at least and at most, (N,) each."""
+    size, area = (warp**2).sum((1, 2)), np.abs(np.linalg.det(warp))
+    both, apart = np.sqrt(size + 2 * area), np.sqrt(np.maximum(size - 2 * area, 0))
+    return (both - apart) / 2, (both + apart) / 2
+
+
 def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
     """Depths (N,) in A and in B, both times the same positive number for a point."""
     m = rays_x @ R.T

@@ -19,15 +19,15 @@ Pixels = NDArray[np.int64]
 # Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
 _BLOCK = 2048
 
-# Points per pass of resized patches, which take 512 places in the image each (2 MB).
-_RESIZED_BLOCK = 256
+# Points per pass of warped patches, which take 512 places in the image each (2 MB).
+_WARPED_BLOCK = 256
 
 # Tests per pass over the points: enough to spare calls, few enough to stay in the cache. All 256
 # at once would overflow the bytes in which they are counted.
 _TESTS_AT_ONCE = 32
 
-# Places x (512,) and y (512,) at which the tests look: all their p, and all their q.
-_TEST_ENDS = np.concatenate([TESTS[:, :2], TESTS[:, 2:]]).T.astype(np.float32)
+# Places (512, 2) around a point at which the tests look: all their p, and all their q.
+_TEST_ENDS = np.concatenate([TESTS[:, :2], TESTS[:, 2:]]).astype(np.float32)
 
 
 def smooth(gray: Image) -> Image:
@@ -60,19 +60,19 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
     return np.asarray(patches[py, px] < patches[qy, qx])
 
 
-def resized_descriptor_bits(smoothed: Image, points: Pixels, growth: Array) -> NDArray[np.bool_]:
+def warped_descriptor_bits(smoothed: Image, points: Pixels, warp: Array) -> NDArray[np.bool_]:
     """
-    Descriptors d(x), as (256, N) bits, of patches as they look when seen `growth` times as large.
+    Descriptors d(x), as (256, N) bits, of patches as they look when seen through a warp.
 
-    points: (N, 2) whole pixels; growth: (N,). The tests reach for intensities between pixels,
-    1 / growth as far from the point; beyond the image its border goes on.
+    points: (N, 2) whole pixels; warp: (N, 2, 2) derivatives dy/dx, not singular. The tests look
+    at dx = warp^-1 dy from the point, between pixels; beyond the image its border goes on.
     """
     bits = np.empty((256, len(points)), bool)
-    for start in range(0, len(points), _RESIZED_BLOCK):
-        block = slice(start, start + _RESIZED_BLOCK)
-        reach = (1 / growth[block]).astype(np.float32)
-        x, y = (points[block, axis].astype(np.float32) + ends[:, None] * reach
-                for axis, ends in enumerate(_TEST_ENDS))
+    inverse = np.linalg.inv(warp).astype(np.float32)
+    for start in range(0, len(points), _WARPED_BLOCK):
+        block = slice(start, start + _WARPED_BLOCK)
+        x, y = (points[block, axis].astype(np.float32) + _TEST_ENDS @ inverse[block, axis].T
+                for axis in (0, 1))
         values = cv2.remap(smoothed, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         np.less(values[:256], values[256:], out=bits[:, block])
     return bits

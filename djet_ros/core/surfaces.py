@@ -16,7 +16,7 @@ from djet_ros.core.hamming import (
     describable,
     descriptor_bits,
     hamming_surfaces,
-    resized_descriptor_bits,
+    warped_descriptor_bits,
 )
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
@@ -31,7 +31,7 @@ from scipy.ndimage import map_coordinates
 
 
 # The outermost of a descriptor's tests is 13 pixels off, and moves by a quarter of a pixel.
-_GROWTH_STEP = 0.02
+_WARP_STEP = 0.02
 
 
 class ResidualSurface(Protocol):
@@ -43,12 +43,12 @@ class ResidualSurface(Protocol):
 
     x: Array
 
-    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """
         Paraboloids of the residual, valid in the neighbourhood of y (N, 2).
 
-        growth: (N,) how many times larger the surroundings of x are seen around y; None where
-        that is not known, and for surfaces that are to be as the paper has them.
+        warp: (N, 2, 2) how the surroundings of x are seen around y, the derivatives dy/dx; None
+        where that is not known, and for surfaces that are to be as the paper has them.
         """
         ...
 
@@ -63,19 +63,19 @@ class DescriptorSurface:
         self._bits[:, self._has_reference] = descriptor_bits(
             previous.smoothed, pixels[self._has_reference])
         self._previous, self._smoothed = previous.smoothed, current.smoothed
-        self._pixels, self._growth = pixels, np.ones(len(x))
+        self._pixels, self._warp = pixels, np.repeat(np.eye(2)[None], len(x), axis=0)
         self._radius = config.window // 2
         self._sigma = config.window_sigma
         self._latest = _no_paraboloids(len(x))
         self.x = pixels.astype(float) if config.snap_reference else x
 
-    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Fit paraboloids to the Hamming surfaces around the whole pixels next to y."""
-        resized = np.zeros(len(y), bool) if growth is None else self._resize(growth)
+        anew = np.zeros(len(y), bool) if warp is None else self._see_through(warp)
         centres = np.rint(y).astype(np.int64)
         usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
         # Most windows stay on their pixel from one round to the next, and so does their fit.
-        stale = usable & (resized | (centres != self._latest.centres).any(1))
+        stale = usable & (anew | (centres != self._latest.centres).any(1))
         surfaces = hamming_surfaces(self._bits[:, stale], self._smoothed, centres[stale],
                                     self._radius)
         fitted = fit_paraboloids(surfaces, centres[stale].astype(float), self._sigma)
@@ -84,13 +84,14 @@ class DescriptorSurface:
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
-    def _resize(self, growth: Array) -> NDArray[np.bool_]:
-        """Sample reference descriptors at another size; tells, (N,) bool, where it mattered."""
-        resized = self._has_reference & (np.abs(growth / self._growth - 1) > _GROWTH_STEP)
-        self._bits[:, resized] = resized_descriptor_bits(
-            self._previous, self._pixels[resized], growth[resized])
-        self._growth = np.where(resized, growth, self._growth)
-        return resized
+    def _see_through(self, warp: Array) -> NDArray[np.bool_]:
+        """Sample reference descriptors through a warp; tells, (N,) bool, where it mattered."""
+        anew: NDArray[np.bool_] = self._has_reference & (
+            np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP)
+        self._bits[:, anew] = warped_descriptor_bits(
+            self._previous, self._pixels[anew], warp[anew])
+        self._warp = np.where(anew[:, None, None], warp, self._warp)
+        return anew
 
 
 class PhotometricSurface:
@@ -111,10 +112,10 @@ class PhotometricSurface:
         self._has_reference = self._inside(x, previous.smoothed.shape)
         self.x = x
 
-    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
-        if growth is not None:
-            self._reference = self._sample(self._previous, self.x, growth)
+        if warp is not None:
+            self._reference = self._sample(self._previous, self.x, warp)
         difference = self._reference - self._sample(self._image, y)
         gx, gy = (self._sample(component, y) for component in self._gradient)
         W = self._weights
@@ -126,14 +127,14 @@ class PhotometricSurface:
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
     def _sample(self, image: NDArray[np.float32], points: Array,
-                growth: Array | None = None) -> NDArray[np.float32]:
+                warp: Array | None = None) -> NDArray[np.float32]:
         """
-        Bilinear samples (N, P^2) of the window around each point, as it looks when grown.
+        Bilinear samples (N, P^2) of the window around each point, as it looks through a warp.
 
         Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
         """
-        reach = np.ones(len(points)) if growth is None else 1 / growth
-        places = points.T[:, :, None] + reach[:, None] * self._offsets.T[:, None]
+        offsets = self._offsets.T if warp is None else np.linalg.inv(warp) @ self._offsets.T
+        places = np.moveaxis(points[:, :, None] + offsets, 1, 0)
         return np.asarray(map_coordinates(image, places[::-1], order=1, mode='nearest'))
 
     def _inside(self, points: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -149,7 +150,7 @@ class ReprojectionSurface:
         self.x = x
         self._y = y
 
-    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
+    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Give the same circular paraboloid wherever the keypoint has moved."""
         n = len(y)
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),

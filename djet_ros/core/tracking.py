@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from djet_ros.core.config import EstimatorConfig
-from djet_ros.core.geometry import epipolar_lines, fundamental, growth, homogeneous, rays
+from djet_ros.core.geometry import (
+    epipolar_lines,
+    fundamental,
+    growth,
+    homogeneous,
+    patch_warp,
+    rays,
+    stretches,
+)
 from djet_ros.core.jet import (
     epipolar_residuals,
     jet_problem,
@@ -46,9 +54,9 @@ _STEPS_TO_COMPARE = 7
 # err alike. A plane seen by few matches leaves such a choice, between its own motion and its twin.
 _UNDECIDED = 10.0
 
-# A patch that would be seen this many times larger or smaller, or by one camera from behind, is a
-# false match.
-_MOST_GROWTH = 2.0
+# A patch that would be stretched or shrunk by more than this, or seen by one camera from behind,
+# is a false match.
+_MOST_STRETCH = 2.0
 
 # A match agrees with a pose within this many robust standard deviations.
 _INLIER = 3.0
@@ -97,12 +105,12 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     """
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     alive = np.ones(len(y), bool)
-    poses, grown = starts, None
+    poses, warp = starts, None
     plausible = np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
         paraboloids, no_minimum = with_minimum(
-            surface.around(keypoints, grown), config.indefinite)
+            surface.around(keypoints, warp), config.indefinite)
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive &= paraboloids.usable
         voting = alive & plausible & (
@@ -121,8 +129,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         if converged or iteration == config.max_iterations:
             break
         keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
-        if config.resize_reference:
-            grown, plausible = _growth(pose, K, surface.x, optimum)
+        if config.warp_reference:
+            warp, plausible = _warps(pose, K, surface.x, optimum)
     return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
                  no_minimum, iteration)
 
@@ -199,12 +207,14 @@ def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array
     return np.asarray(keypoints + way * np.minimum(1.0, longest / np.maximum(length, 1e-12)))
 
 
-def _growth(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Tell how much larger patches are seen at y than at x, 1 where that is not plausible."""
+def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Tell how patches at x are seen at y, as they are where that is not plausible."""
     seen = growth(pose.R, pose.t, rays(K, x), rays(K, y))
     seen = np.where(np.isnan(seen), 1.0, seen)  # without any parallax, or on the epipole
-    plausible = (seen > 1 / _MOST_GROWTH) & (seen < _MOST_GROWTH)
-    return np.where(plausible, seen, 1.0), plausible
+    warp = patch_warp(K, pose.R, y, seen)
+    least, most = stretches(warp)
+    plausible = (seen > 0) & (least > 1 / _MOST_STRETCH) & (most < _MOST_STRETCH)
+    return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
 
 
 def _change(before: Pose, after: Pose) -> float:

@@ -45,8 +45,8 @@ def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
                                     ('geman_mcclure', 'Geman-McClure'))],
         'rounding': [Change('x not rounded', {'snap_reference': False}),
                      Change('x on whole pixels', {'snap_reference': True})],
-        'size': [Change('patches not resized', {'resize_reference': False}),
-                 Change('patches resized', {'resize_reference': True})],
+        'warp': [Change('patches not warped', {'warp_reference': False}),
+                 Change('patches warped', {'warp_reference': True})],
         'recentring': [Change('window not re-centred', {'max_iterations': 1})],
         'indefinite': [Change(f'indefinite fits: {word}', {'indefinite': name})
                        for name, word in (('keep', 'kept'), ('drop', 'dropped'),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances
-from djet_ros.core.hamming import describable, hamming_surfaces, resized_descriptor_bits
+from djet_ros.core.hamming import describable, hamming_surfaces, warped_descriptor_bits
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.starts import five_point, starting_poses
 from djet_ros.core.surfaces import DescriptorSurface, ResidualSurface
@@ -47,13 +47,13 @@ class Round:
     A round of Algorithm 1 for all N matches.
 
     keypoints: (N, 2) where the surfaces were sampled around; fits: the paraboloids there;
-    growth: (N,) size at which the reference patches were seen; lines: (N, 3) epipolar lines of
+    warps: (N, 2, 2) through which the reference patches were seen; lines: (N, 3) epipolar lines of
     the pose found on them; optima: (N, 2) places y + v_opt.
     """
 
     keypoints: Array
     fits: Paraboloids
-    growth: Array
+    warps: Array
     lines: Array
     optima: Array
 
@@ -82,9 +82,10 @@ class _Observed:
         self.seen: list[tuple[Array, Paraboloids, Array]] = []
         self._surface = surface
 
-    def around(self, y: Array, growth: Array | None = None) -> Paraboloids:
-        fits = self._surface.around(y, growth)
-        self.seen.append((y.copy(), fits, np.ones(len(y)) if growth is None else growth))
+    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
+        fits = self._surface.around(y, warp)
+        unwarped = np.broadcast_to(np.eye(2), (len(y), 2, 2))
+        self.seen.append((y.copy(), fits, unwarped if warp is None else warp))
         return fits
 
 
@@ -120,9 +121,9 @@ def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorC
 
 
 def _round(track: Track, surface: _Observed, K: Array) -> Round:
-    keypoints, fits, growth = surface.seen[-1]
+    keypoints, fits, warps = surface.seen[-1]
     lines = epipolar_lines(fundamental(K, track.pose.R, track.pose.t), surface.x)
-    return Round(keypoints, fits, growth, lines, track.y_opt)
+    return Round(keypoints, fits, warps, lines, track.y_opt)
 
 
 def telling_match(course: Course, window: int) -> int:
@@ -194,7 +195,7 @@ def _draw_round(axes: Axes, course: Course, match: int, index: int, window: int)
     step = course.rounds[index]
     centre = np.rint(course.y[match]).astype(np.int64)
     pixels = np.rint(course.x[[match]]).astype(np.int64)
-    bits = resized_descriptor_bits(course.previous.smoothed, pixels, step.growth[[match]])
+    bits = warped_descriptor_bits(course.previous.smoothed, pixels, step.warps[[match]])
     surface = hamming_surfaces(bits, course.current.smoothed, centre[None], RADIUS)[:, :, 0]
     draw_patch(axes, course.current.gray, centre, RADIUS)
     draw_heat(axes, surface, centre, 0.75)
