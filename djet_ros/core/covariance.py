@@ -14,7 +14,7 @@ _CELL = 32
 
 # What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
 # once, as the normalised squared error on a rendered street; tests hold it on other scenes.
-_INFLATION = 1.9
+_INFLATION = 1.6
 
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.
 _LEAST_SUPPORT = 1e-6
@@ -32,8 +32,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
 
     The noise is taken from the matches themselves: from how far the pose would move without those
     of a cell, cell by cell (delete-a-group jackknife, to first order; Bell and McCaffrey, Survey
-    Methodology 2002). One match that alone decides about a direction is found out by that: its
-    residual is next to nothing, because the pose follows it wherever it lies.
+    Methodology 2002). Where few cells decide about a direction, their moves say little; so the
+    mean is taken of the moves that are seen and of those that noise would make, which are large
+    there, at the size that has the seen ones on average.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -52,8 +53,12 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     whitening = np.linalg.inv(np.linalg.cholesky(H))
     if np.linalg.eigvalsh(whitening @ H_cells @ whitening.T).max() > 1 - _LEAST_SUPPORT:
         return unknown
-    moves = np.linalg.solve(H - H_cells, gradients[:, :, None])[:, :, 0] / flattening
-    covariance = _INFLATION * (1 - 1 / cells) * moves.T @ moves
+    without = np.linalg.inv(H - H_cells)
+    moves = (without @ gradients[:, :, None])[:, :, 0]
+    seen = moves.T @ moves
+    by_noise = (without - np.linalg.inv(H)).sum(0)
+    by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
+    covariance = _INFLATION * (1 - 1 / cells) / flattening**2 * (seen + by_noise) / 2
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = _blocks(-residuals.tangents if flipped else residuals.tangents)
