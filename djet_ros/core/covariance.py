@@ -43,7 +43,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     flattening = loss.curvature(squared).mean() / weights.mean() if len(squared) else 0.0
     H = (J * weights) @ J.T
     unknown = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
-    if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e14:
+    if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return unknown
     H_cells, gradients = _summed_by_cell(
         places, J[:, None] * (J * weights), J * (weights * residuals.r))
