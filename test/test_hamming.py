@@ -10,9 +10,9 @@ from djet_ros.core.hamming import (
     describable,
     descriptor_bits,
     hamming_surfaces,
+    intensities_through,
     match_distances,
     smooth,
-    warped_descriptor_bits,
 )
 from djet_ros.core.orb_pattern import REACH, TESTS
 import numpy as np
@@ -123,7 +123,7 @@ def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
     smoothed = smooth(pictures()['textured'])
     points = np.array([[60, 50], [90, 60], [70, 70]])
     warps = np.array([np.eye(2), 1.25 * np.eye(2), [[0.9, 0.2], [-0.1, 1.1]]])
-    bits = warped_descriptor_bits(smoothed, points, warps)
+    bits = np.less(*intensities_through(warps, smoothed, points))
     assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
 
     def between(x, y):

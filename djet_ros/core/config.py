@@ -45,6 +45,12 @@ class EstimatorConfig:
     window_sigma: float = parameter(
         1.0, 'Gaussian weight of the samples in the quadratic fit, in pixels; 0 weighs all alike',
         minimum=0.0, maximum=15.0)
+    grading: float = parameter(
+        24.0, 'difference in gray levels from which on a binary test of a surface is decided; '
+        'below it counts by degrees; 0 takes bits, as ORB does', minimum=0.0, maximum=120.0)
+    binary_tests: int = parameter(
+        128, "how many of ORB's 256 binary tests a surface compares; ORB ranks them by how much "
+        'they add', minimum=16, maximum=256)
     snap_reference: bool = parameter(
         True, 'take geometry from the whole pixel at which the reference descriptor was sampled')
     warp_reference: bool = parameter(
@@ -85,8 +91,8 @@ class EstimatorConfig:
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
     'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
-    'snap_reference': False, 'warp_reference': False, 'indefinite': 'drop',
-    'cull_outside': False, 'loss': 'none',
+    'grading': 0.0, 'binary_tests': 256, 'snap_reference': False, 'warp_reference': False,
+    'indefinite': 'drop', 'cull_outside': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
 }
 

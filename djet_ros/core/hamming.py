@@ -26,9 +26,6 @@ _WARPED_BLOCK = 256
 # at once would overflow the bytes in which they are counted.
 _TESTS_AT_ONCE = 32
 
-# Places (512, 2) around a point at which the tests look: all their p, and all their q.
-_TEST_ENDS = np.concatenate([TESTS[:, :2], TESTS[:, 2:]]).astype(np.float32)
-
 
 def smooth(gray: Image) -> Image:
     """
@@ -54,28 +51,40 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
 
     Raises ValueError where a point is too close to the border for a descriptor.
     """
-    _require_describable(points, smoothed, 0)
-    patches = _gather_patches(smoothed, points, REACH)
-    px, py, qx, qy = TESTS.T + REACH
-    return np.asarray(patches[py, px] < patches[qy, qx])
+    p, q = intensities(smoothed, points)
+    return p < q
 
 
-def warped_descriptor_bits(smoothed: Image, points: Pixels, warp: Array) -> NDArray[np.bool_]:
+def intensities(smoothed: Image, points: Pixels, count: int = len(TESTS)) -> tuple[Image, Image]:
     """
-    Descriptors d(x), as (256, N) bits, of patches as they look when seen through a warp.
+    Intensities at both ends p and q of the first tests around (N, 2) whole pixels, (count, N).
 
-    points: (N, 2) whole pixels; warp: (N, 2, 2) derivatives dy/dx, not singular. The tests look
+    Raises ValueError where a point is too close to the border for a descriptor.
+    """
+    require_describable(points, smoothed, 0)
+    patches = gather_patches(smoothed, points, REACH)
+    px, py, qx, qy = TESTS[:count].T + REACH
+    return patches[py, px], patches[qy, qx]
+
+
+def intensities_through(warp: Array, smoothed: Image, points: Pixels,
+                        count: int = len(TESTS)) -> tuple[Image, Image]:
+    """
+    Intensities at both ends of the first tests, (count, N), on patches seen through a warp.
+
+    warp: (N, 2, 2) derivatives dy/dx, not singular; points: (N, 2) whole pixels. The tests look
     at dx = warp^-1 dy from the point, between pixels; beyond the image its border goes on.
     """
-    bits = np.empty((256, len(points)), bool)
     inverse = np.linalg.inv(warp).astype(np.float32)
+    ends = np.concatenate([TESTS[:count, :2], TESTS[:count, 2:]]).astype(np.float32)
+    values = np.empty((2 * count, len(points)), np.uint8)
     for start in range(0, len(points), _WARPED_BLOCK):
         block = slice(start, start + _WARPED_BLOCK)
-        x, y = (points[block, axis].astype(np.float32) + _TEST_ENDS @ inverse[block, axis].T
+        x, y = (points[block, axis].astype(np.float32) + ends @ inverse[block, axis].T
                 for axis in (0, 1))
-        values = cv2.remap(smoothed, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        np.less(values[:256], values[256:], out=bits[:, block])
-    return bits
+        values[:, block] = cv2.remap(smoothed, x, y, cv2.INTER_LINEAR,
+                                     borderMode=cv2.BORDER_REPLICATE)
+    return values[:count], values[count:]
 
 
 def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
@@ -88,15 +97,15 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
     """
     Hamming match residual Q_k(v) = H(d(x_k), d(y_k + v)) for all |v_x|, |v_y| <= radius.
 
-    bits: (256, N) reference descriptors d(x_k); centres: (N, 2) whole pixels y_k in the smoothed
-    image B. Gives (P, P, N) with P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k].
-    Raises ValueError where a window does not fit into the image.
+    bits: (T, N) reference descriptors d(x_k), of the first T tests; centres: (N, 2) whole pixels
+    y_k in the smoothed image B. Gives (P, P, N) with P = 2 radius + 1, indexed
+    [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
-    _require_describable(centres, smoothed, radius)
+    require_describable(centres, smoothed, radius)
     surfaces = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint16)
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
-        patches = _gather_patches(smoothed, centres[block], REACH + radius)
+        patches = gather_patches(smoothed, centres[block], REACH + radius)
         # Bits chosen by a mask come points first, which is three times slower to count.
         surfaces[:, :, block] = _count_differing_tests(
             np.ascontiguousarray(bits[:, block]), patches, radius)
@@ -118,7 +127,7 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) ->
     return distances
 
 
-def _gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
+def gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
     """Square patches as (S, S, N): points last, so that every test runs over contiguous memory."""
     side = 2 * reach + 1
     if not len(centres):
@@ -136,18 +145,20 @@ def _count_differing_tests(bits: NDArray[np.bool_], patches: Image,
     side = 2 * radius + 1
     total = np.zeros((side, side, patches.shape[2]), np.uint16)
     outcomes = np.empty((_TESTS_AT_ONCE, *total.shape), bool)
-    tests = (TESTS + REACH).tolist()
+    tests = (TESTS[:len(bits)] + REACH).tolist()
     for first in range(0, len(tests), _TESTS_AT_ONCE):
         some = slice(first, first + _TESTS_AT_ONCE)
-        for outcome, (px, py, qx, qy) in zip(outcomes, tests[some]):
+        differ = outcomes[:len(tests[some])]
+        for outcome, (px, py, qx, qy) in zip(differ, tests[some]):
             np.less(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
                     out=outcome)
-        np.not_equal(outcomes, bits[some, None, None], out=outcomes)
-        total += np.add.reduce(outcomes.view(np.uint8), axis=0, dtype=np.uint8)
+        np.not_equal(differ, bits[some, None, None], out=differ)
+        total += np.add.reduce(differ.view(np.uint8), axis=0, dtype=np.uint8)
     return total
 
 
-def _require_describable(points: Pixels, image: Image, radius: int) -> None:
+def require_describable(points: Pixels, image: Image, radius: int) -> None:
+    """Raise ValueError unless all (N, 2) points are `describable`."""
     inside = describable(points, image.shape, radius)
     if not inside.all():
         raise ValueError(f'{int((~inside).sum())} points, the first at {points[~inside][0]}, are '

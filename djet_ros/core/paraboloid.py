@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 from djet_ros.core.types import Array
 import numpy as np
@@ -61,7 +62,7 @@ def fit_operator(window: int, sigma: float) -> Array:
     return np.asarray(operator)
 
 
-def fit_paraboloids(surfaces: NDArray[np.uint16], centres: Array, sigma: float) -> Paraboloids:
+def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Paraboloids:
     """Fit sampled surfaces (P, P, N), indexed [v_y, v_x, k], around centres (N, 2)."""
     window, _, count = surfaces.shape
     a = fit_operator(window, sigma) @ surfaces.reshape(window**2, count).astype(float)

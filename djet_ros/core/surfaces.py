@@ -8,15 +8,18 @@ optimiser does not know which one it is given.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.graded import graded_surfaces, grades
 from djet_ros.core.hamming import (
     describable,
-    descriptor_bits,
     hamming_surfaces,
-    warped_descriptor_bits,
+    Image,
+    intensities,
+    intensities_through,
+    Pixels,
 )
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
@@ -54,13 +57,18 @@ class ResidualSurface(Protocol):
 
 
 class DescriptorSurface:
-    """Hamming match residual Q_k(v) = H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET)."""
+    """
+    Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET).
+
+    H is the Hamming distance, or that of graded tests.
+    """
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
         pixels = np.rint(x).astype(np.int64)
+        self._distances = DescriptorDistances(config)
         self._has_reference = describable(pixels, previous.smoothed.shape)
-        self._bits = np.zeros((256, len(x)), bool)
-        self._bits[:, self._has_reference] = descriptor_bits(
+        self._reference = np.zeros((config.binary_tests, len(x)), self._distances.dtype)
+        self._reference[:, self._has_reference] = self._distances.reference(
             previous.smoothed, pixels[self._has_reference])
         self._previous, self._smoothed = previous.smoothed, current.smoothed
         self._pixels, self._warp = pixels, np.repeat(np.eye(2)[None], len(x), axis=0)
@@ -70,14 +78,14 @@ class DescriptorSurface:
         self.x = pixels.astype(float) if config.snap_reference else x
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
-        """Fit paraboloids to the Hamming surfaces around the whole pixels next to y."""
+        """Fit paraboloids to the surfaces around the whole pixels next to y."""
         anew = np.zeros(len(y), bool) if warp is None else self._see_through(warp)
         centres = np.rint(y).astype(np.int64)
         usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
         # Most windows stay on their pixel from one round to the next, and so does their fit.
         stale = usable & (anew | (centres != self._latest.centres).any(1))
-        surfaces = hamming_surfaces(self._bits[:, stale], self._smoothed, centres[stale],
-                                    self._radius)
+        surfaces = self._distances.surfaces(self._reference[:, stale], self._smoothed,
+                                            centres[stale], self._radius)
         fitted = fit_paraboloids(surfaces, centres[stale].astype(float), self._sigma)
         self._latest = replace(_put(self._latest, fitted, stale), usable=usable)
         # A match that never had a surface stays where it is.
@@ -88,10 +96,37 @@ class DescriptorSurface:
         """Sample reference descriptors through a warp; tells, (N,) bool, where it mattered."""
         anew: NDArray[np.bool_] = self._has_reference & (
             np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP)
-        self._bits[:, anew] = warped_descriptor_bits(
+        self._reference[:, anew] = self._distances.reference(
             self._previous, self._pixels[anew], warp[anew])
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         return anew
+
+
+class DescriptorDistances:
+    """The distance between descriptors that a configuration asks for: graded, or Hamming's."""
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self._grading, self._count = config.grading, config.binary_tests
+        self.dtype: type[np.generic] = np.int8 if self._grading else np.bool_
+
+    def reference(self, smoothed: Image, points: Pixels,
+                  warp: Array | None = None) -> NDArray[Any]:
+        """
+        Descriptors (T, N) at (N, 2) whole pixels, perhaps seen through a warp (N, 2, 2).
+
+        Raises ValueError where a point is too close to the border for a descriptor, and there is
+        no warp.
+        """
+        p, q = (intensities(smoothed, points, self._count) if warp is None else
+                intensities_through(warp, smoothed, points, self._count))
+        return grades(p, q, self._grading) if self._grading else p < q
+
+    def surfaces(self, reference: NDArray[Any], smoothed: Image, centres: Pixels,
+                 radius: int) -> NDArray[Any]:
+        """Distances (P, P, N) in bits between references (T, N) and all pixels of windows."""
+        if self._grading:
+            return graded_surfaces(reference, smoothed, centres, radius, self._grading)
+        return hamming_surfaces(reference, smoothed, centres, radius)
 
 
 class PhotometricSurface:

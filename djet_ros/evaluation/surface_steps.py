@@ -8,10 +8,10 @@ from pathlib import Path
 
 from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances
-from djet_ros.core.hamming import describable, hamming_surfaces, warped_descriptor_bits
+from djet_ros.core.hamming import describable
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.starts import five_point, starting_poses
-from djet_ros.core.surfaces import DescriptorSurface, ResidualSurface
+from djet_ros.core.surfaces import DescriptorDistances, DescriptorSurface, ResidualSurface
 from djet_ros.core.tracking import Track, track_jointly
 from djet_ros.core.types import Array, View
 from djet_ros.errors import DjetError
@@ -63,11 +63,13 @@ class Course:
     """
     Rounds of Algorithm 1 on two views.
 
-    x, y: (N, 2) matches as they went in; inliers: (N,) bool at the end.
+    distances: how descriptors were compared; x, y: (N, 2) matches as they went in; inliers: (N,)
+    bool at the end.
     """
 
     previous: View
     current: View
+    distances: DescriptorDistances
     x: Array
     y: Array
     rounds: list[Round]
@@ -117,7 +119,7 @@ def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorC
             break
         rounds.append(_round(track, surface, K))
         inliers = track.inliers()
-    return Course(previous, current, surface.x, y, rounds, inliers)
+    return Course(previous, current, DescriptorDistances(config), surface.x, y, rounds, inliers)
 
 
 def _round(track: Track, surface: _Observed, K: Array) -> Round:
@@ -195,8 +197,9 @@ def _draw_round(axes: Axes, course: Course, match: int, index: int, window: int)
     step = course.rounds[index]
     centre = np.rint(course.y[match]).astype(np.int64)
     pixels = np.rint(course.x[[match]]).astype(np.int64)
-    bits = warped_descriptor_bits(course.previous.smoothed, pixels, step.warps[[match]])
-    surface = hamming_surfaces(bits, course.current.smoothed, centre[None], RADIUS)[:, :, 0]
+    reference = course.distances.reference(course.previous.smoothed, pixels, step.warps[[match]])
+    surface = course.distances.surfaces(reference, course.current.smoothed, centre[None],
+                                        RADIUS)[:, :, 0]
     draw_patch(axes, course.current.gray, centre, RADIUS)
     draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:

@@ -1,0 +1,99 @@
+"""Graded tests, against a sum over tests and pixels, and against the Hamming distance."""
+
+from __future__ import annotations
+
+from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.graded import graded_surfaces, grades
+from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, intensities, smooth
+from djet_ros.core.orb_pattern import REACH, TESTS
+from djet_ros.core.surfaces import DescriptorSurface, with_minimum
+import numpy as np
+import pytest
+from two_view import K, textured
+
+SIZE = (160, 120)
+
+
+def smoothed(seed):
+    return smooth(textured(np.random.default_rng(seed), SIZE))
+
+
+@pytest.mark.parametrize('grading', [2.0, 24.0, 120.0])
+@pytest.mark.parametrize('count', [16, 100, 256])
+def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count):
+    image_a, image_b = smoothed(70), smoothed(71)
+    x, y = np.array([[60, 50], [90, 61]]), np.array([[62, 49], [88, 60]])
+    reference = grades(*intensities(image_a, x, count), grading)
+    surfaces = graded_surfaces(reference, image_b, y, 2, grading)
+
+    def graded(image, place, test):
+        halves = [int(image[place[1] + test[i + 1], place[0] + test[i]]) // 2 for i in (0, 2)]
+        return np.clip(halves[1] - halves[0], -grading / 2, grading / 2)
+
+    for k in range(2):
+        for v_y in range(-2, 3):
+            for v_x in range(-2, 3):
+                expected = sum(abs(graded(image_a, x[k], test)
+                                   - graded(image_b, y[k] + (v_x, v_y), test))
+                               for test in TESTS[:count]) / grading
+                assert surfaces[v_y + 2, v_x + 2, k] == pytest.approx(expected, rel=1e-6)
+
+
+def test_where_all_tests_are_decided_the_distance_is_hammings():
+    # With two levels a test is decided or undecided; undecided ones are 0 here and a bit there.
+    rng = np.random.default_rng(72)
+    image = np.where(rng.uniform(size=SIZE[::-1]) < 0.5, 0, 255).astype(np.uint8)
+    x, y = np.array([[60, 50]]), np.array([[62, 49]])
+    p, q = intensities(image, x)
+    decided = (p != q)[:, 0]
+    found = graded_surfaces(grades(p, q, 24.0), image, y, 0, 24.0)[0, 0, 0]
+    there = intensities(image, y)
+    both = decided & (there[0] != there[1])[:, 0]
+    bits = np.abs((p < q)[:, 0].astype(int) - (there[0] < there[1])[:, 0])
+    assert found == bits[both].sum() + 0.5 * (decided != (there[0] != there[1])[:, 0]).sum()
+
+
+def test_many_points_at_once_are_as_one_at_a_time():
+    rng = np.random.default_rng(73)
+    image_a, image_b = smoothed(74), smoothed(75)
+    points = rng.integers(REACH + 2, np.subtract(SIZE, REACH + 2), (5000, 2))
+    reference = grades(*intensities(image_a, points, 128), 24.0)
+    together = graded_surfaces(reference, image_b, points, 2, 24.0)
+    for k in (0, 2047, 2048, 4999):
+        alone = graded_surfaces(reference[:, k:k + 1], image_b, points[k:k + 1], 2, 24.0)
+        assert np.array_equal(together[:, :, k], alone[:, :, 0])
+    assert graded_surfaces(reference[:, :0], image_b, points[:0], 2, 24.0).shape == (5, 5, 0)
+
+
+def test_without_grading_all_of_orbs_bits_are_compared():
+    image_a, image_b = smoothed(76), smoothed(77)
+    estimator = TwoViewEstimator()
+    views = [estimator.view(image, K) for image in (image_a, image_b)]
+    x = np.array([[60.0, 50.0], [90.0, 61.0]])
+    config = EstimatorConfig(grading=0.0, binary_tests=256, window=3, window_sigma=0.0)
+    fitted = DescriptorSurface(*views, x, config).around(x)
+    pixels = x.astype(int)
+    samples = hamming_surfaces(descriptor_bits(views[0].smoothed, pixels), views[1].smoothed,
+                               pixels, 1).reshape(9, 2)
+    # The mean of a quadratic over 3x3 pixels is c plus two thirds of the trace of A'.
+    means = fitted.c + 2 / 3 * np.trace(fitted.A, axis1=1, axis2=2)
+    assert np.allclose(means, samples.mean(0))
+
+
+@pytest.mark.parametrize('noise', [2.0, 6.0])
+def test_graded_tests_find_a_place_in_noise_nearer_to_the_truth_than_bits(noise):
+    rng = np.random.default_rng(78)
+    clean = textured(rng, (320, 240))
+    estimator = TwoViewEstimator()
+    views = [estimator.view(np.clip(clean + rng.normal(0, noise, clean.shape), 0, 255).astype(
+        np.uint8), K) for _ in range(2)]
+    grid = np.stack(np.meshgrid(np.arange(40, 280, 7), np.arange(40, 200, 7)), -1)
+    x = grid.reshape(-1, 2).astype(float)
+    errors = {}
+    for grading, count in ((24.0, 128), (0.0, 256)):
+        surface = DescriptorSurface(*views, x, EstimatorConfig(grading=grading,
+                                                               binary_tests=count))
+        fitted, _ = with_minimum(surface.around(x), 'project')
+        errors[grading] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
+    assert errors[24.0] < 0.8 * errors[0.0]
