@@ -49,7 +49,8 @@ def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_ne
     previous, current = pair
     x, y = np.array([[60.4, 50.0], [90.0, 70.6]]), np.array([[64.2, 48.7], [88.0, 66.4]])
     surface = DescriptorSurface(previous, current, x,
-                                EstimatorConfig(window=side, window_sigma=sigma))
+                                EstimatorConfig(window=side, window_sigma=sigma,
+                                                grading=0.0, binary_tests=256))
     fitted = surface.around(y)
     assert fitted.usable.all()
     assert np.array_equal(fitted.centres, [[64, 49], [88, 66]])
