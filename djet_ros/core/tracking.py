@@ -46,6 +46,7 @@ _TIGHT = 1.0
 # where a start lies says little of its basin.
 _STEPS_TO_SKETCH = 4
 _MATCHES_TO_SKETCH = 800
+_FEW_MATCHES = 400  # all starts are refined on so few: it costs little, and basins lie closer
 _REFINED_STARTS = 2
 _SAME_BASIN = 0.02  # rad
 _STEPS_TO_COMPARE = 7
@@ -151,9 +152,8 @@ def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
     some = problem.subset(slice(None, None, -(-len(problem.blur) // _MATCHES_TO_SKETCH)))
     scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
     tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
-    if len(starts) > 1:
-        sketched = [minimise(some, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts]
-        starts = _promising(sketched)
+    if len(starts) > 1 and len(problem.blur) > _FEW_MATCHES:
+        starts = _promising([minimise(some, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts])
     refined = [minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts]
     best = min(refined, key=lambda solution: solution.cost)
     if prior is not None:
