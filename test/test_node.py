@@ -213,7 +213,10 @@ def test_a_late_camera_info_and_then_a_periodic_one(node, publisher, subscriber,
     publisher.advertise(INFO, INFO_TYPE)
     publisher.advertise(IMAGE, IMAGE_TYPE)
     play(publisher, drive[:3])
-    subscriber.wait('a complaint', said('waiting for camera_info'))
+    # Topics are not in order with one another: all three images have to be there first.
+    waiting = said('waiting for camera_info')
+    subscriber.wait('a complaint about each', lambda heard: (waiting(heard) or {}).get(
+        'frames dropped: waiting_for_camera_info') == '3')
     for i in range(3, 8):
         publisher.send(INFO, camera_info(K, SIZE, stamp_ns=stamp(i)))
         play(publisher, drive[i:i + 1], first=i, pause=0.1)
