@@ -1,8 +1,8 @@
 """
 Graded binary tests: by how much, and not only which of, two places is the brighter one.
 
-A bit of a descriptor flips where its two places are equally bright, so what a Hamming surface says
-is decided by tests that hardly any noise would turn. A graded test passes gradually from one
+A bit of a descriptor flips where its two places are equally bright, so most of what a Hamming
+surface says hangs on tests that a little noise would turn. A graded test passes by degrees from one
 outcome to the other, g = clip(I(q) - I(p), -s, s) with s the grading. The distance of two graded
 descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all tests are decided.
 """
@@ -52,8 +52,8 @@ def _summed_differences(reference: Grades, patches: Grades, radius: int,
                         reach: int) -> NDArray[np.uint16]:
     side = 2 * radius + 1
     total = np.zeros((side, side, patches.shape[2]), np.uint16)
-    # As many tests at once as can be summed in bytes.
-    at_once = 255 // (2 * reach)
+    # As many tests at once as can be summed in bytes, and stay in the cache.
+    at_once = min(255 // (2 * reach), 32)
     buffer = np.empty((at_once, *total.shape), np.int8)
     tests = (TESTS[:len(reference)] + REACH).tolist()
     for first in range(0, len(tests), at_once):
