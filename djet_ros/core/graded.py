@@ -2,9 +2,9 @@
 Graded binary tests: by how much, and not only which of, two places is the brighter one.
 
 A bit of a descriptor flips where its two places are equally bright, so most of what a Hamming
-surface says hangs on tests that a little noise would turn. A graded test passes by degrees from one
-outcome to the other, g = clip(I(q) - I(p), -s, s) with s the grading. The distance of two graded
-descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all tests are decided.
+surface says hangs on tests that a little noise would turn. A graded test passes by degrees from
+one outcome to the other, g = clip(I(q) - I(p), -s, s) with s the grading. The distance of two
+graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all tests are decided.
 """
 
 from __future__ import annotations
