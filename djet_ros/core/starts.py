@@ -53,7 +53,7 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
 
     x, y: (N, 2) pixels; threshold in pixels; prior: the previous motion, if there is one.
     """
-    some = slice(None, None, -(-len(x) // _RANSAC_MATCHES))
+    some = slice(None, None, max(1, -(-len(x) // _RANSAC_MATCHES)))
     x, y = x[some], y[some]
     found = five_point(K, x, y, threshold, robust=True)
     return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
