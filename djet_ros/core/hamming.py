@@ -2,8 +2,8 @@
 Dense unrotated descriptors on pyramid level 0, and the Hamming match residual Q_k around a point.
 
 Paper: section "Locally differentiable descriptor residual" and "Descriptor". Descriptors are taken
-at whole pixels of the smoothed image, exactly as ``cv2.ORB.compute`` does with angle 0; only patches
-that are seen through a warp are tested between pixels.
+at whole pixels of the smoothed image, exactly as ``cv2.ORB.compute`` does with angle 0; only
+patches that are seen through a warp are tested between pixels.
 """
 
 from __future__ import annotations
