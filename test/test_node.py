@@ -252,6 +252,7 @@ def test_compressed_images_are_tracked(node, publisher, subscriber, drive):
     publisher.advertise(f'{IMAGE}/compressed', 'sensor_msgs/msg/CompressedImage')
     publisher.advertise(INFO, INFO_TYPE)
     publisher.send(INFO, camera_info(K, SIZE))
+    subscriber.wait('readiness', said('waiting for an image'))
     for i, gray in enumerate(drive[:3]):
         jpeg = cv2.imencode('.jpg', gray)[1].tobytes()
         publisher.send(f'{IMAGE}/compressed', compressed(jpeg, 'jpeg', stamp(i)))
