@@ -8,6 +8,9 @@ patches that are seen through a warp are tested between pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 from djet_ros.core.orb_pattern import REACH, TESTS
 from djet_ros.core.types import Array
@@ -23,8 +26,7 @@ _BLOCK = 2048
 # Points per pass of warped patches, which take 512 places in the image each (2 MB).
 _WARPED_BLOCK = 256
 
-# Tests per pass over the points: enough to spare calls, few enough to stay in the cache. All 256
-# at once would overflow the bytes in which they are counted.
+# Tests per pass over the points at most: enough to spare calls, few enough to stay in the cache.
 _TESTS_AT_ONCE = 32
 
 
@@ -102,15 +104,52 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
     y_k in the smoothed image B. Gives (P, P, N) with P = 2 radius + 1, indexed
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
-    require_describable(centres, smoothed, radius)
-    surfaces = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint16)
+    def differ(outcomes: NDArray[Any], reference: NDArray[Any]) -> NDArray[np.uint8]:
+        np.not_equal(outcomes, reference, out=outcomes)
+        return outcomes.view(np.uint8)
+
+    return sum_over_tests(bits, smoothed, centres, radius, np.less, differ, most=1)
+
+
+def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels, radius: int,
+                   outcome: np.ufunc, differ: Callable[..., NDArray[np.uint8]],
+                   most: int) -> NDArray[np.uint16]:
+    """
+    Sum up, at every pixel of a window, by how much the tests differ from those at a reference.
+
+    reference: (T, N) of the first T tests; image: (H, W); centres: (N, 2) whole pixels in it.
+    outcome(I(p), I(q)) is a test, of the type of the reference; differ(outcomes, reference), which
+    may write over the outcomes, is at most `most`. Gives (P, P, N) with P = 2 radius + 1, indexed
+    [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
+    """
+    require_describable(centres, image, radius)
+    sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint16)
+    # As many at once as can be summed in bytes.
+    at_once = min(_TESTS_AT_ONCE, 255 // most)
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
-        patches = gather_patches(smoothed, centres[block], REACH + radius)
-        # Bits chosen by a mask come points first, which is three times slower to count.
-        surfaces[:, :, block] = _count_differing_tests(
-            np.ascontiguousarray(bits[:, block]), patches, radius)
-    return surfaces
+        patches = gather_patches(image, centres[block], REACH + radius)
+        # What a mask has chosen comes points first, which is three times slower to compare.
+        chosen = np.ascontiguousarray(reference[:, block])
+        sums[:, :, block] = _summed(chosen, patches, radius, outcome, differ, at_once)
+    return sums
+
+
+def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, outcome: np.ufunc,
+            differ: Callable[..., NDArray[np.uint8]], at_once: int) -> NDArray[np.uint16]:
+    side = 2 * radius + 1
+    total = np.zeros((side, side, patches.shape[2]), np.uint16)
+    buffer = np.empty((at_once, *total.shape), reference.dtype)
+    tests = (TESTS[:len(reference)] + REACH).tolist()
+    for first in range(0, len(tests), at_once):
+        some = slice(first, first + at_once)
+        outcomes = buffer[:len(tests[some])]
+        for one, (px, py, qx, qy) in zip(outcomes, tests[some]):
+            outcome(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
+                    out=one)
+        differences = differ(outcomes, reference[some, None, None])
+        total += np.add.reduce(differences, axis=0, dtype=np.uint8)
+    return total
 
 
 def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) -> Array:
@@ -128,34 +167,17 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) ->
     return distances
 
 
-def gather_patches(smoothed: Image, centres: Pixels, reach: int) -> Image:
+def gather_patches(image: NDArray[Any], centres: Pixels, reach: int) -> NDArray[Any]:
     """Square patches as (S, S, N): points last, so that every test runs over contiguous memory."""
     side = 2 * reach + 1
     if not len(centres):
         # The image may be smaller than a window.
-        return np.empty((side, side, 0), np.uint8)
-    windows = np.lib.stride_tricks.sliding_window_view(smoothed, (side, side))
+        return np.empty((side, side, 0), image.dtype)
+    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
     patches = windows[centres[:, 1] - reach, centres[:, 0] - reach]
     # OpenCV transposes bytes ten times as fast as NumPy.
-    points_last = np.asarray(cv2.transpose(patches.reshape(len(centres), side * side)), np.uint8)
+    points_last = np.asarray(cv2.transpose(patches.reshape(len(centres), side * side)))
     return points_last.reshape(side, side, len(centres))
-
-
-def _count_differing_tests(bits: NDArray[np.bool_], patches: Image,
-                           radius: int) -> NDArray[np.uint16]:
-    side = 2 * radius + 1
-    total = np.zeros((side, side, patches.shape[2]), np.uint16)
-    outcomes = np.empty((_TESTS_AT_ONCE, *total.shape), bool)
-    tests = (TESTS[:len(bits)] + REACH).tolist()
-    for first in range(0, len(tests), _TESTS_AT_ONCE):
-        some = slice(first, first + _TESTS_AT_ONCE)
-        differ = outcomes[:len(tests[some])]
-        for outcome, (px, py, qx, qy) in zip(differ, tests[some]):
-            np.less(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
-                    out=outcome)
-        np.not_equal(differ, bits[some, None, None], out=differ)
-        total += np.add.reduce(differ.view(np.uint8), axis=0, dtype=np.uint8)
-    return total
 
 
 def require_describable(points: Pixels, image: Image, radius: int) -> None:
