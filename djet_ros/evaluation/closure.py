@@ -15,10 +15,11 @@ from typing import Any
 
 from djet_ros.core.config import preset
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.geometry import rotation_angle
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.data.sequence import FrameSequence
 from djet_ros.errors import DjetError
+from djet_ros.evaluation.pair_errors import motion_errors, statistics
+from djet_ros.evaluation.pairs import camera_motion
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -99,21 +100,19 @@ def summary(triangles: Sequence[Triangle | None]) -> dict[str, Any]:
     """Sum up one method: angles in degrees, 'without' counts triangles with a pose missing."""
     closed = [triangle for triangle in triangles if triangle is not None]
 
-    def quantile(name: str, share: float) -> float:
-        values = [getattr(triangle, name) for triangle in closed]
-        known = [value for value in values if np.isfinite(value)]
-        return float(np.quantile(known, share)) if known else float('nan')
+    def spread(name: str) -> dict[str, float]:
+        found = statistics(np.array([getattr(triangle, name) for triangle in closed]))
+        return found or dict.fromkeys(('mean', 'median', 'p95'), float('nan'))
 
-    squares = [triangle.normalised_square for triangle in closed]
     return {'triangles': len(closed), 'without': len(triangles) - len(closed),
-            'median_deg': quantile('angle', 0.5), 'p95_deg': quantile('angle', 0.95),
-            'claimed_median_deg': quantile('claimed', 0.5),
-            'normalised_square_mean': float(np.mean(squares)) if squares else float('nan'),
-            'error_median_deg': quantile('error', 0.5)}
+            'median_deg': spread('angle')['median'], 'p95_deg': spread('angle')['p95'],
+            'claimed_median_deg': spread('claimed')['median'],
+            'normalised_square_mean': spread('normalised_square')['mean'],
+            'error_median_deg': spread('error')['median']}
 
 
 def _error(pose: RelativePose, poses: Array | None, first: int) -> float:
     if poses is None or not np.isfinite(poses[[first, first + 1]]).all():
         return float('nan')
-    true_motion = np.linalg.inv(poses[first + 1]) @ poses[first]
-    return float(np.degrees(rotation_angle(pose.R, true_motion[:3, :3])))
+    true_motion = np.linalg.inv(poses[first]) @ poses[first + 1]
+    return motion_errors(pose.status, camera_motion(pose), true_motion)[0]
