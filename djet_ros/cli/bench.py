@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.outputs import add_json_output, check_output, write_json
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.bench import bench, QUOTED_POINTS
 from rich.console import Console
@@ -22,11 +21,9 @@ def add_parser(subparsers: Any) -> None:
         'how the D-JET stage grows with points and window. Writes the figures as JSON and a plot '
         'beside them.')
     parser.add_argument('source', type=Path, metavar='SOURCE', help='folder such as sequences/00')
-    parser.add_argument('--output', type=Path, required=True, metavar='FILE.json',
-                        help='where the figures go; the plot goes to FILE.png')
     parser.add_argument('--pairs', type=int, default=40, metavar='N',
                         help='pairs to measure (default: %(default)s)')
-    add_overwrite(parser)
+    add_json_output(parser, 'figures')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,8 +36,7 @@ def run(args: argparse.Namespace) -> int:
     with console.status('measuring ...') as status:
         figures = bench(args.source, args.pairs,
                         lambda stage: status.update(f'measuring with {stage} ...'))
-    args.output.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
-    plot = args.output.with_suffix('.png')
+    plot = write_json(args.output, figures)
     draw(figures, plot)
     console.print(_table(figures))
     print(f'figures: {args.output}\nplot: {plot}')

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.outputs import add_json_output, check_output, write_json
 from djet_ros.cli.pair_runs import split
 from djet_ros.core.config import METHODS
 from djet_ros.errors import DjetError
@@ -36,13 +35,11 @@ def add_parser(subparsers: Any) -> None:
     """Add the subcommand to the subparsers of ``djet``."""
     parser = subparsers.add_parser('closure', description=DESCRIPTION)
     parser.add_argument('source', type=Path, metavar='SOURCE', help='a sequence or a bag')
-    parser.add_argument('--output', type=Path, required=True, metavar='FILE.json',
-                        help='where the triangles go; the plot goes to FILE.png')
     parser.add_argument('--methods', default=','.join(CHOICES), metavar='LIST',
                         help='(default: %(default)s)')
     parser.add_argument('--frames', type=int, default=150, metavar='N',
                         help='how many frames to use, from the first (default: %(default)s)')
-    add_overwrite(parser)
+    add_json_output(parser, 'triangles')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,11 +57,10 @@ def run(args: argparse.Namespace) -> int:
             found = closures(sequence, methods, args.frames,
                              lambda done: bar.update(task, completed=done))
     summaries = {method: summary(triangles) for method, triangles in found.items()}
-    args.output.write_text(json.dumps(
-        {'source': sequence.name, 'summary': summaries, 'triangles': {
-            method: [triangle and asdict(triangle) for triangle in triangles]
-            for method, triangles in found.items()}}, indent=2) + '\n', encoding='utf-8')
-    plot = args.output.with_suffix('.png')
+    plot = write_json(args.output, {
+        'source': sequence.name, 'summary': summaries,
+        'triangles': {method: [triangle and asdict(triangle) for triangle in triangles]
+                      for method, triangles in found.items()}})
     draw(found, sequence.name, plot)
     Console().print(_table(sequence.name, summaries))
     print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '

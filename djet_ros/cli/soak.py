@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.outputs import add_json_output, check_output, write_json
 from djet_ros.evaluation.soak import SIZE, soak
 from rich.console import Console
 
@@ -19,14 +18,12 @@ def add_parser(subparsers: Any) -> None:
         'odometry, black ones, gaps and steps back in time among them, and record memory and '
         'latency. Writes the figures as JSON and a plot beside them. The exit code is 1 if '
         'memory grows beyond the bound.')
-    parser.add_argument('--output', type=Path, required=True, metavar='FILE.json',
-                        help='where the figures go; the plot goes to FILE.png')
     parser.add_argument('--frames', type=int, default=20_000, metavar='N',
                         help='frames to process (default: %(default)s)')
     parser.add_argument('--max-growth', type=float, default=10.0, metavar='MB',
                         help='resident memory that may come on top of what a fifth of the frames '
                         'took (default: %(default)s)')
-    add_overwrite(parser)
+    add_json_output(parser, 'figures')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     with Console(stderr=True).status('soaking ...') as status:
         figures = soak(args.frames, args.max_growth, lambda done: status.update(
             f'soaking: {done} of {args.frames} frames ...'))
-    args.output.write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
-    plot = args.output.with_suffix('.png')
+    plot = write_json(args.output, figures)
     draw(figures, plot)
     latency = figures['latency_ms']
     print(f"{figures['frames']} frames in {figures['seconds']:.0f} s; latency p50 "
