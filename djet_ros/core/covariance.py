@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 _CELL = 32
 
 # What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
-# once, as the normalised squared error on a rendered street; tests hold it on other scenes.
+# once, as the normalised squared error on rendered streets; tests hold it on other scenes.
 _INFLATION = 1.6
 
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.

@@ -89,11 +89,12 @@ class TwoViewEstimator:
         if len(x) < config.min_matches:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
+        before = _pose(prior)
         if config.starts == 'several' and config.method != 'five_point':
             # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
             # The first surfaces need no pose, and are sampled meanwhile.
             starts, surface = both(
-                lambda: self._starts(K, x, y, prior, timings),
+                lambda: self._starts(K, x, y, before, timings),
                 lambda: self._surface(previous, current, x, y, timings))
         else:
             # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
@@ -107,16 +108,16 @@ class TwoViewEstimator:
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
-                     else track_jointly(surface, K, y, starts, config, _pose(prior)))
+                     else track_jointly(surface, K, y, starts, config, before))
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
         with _timed(timings, 'result'):
             return self._result(previous, current, surface, y, track)
 
-    def _starts(self, K: Array, x: Array, y: Array, prior: RelativePose | None,
+    def _starts(self, K: Array, x: Array, y: Array, before: Pose | None,
                 timings: dict[str, float]) -> list[Pose]:
         with _timed(timings, 'starts'):
-            return starting_poses(K, x, y, self.config.ransac_threshold, _pose(prior))
+            return starting_poses(K, x, y, self.config.ransac_threshold, before)
 
     def _surface(self, previous: View, current: View, x: Array, y: Array,
                  timings: dict[str, float]) -> ResidualSurface:

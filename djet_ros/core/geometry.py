@@ -86,11 +86,16 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     x, y = unit(rays_x), unit(rays_y)
     R, weights = np.eye(3), np.ones(len(x))
     for _ in range(rounds):
-        U, _, Vt = np.linalg.svd((y.T * weights) @ x)
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = nearest_rotation((y.T * weights) @ x)
         deviation = np.linalg.norm(y - x @ R.T, axis=1)
         weights = 1 / (1 + (deviation / max(float(np.median(deviation)), 1e-9))**2)
     return R
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Give the rotation (3, 3) that is next to a matrix (3, 3), in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-from djet_ros.core.geometry import in_front, rays, unit
+from djet_ros.core.geometry import in_front, nearest_rotation, rays, unit
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -53,10 +53,15 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
 
     x, y: (N, 2) pixels; threshold in pixels; prior: the previous motion, if there is one.
     """
-    some = slice(None, None, max(1, -(-len(x) // _RANSAC_MATCHES)))
+    some = thinned(len(x), _RANSAC_MATCHES)
     x, y = x[some], y[some]
     found = five_point(K, x, y, threshold, robust=True)
     return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
+
+
+def thinned(count: int, most: int) -> slice:
+    """Choose at most so many of a count of matches, evenly from their order."""
+    return slice(None, None, max(1, -(-count // most)))
 
 
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
@@ -70,15 +75,10 @@ def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     if H is None or not np.isfinite(H).all():
         return []
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.ascontiguousarray(K))
-    return [Pose(_nearest_rotation(np.asarray(R, float)), unit(np.ravel(np.asarray(t, float))))
+    # OpenCV's rotations are off by as much as 1e-8.
+    return [Pose(nearest_rotation(np.asarray(R, float)), unit(np.ravel(np.asarray(t, float))))
             for R, t in zip(rotations, translations)
             if np.isfinite(R).all() and np.linalg.norm(t) > 1e-6]
-
-
-def _nearest_rotation(R: Array) -> Array:
-    """Give the rotation next to a matrix (3, 3): OpenCV's are off by as much as 1e-8."""
-    U, _, Vt = np.linalg.svd(R)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:

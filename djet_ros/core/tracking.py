@@ -25,7 +25,7 @@ from djet_ros.core.jet import (
     Solution,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.starts import Pose
+from djet_ros.core.starts import Pose, thinned
 from djet_ros.core.surfaces import ResidualSurface, with_minimum
 from djet_ros.core.types import Array
 import numpy as np
@@ -149,7 +149,7 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
               prior: Pose | None) -> tuple[Solution, Loss]:
     """Refine the most promising starts, and the cheapest of them to the end."""
-    some = problem.subset(slice(None, None, -(-len(problem.blur) // _MATCHES_TO_SKETCH)))
+    some = problem.subset(thinned(len(problem.blur), _MATCHES_TO_SKETCH))
     scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
     tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
     if len(starts) > 1 and len(problem.blur) > _FEW_MATCHES:
