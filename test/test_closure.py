@@ -65,6 +65,7 @@ def test_the_command_writes_triangles_and_a_plot(road: Path, tmp_path: Path) -> 
     answer = djet(road, '--output', output, '--methods', 'djet,rpe', '--frames', 4)
     assert answer.returncode == 0, answer.stderr
     written = json.loads(output.read_text())
+    assert written['source'] == 'road'  # not KITTI, whose layout a rendered sequence has
     assert list(written['summary']) == ['djet', 'rpe']
     first, second = written['triangles']['rpe']
     assert (first['first'], second['first']) == (0, 1)

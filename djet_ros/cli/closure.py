@@ -14,7 +14,7 @@ from djet_ros.core.config import METHODS
 from djet_ros.errors import DjetError
 from djet_ros.evaluation.closure import closures, summary, Triangle
 from djet_ros.evaluation.entrants import check_names, TITLES
-from djet_ros.evaluation.sources import readable_frames
+from djet_ros.evaluation.sources import plain_name, readable_frames
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     check_output(args.output, args.overwrite)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
-    methods = split(args.methods)
+    methods, name = split(args.methods), plain_name(args.source)
     check_names('method', methods, CHOICES)
     with TemporaryDirectory() as workspace:
         sequence = readable_frames(args.source, Path(workspace))
@@ -58,11 +58,11 @@ def run(args: argparse.Namespace) -> int:
                              lambda done: bar.update(task, completed=done))
     summaries = {method: summary(triangles) for method, triangles in found.items()}
     plot = write_json(args.output, {
-        'source': sequence.name, 'summary': summaries,
+        'source': name, 'summary': summaries,
         'triangles': {method: [triangle and asdict(triangle) for triangle in triangles]
                       for method, triangles in found.items()}})
-    draw(found, sequence.name, plot)
-    Console().print(_table(sequence.name, summaries))
+    draw(found, name, plot)
+    Console().print(_table(name, summaries))
     print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '
           'average if true;\noff truth: error of single rotations, median, where there is ground '
           'truth')

@@ -52,7 +52,7 @@ def closures(sequence: FrameSequence, methods: Sequence[str], frames: int,
     """
     frames = min(frames, len(sequence))
     if frames < 3:
-        raise DjetError(f'{sequence.name} has {frames} frames to use; a triangle needs three')
+        raise DjetError(f'there are {frames} frames to use; a triangle needs three')
     estimators = {name: TwoViewEstimator(preset('best', method=name)) for name in methods}
     found: dict[str, list[Triangle | None]] = {name: [] for name in methods}
     # All methods see the same features: detection has no parameter of theirs.

@@ -66,7 +66,7 @@ def open_sources(paths: Iterable[Path], selection: Selection, workspace: Path) -
     """
     sources: list[Source] = []
     for path in chain.from_iterable(map(_sequences, paths)):
-        name = _unused(_name(path), {source.name for source in sources})
+        name = _unused(plain_name(path), {source.name for source in sources})
         sources.append(_source(path, name, selection, workspace))
     return sources
 
@@ -127,7 +127,8 @@ def _sequences(path: Path) -> Iterator[Path]:
     yield from inner or [path]
 
 
-def _name(path: Path) -> str:
+def plain_name(path: Path) -> str:
+    """Name that tables call a dataset by: a rendered one by its scene, others by their folder."""
     resolved = path.resolve()
     return rendered_scene(resolved) or (resolved.stem if resolved.is_file() else resolved.name)
 
