@@ -20,22 +20,24 @@ import tempfile
 from typing import Any, cast, NamedTuple
 
 import cv2
-from djet_ros.config import Config, dump_yaml, flat, from_flat, load_yaml
-from djet_ros.data.bag_writers import ResultBag, write_kitti_bag
-from djet_ros.data.bags import Bag, BagSource
-from djet_ros.data.datasets import euroc, tum_rgbd
-from djet_ros.data.decoding import decoder, jazzy, message_type
-from djet_ros.data.kitti import KittiSequence, read_camera, read_poses
-from djet_ros.data.pose_graph import read_results
-from djet_ros.data.sequence import FrameSequence
-from djet_ros.data.sources import pose_of
-from djet_ros.data.storages import BrokenFile, Connection
-from djet_ros.data.trajectories import KittiWriter, read_tum, TumWriter
-from djet_ros.data.varos import VarosSequence
+from djet_ros.config.flat import flat, from_flat
+from djet_ros.config.sections import Config
+from djet_ros.config.yaml_files import dump_yaml, load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
+from djet_ros.recordings.bags import Bag, BagSource
+from djet_ros.recordings.datasets import euroc, tum_rgbd
+from djet_ros.recordings.decoding import decoder, jazzy, message_type
+from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
+from djet_ros.recordings.sequence import FrameSequence
+from djet_ros.recordings.sources import pose_of
+from djet_ros.recordings.storages import BrokenFile, Connection
+from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
+from djet_ros.recordings.varos import VarosSequence
+from djet_ros.replay.graph_of_results import read_results
 import numpy as np
 from ros_messages import camera_info, compressed, header, image, roi, serialised
 from rosbags.rosbag1 import Writer as Ros1Writer

@@ -15,21 +15,27 @@ import tracemalloc
 
 import cv2
 from djet_ros.cli import kitti_to_bag
-from djet_ros.data.bag_writers import (
-    camera_info, mono8, OPTICAL, pose_stamped, ResultBag, STORAGES, write_kitti_bag)
-from djet_ros.data.bags import Bag, BagSource
-from djet_ros.data.decoding import decoder, jazzy, message_type, MOST_ELEMENTS
-from djet_ros.data.kitti import KittiSequence
-from djet_ros.data.storages.base import BrokenFile, Connection, LARGEST_PIECE
-from djet_ros.data.storages.compression import zstd
 from djet_ros.errors import DjetError
+from djet_ros.recordings.bag_writers import (
+    camera_info,
+    mono8,
+    OPTICAL,
+    pose_stamped,
+    ResultBag,
+    STORAGES,
+    write_kitti_bag,
+)
+from djet_ros.recordings.bags import Bag, BagSource
+from djet_ros.recordings.decoding import decoder, jazzy, message_type, MOST_ELEMENTS
+from djet_ros.recordings.kitti import KittiSequence
+from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE
+from djet_ros.recordings.storages.compression import zstd
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import (
-    CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from scipy.spatial.transform import Rotation
 
@@ -730,7 +736,7 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
     # Little more than the interpreter and its libraries need; unpacking would break it.
     script = ('import resource, sys, pathlib\n'
               'from test_bags import read_until_broken\n'
-              'import djet_ros.data.decoding\n'
+              'import djet_ros.recordings.decoding\n'
               'used = int(open("/proc/self/statm").read().split()[0]) * 4096\n'
               'resource.setrlimit(resource.RLIMIT_AS, (used + (300 << 20),) * 2)\n'
               'for path in sys.argv[1:]:\n'

@@ -7,7 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from djet_ros.scenes.sequence import render_sequence
+from djet_ros.lab.scenes.sequence import render_sequence
 import pytest
 
 

@@ -8,9 +8,9 @@ import subprocess
 import sys
 
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.data.datasets import open_sequence
-from djet_ros.evaluation.closure import closures, remaining_rotation, summary
-from djet_ros.scenes.sequence import render_sequence
+from djet_ros.lab.closure import closures, remaining_rotation, summary
+from djet_ros.lab.scenes.sequence import render_sequence
+from djet_ros.recordings.datasets import open_sequence
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

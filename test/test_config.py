@@ -3,20 +3,13 @@
 import argparse
 from pathlib import Path
 
-from djet_ros.config import (
-    add_flags,
-    Config,
-    dump_yaml,
-    flag_values,
-    flat,
-    from_flat,
-    load_yaml,
-    with_values,
-)
-from djet_ros.core.config import preset
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import flat, from_flat, with_values
+from djet_ros.config.sections import Config
+from djet_ros.config.yaml_files import dump_yaml, load_yaml
+from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import pytest
 
 SHIPPED = Path(__file__).parent.parent / 'config' / 'vo.yaml'
@@ -31,8 +24,8 @@ def written(tmp_path, text):
 def test_the_shipped_yaml_is_the_generated_one():
     expected = dump_yaml(Config(), preset_as_comments=True)
     assert SHIPPED.read_text() == expected, (
-        "write config/vo.yaml anew: python -c 'from djet_ros.config import *; "
-        "print(dump_yaml(Config(), preset_as_comments=True), end=str())' > config/vo.yaml")
+        "write config/vo.yaml anew: python -c 'from djet_ros.config.sections import *; "
+        "from djet_ros.config.yaml_files import *; print(dump_yaml(Config(), preset_as_comments=True), end=str())' > config/vo.yaml")
 
 
 def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():

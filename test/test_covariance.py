@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from djet_ros.core.config import preset
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import sphere_tangents, unit
 from djet_ros.core.jet import Loss, Residuals
 from djet_ros.core.types import Status
-from djet_ros.scenes.pair import render_pair
+from djet_ros.lab.scenes.pair import render_pair
 import numpy as np
 from scipy.spatial.transform import Rotation
 

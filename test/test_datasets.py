@@ -1,11 +1,11 @@
 """TUM RGB-D and EuRoC folders, and finding out what a path holds."""
 
 import cv2
-from djet_ros.data.bag_writers import write_kitti_bag
-from djet_ros.data.bags import BagSource
-from djet_ros.data.datasets import euroc, interpolate, open_sequence, tum_rgbd
-from djet_ros.data.kitti import KittiSequence
 from djet_ros.errors import DjetError
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.datasets import euroc, interpolate, open_sequence, tum_rgbd
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -22,13 +22,13 @@ from dds_graph import (
     TYPES,
 )
 from djet_ros.cli.main import main
-from djet_ros.data.bag_writers import write_kitti_bag
-from djet_ros.data.bags import Bag
-from djet_ros.data.kitti import KittiSequence
 from djet_ros.dds.names import Names
 from djet_ros.dds.wire import encode
+from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.messages import stamp_ns
-from djet_ros.scenes import render_sequence
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, serialised

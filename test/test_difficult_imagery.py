@@ -14,13 +14,13 @@ import re
 from typing import NamedTuple
 
 import cv2
-from djet_ros.core.config import preset
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
 from djet_ros.core.types import RelativePose, Status
+from djet_ros.lab.scenes.catalogue import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import VisualOdometry
-from djet_ros.scenes.catalogue import make_scene
 import numpy as np
 from numpy.typing import NDArray
 import pytest

@@ -10,8 +10,8 @@ import pickle
 
 from cards import Cards, K as CARDS_K, pose
 import cv2
-from djet_ros.core.config import EstimatorConfig, METHODS, preset
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig, METHODS, preset
 from djet_ros.core.geometry import (
     direction_angle,
     epipolar_lines,
@@ -26,10 +26,9 @@ from djet_ros.core.starts import five_point, planar, Pose, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.data.kitti import KittiSequence
-from djet_ros.scenes import make_scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from djet_ros.lab.scenes import make_scene
+from djet_ros.recordings.kitti import KittiSequence
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -17,18 +17,18 @@ import sys
 from time import monotonic, sleep
 
 import cv2
-from djet_ros.core.config import EstimatorConfig, preset
+from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.types import Status
-from djet_ros.data.bag_writers import write_kitti_bag
-from djet_ros.data.kitti import KittiSequence
-from djet_ros.data.trajectories import read_tum
-from djet_ros.evaluation.entrants import default_methods, Entrant, TITLES
-from djet_ros.evaluation.evo import trajectory_metrics
-from djet_ros.evaluation.pairs import Chunk, evaluate_chunk, has_failed, PairRecord
-from djet_ros.evaluation.sources import open_sources, Selection, Source
-from djet_ros.evaluation.summary import table_rows
-from djet_ros.evaluation.trajectories import estimated_trajectory, true_trajectory
-from djet_ros.scenes import render_sequence
+from djet_ros.lab.entrants import default_methods, Entrant, TITLES
+from djet_ros.lab.evo import trajectory_metrics
+from djet_ros.lab.pairs import Chunk, evaluate_chunk, has_failed, PairRecord
+from djet_ros.lab.scenes import render_sequence
+from djet_ros.lab.sources import open_sources, Selection, Source
+from djet_ros.lab.summary import table_rows
+from djet_ros.lab.trajectories import estimated_trajectory, true_trajectory
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.kitti import KittiSequence
+from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 import pytest
 

@@ -17,9 +17,9 @@ from cards import Cards, K, pose
 from conftest import write_small_kitti
 import cv2
 from djet_ros.cli.main import main
-from djet_ros.data.bags import Bag
-from djet_ros.data.trajectories import read_tum
 from djet_ros.errors import DjetError
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader

@@ -8,13 +8,13 @@ import sys
 
 import cv2
 from djet_ros.cli.main import main
-from djet_ros.core.config import EstimatorConfig, preset
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.data.kitti import KittiSequence
+from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.similarity import cross_similarity, read_image, self_similarity
-from djet_ros.evaluation.surface_steps import follow, RADIUS, telling_match
-from djet_ros.scenes import render_sequence
+from djet_ros.lab.scenes import render_sequence
+from djet_ros.lab.similarity import cross_similarity, read_image, self_similarity
+from djet_ros.lab.surface_steps import follow, RADIUS, telling_match
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 

@@ -3,7 +3,7 @@
 from threading import Thread
 from time import monotonic
 
-from djet_ros.odometry.frame_queue import FrameQueue
+from djet_ros.live.frame_queue import FrameQueue
 import pytest
 
 

@@ -21,8 +21,7 @@ from djet_ros.core.geometry import (
     stretches,
     unit,
 )
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest

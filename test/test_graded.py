@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.graded import graded_surfaces, grades
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, intensities, smooth
 from djet_ros.core.orb_pattern import REACH, TESTS

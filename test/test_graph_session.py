@@ -3,9 +3,9 @@
 from time import monotonic, sleep
 
 from cards import Cards, K, pose, SIZE
-from djet_ros.config import from_flat
+from djet_ros.config.flat import from_flat
 from djet_ros.odometry.messages import stamp_ns
-from djet_ros.slam.live_config import LiveSlamConfig
+from djet_ros.posegraph.live_config import LiveSlamConfig
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -22,8 +22,8 @@ class Live:
 
     def __init__(self, **parameters):
         pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-        from djet_ros.ros.graph_session import GraphSession
-        from djet_ros.slam.live import LiveSlam
+        from djet_ros.live.graph_session import GraphSession
+        from djet_ros.posegraph.live_slam import LiveSlam
         self.graph = Graph()
         self.slam = LiveSlam(
             from_flat({'estimator.max_features': 500}), LiveSlamConfig(
@@ -78,7 +78,7 @@ def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
 
 
 def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
-    monkeypatch.setattr('djet_ros.ros.graph_session.SILENCE', 0.0)
+    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE', 0.0)
     one = live(optimise_period=1000.0)
     one.drive(WAYS)
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
@@ -88,7 +88,7 @@ def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
 
 
 def test_what_is_missing_is_said_by_its_topic(live, monkeypatch):
-    monkeypatch.setattr('djet_ros.ros.graph_session.SILENCE', 0.0)
+    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE', 0.0)
     one = live()
     one.session.camera_info(camera_info(K, SIZE))
     for _ in range(3):

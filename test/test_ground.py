@@ -2,19 +2,20 @@
 
 from cards import Cards, K as CARDS_K, pose, REST
 import cv2
-from djet_ros.config import from_flat, OdometryConfig
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.ground import Ground
 from djet_ros.core.types import RelativePose, Status, View
-from djet_ros.data.decoding import message_type
-from djet_ros.data.kitti import KittiSequence
+from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.ground import Ground
 from djet_ros.odometry.scale import CameraHeightScale
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.visual_odometry import VisualOdometry
-from djet_ros.scenes import make_scene
+from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 

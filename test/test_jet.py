@@ -12,8 +12,7 @@ from djet_ros.core.jet import (
     robust_scale,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from scipy.optimize import approx_fprime

@@ -4,9 +4,9 @@ from fractions import Fraction
 from pathlib import Path
 
 import cv2
-from djet_ros.data.kitti import KittiSequence, read_poses, STAMP_OFFSET_NS
-from djet_ros.data.text import nanoseconds
 from djet_ros.errors import DjetError
+from djet_ros.recordings.kitti import KittiSequence, read_poses, STAMP_OFFSET_NS
+from djet_ros.recordings.text import nanoseconds
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest

@@ -15,11 +15,13 @@ import sys
 from time import monotonic, sleep
 from typing import Any
 
-from djet_ros.config import from_flat, load_yaml, NodeConfig
+from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import NodeConfig
+from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
+from djet_ros.live.topics import graph_outputs, odometry_outputs
 from djet_ros.odometry.messages import Messages
-from djet_ros.ros.topics import graph_outputs, odometry_outputs
-from djet_ros.slam.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
+from djet_ros.posegraph.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
 import pytest
 import yaml
 

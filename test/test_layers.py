@@ -1,9 +1,9 @@
-"""Imports only go down: faces, then odometry and data, then the core."""
+"""Imports only go down: each room knows those below it, and none above or beside it."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.metadata import requires
 from pathlib import Path
 import re
@@ -12,19 +12,24 @@ from xml.etree import ElementTree
 
 import djet_ros
 from djet_ros.cli.main import DISTRIBUTIONS
+import pytest
 
 PACKAGE = Path(djet_ros.__file__).parent
 MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
 ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
-FLOORS = {'cli': 3, 'dds': 3, 'ros': 3, 'core': 1, '__init__': 1}
-ALL_OTHERS = 2
+# From the bottom up. Rooms in one tuple are beside one another and do not know each other.
+ORDER = (('__init__', 'errors', 'threads'), ('core',), ('config',), ('odometry',), ('recordings',),
+         ('posegraph',), ('replay',), ('live',), ('ros', 'dds'), ('lab',), ('cli',))
+FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 
 CORE_LIBRARIES = {'cv2', 'djet_ros', 'numpy', 'scipy'}
 OUTSIDE_WORLD = {'argparse', 'glob', 'io', 'logging', 'os', 'pathlib', 'pickle', 'random',
                  'shutil', 'signal', 'socket', 'sqlite3', 'subprocess', 'sys', 'tempfile',
                  'threading'}
 OUTSIDE_CALLS = {'eval', 'exec', 'input', 'open', 'print'}
+
+Imports = dict[str, set[str]]
 
 
 def dotted(path: Path) -> str:
@@ -36,34 +41,101 @@ TREES = {dotted(path): ast.parse(path.read_text(), path)
          for path in sorted(PACKAGE.rglob('*.py'))}
 
 
-def floor(module: str) -> int:
-    """Floor on which ``djet_ros.<part>...`` stands."""
-    return FLOORS.get(module.split('.')[1], ALL_OTHERS)
+def room(module: str) -> str:
+    """Room in which ``djet_ros.<room>...`` stands; names of the package itself are __init__'s."""
+    name = module.split('.')[1]
+    return name if name in FLOOR or (PACKAGE / name).exists() else '__init__'
 
 
-def imported(module: str) -> Iterator[str]:
+def imported(tree: ast.AST) -> Iterator[str]:
     """All names that a module imports, in functions too; ``from a import b`` gives a.b."""
-    for node in ast.walk(TREES[module]):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f'{module} has a relative import'
+            assert node.level == 0, f'a relative import of {node.module}'
             yield from (f'{node.module}.{alias.name}' for alias in node.names)
+
+
+IMPORTS: Imports = {module: set(imported(tree)) for module, tree in TREES.items()}
 
 
 def libraries(module: str) -> set[str]:
     """Top-level packages that a module imports from."""
-    return {name.partition('.')[0] for name in imported(module)}
+    return {name.partition('.')[0] for name in IMPORTS[module]}
 
 
-def test_no_module_imports_from_a_floor_above_its_own() -> None:
-    upward = [(module, name) for module in TREES for name in imported(module)
-              if name.startswith('djet_ros.') and floor(name) > floor(module)]
-    assert not upward
+def upward(imports: Imports) -> set[tuple[str, str]]:
+    """Imports from a room above the module's own, or beside it."""
+    return {(module, name) for module, names in imports.items() for name in names
+            if name.startswith('djet_ros.') and room(name) != room(module)
+            and FLOOR[room(name)] >= FLOOR[room(module)]
+            and '__init__' not in (room(name), room(module))}
+
+
+def cycle(imports: Imports) -> list[str]:
+    """Modules that import one another in a ring, or none."""
+    def known(name: str) -> str | None:
+        return name if name in imports else (
+            name.rpartition('.')[0] if name.rpartition('.')[0] in imports else None)
+
+    arrows = {module: sorted({end for end in map(known, names) if end and end != module})
+              for module, names in imports.items()}
+    done: set[str] = set()
+
+    def search(module: str, way: list[str]) -> list[str]:
+        if module in way:
+            return [*way[way.index(module):], module]
+        if module in done:
+            return []
+        found = next(filter(None, (search(end, [*way, module]) for end in arrows[module])), [])
+        done.add(module)
+        return found
+
+    return next(filter(None, (search(module, []) for module in arrows)), [])
+
+
+def planted(module: str, name: str) -> Imports:
+    """Give the imports as they would be with one more."""
+    return {**IMPORTS, module: IMPORTS[module] | {name}}
+
+
+def test_every_room_has_its_place_in_the_order() -> None:
+    rooms = {path.stem for path in PACKAGE.iterdir()
+             if path.suffix == '.py' or (path.is_dir() and any(path.glob('*.py')))}
+    assert rooms == set(FLOOR)
+
+
+def test_no_module_imports_from_a_room_above_or_beside_its_own() -> None:
+    assert not upward(IMPORTS)
+
+
+@pytest.mark.parametrize(('module', 'name'), [
+    ('djet_ros.core.jet', 'djet_ros.config.sections.Config'),
+    ('djet_ros.config.flat', 'djet_ros.odometry.frame.Frame'),
+    ('djet_ros.posegraph.graph', 'djet_ros.replay.results.BAG'),
+    ('djet_ros.dds.graph', 'djet_ros.ros.node.VoNode'),
+    ('djet_ros.live.session', 'djet_ros.lab.soak')])
+def test_an_upward_import_would_be_seen(module: str, name: str) -> None:
+    assert upward(planted(module, name)) == {(module, name)}
+
+
+def test_no_modules_import_one_another_in_a_ring() -> None:
+    assert not cycle(IMPORTS)
+
+
+def test_a_ring_of_imports_would_be_seen() -> None:
+    ring = cycle(planted('djet_ros.core.types', 'djet_ros.core.estimator.TwoViewEstimator'))
+    assert ring[0] == ring[-1]
+    assert {'djet_ros.core.types', 'djet_ros.core.estimator'} <= set(ring)
+
+
+def in_room(name: str) -> Iterable[str]:
+    return (module for module in TREES if module.split('.')[1] == name)
 
 
 def test_the_core_knows_arrays_and_nothing_of_files_threads_or_terminals() -> None:
-    for module in (module for module in TREES if floor(module) == 1):
+    for module in in_room('core'):
         assert libraries(module) <= (sys.stdlib_module_names - OUTSIDE_WORLD) | CORE_LIBRARIES
         called = {node.func.id for node in ast.walk(TREES[module])
                   if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
@@ -73,7 +145,7 @@ def test_the_core_knows_arrays_and_nothing_of_files_threads_or_terminals() -> No
 def test_what_comes_with_ros_is_imported_by_the_ros_face_only() -> None:
     users = {module for module in TREES if libraries(module) & ROS_LIBRARIES}
     assert users
-    assert all(module.startswith('djet_ros.ros.') for module in users)
+    assert users <= set(in_room('ros'))
 
 
 def test_every_library_is_a_declared_dependency() -> None:

@@ -5,21 +5,22 @@ import gc
 from itertools import pairwise
 
 from cards import Cards, K, pose, REST, SIZE
-from djet_ros.config import Config, from_flat, OdometryConfig
+from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
-from djet_ros.data.pose_graph import Edge, PoseGraph
-from djet_ros.data.sources import open_source, pose_of
-from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.lab.alignment import aligned, position_rmse
+from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages
 from djet_ros.odometry.scale import GroundTruthScale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import OdometryResult
-from djet_ros.scenes import render_sequence
-from djet_ros.slam.live_config import LiveSlamConfig
-from djet_ros.slam.steps import Steps
+from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.live_config import LiveSlamConfig
+from djet_ros.posegraph.steps import Steps
+from djet_ros.recordings.sources import open_source, pose_of
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -174,7 +175,7 @@ def test_a_length_that_nobody_knows_is_told_by_its_covariance():
 def live():
     """Give the class, for which GTSAM must be installed."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    from djet_ros.slam.live import LiveSlam
+    from djet_ros.posegraph.live_slam import LiveSlam
     return LiveSlam
 
 
@@ -362,8 +363,8 @@ def test_the_memory_is_bounded(live):
 @pytest.mark.parametrize(('source', 'target'), [(0, 2), (2, 0)])
 def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target):
     """With the forgotten one held relative to its heir, an edge costs what it cost before."""
-    from djet_ros.slam.backend import factor_graph, initial_values
-    from djet_ros.slam.live_map import inherited
+    from djet_ros.posegraph.backend import factor_graph, initial_values
+    from djet_ros.posegraph.live_map import inherited
     rng = np.random.default_rng(3)
     poses = np.array([pose(), pose(x=0.3, z=2.0, yaw=0.4), pose(x=-1.0, z=3.0, yaw=-0.7)])
     spread = rng.normal(size=(6, 6)) * 0.1

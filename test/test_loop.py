@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 
-from djet_ros.scenes.sequence import render_sequence
+from djet_ros.lab.scenes.sequence import render_sequence
 import pytest
 
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-from djet_ros.config import OdometryConfig
+from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.messages import camera_frame, in_convention, Messages, stamp_ns, twist

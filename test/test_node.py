@@ -14,9 +14,9 @@ from typing import Any
 
 from cards import Cards, K, pose, SIZE
 import cv2
-from djet_ros.data.bag_writers import write_kitti_bag
-from djet_ros.data.bags import Bag, BagSource
 from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.bags import Bag, BagSource
 import numpy as np
 import pytest
 from ros_graph import ENVIRONMENT, NODE, NodeProcess, Peer

@@ -12,8 +12,7 @@ from djet_ros.core.paraboloid import (
     Paraboloids,
     project_to_positive,
 )
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 import numpy as np
 import pytest
 

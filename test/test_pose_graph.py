@@ -9,18 +9,20 @@ import sys
 
 from cards import Cards, K, pose, SIZE
 from conftest import write_small_kitti
-from djet_ros.config import Config, from_flat
+from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.data.bag_writers import ResultBag
-from djet_ros.data.bags import Bag, BagMessage
-from djet_ros.data.pose_graph import Edge, PoseGraph, read_results
-from djet_ros.data.pose_graph_files import write_graph
-from djet_ros.data.replay import Replay
-from djet_ros.data.results import ResultsFolder
-from djet_ros.data.trajectories import read_tum
 from djet_ros.errors import DjetError
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
+from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.graph_files import write_graph
+from djet_ros.recordings.bag_writers import ResultBag
+from djet_ros.recordings.bags import Bag, BagMessage
+from djet_ros.recordings.trajectories import read_tum
+from djet_ros.replay.graph_of_results import read_results
+from djet_ros.replay.replay import Replay
+from djet_ros.replay.results import ResultsFolder
 import numpy as np
 import pytest
 from ros_messages import camera_info, image
@@ -317,7 +319,7 @@ def test_gtsam_reads_the_poses_and_edges_of_a_g2o_file(tmp_path):
 
 def test_a_g2o_file_has_the_same_errors_as_the_graph_has_in_gtsam(results, unscaled, tmp_path):
     gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    from djet_ros.slam.backend import factor_graph, initial_values
+    from djet_ros.posegraph.backend import factor_graph, initial_values
     graphs = [random_graph(seed) for seed in range(5)]
     for i, graph in enumerate([*graphs, read_results(results), read_results(unscaled)]):
         write_graph(graph, tmp_path / f'{i}.g2o', 'g2o')

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from djet_ros.config import OdometryConfig
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     direction_angle,
     epipolar_lines,
@@ -18,15 +18,14 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.paraboloid import constrained_minimum, fit_paraboloids, project_to_positive
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.data.sources import pose_of
 from djet_ros.odometry.diagnostics import StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, stamp_ns, twist
 from djet_ros.odometry.scale import GroundTruthScale, Length, SpeedScale
 from djet_ros.odometry.uncertainty import compose
 from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult, VisualOdometry
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from djet_ros.recordings.sources import pose_of
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest

@@ -11,17 +11,17 @@ import time
 
 from cards import Cards, K, pose, SIZE
 import cv2
-from djet_ros.config import load_yaml
+from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
-from djet_ros.data.bag_writers import IMAGE_TOPIC, INFO_TOPIC, write_kitti_bag
-from djet_ros.data.bags import Bag
-from djet_ros.data.kitti import KittiSequence
-from djet_ros.data.sources import open_source, pose_of
-from djet_ros.data.trajectories import read_tum, TumWriter
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.ground_truth import GroundTruth
-from djet_ros.evaluation.pair_errors import Pair, pair_errors, statistics
+from djet_ros.recordings.bag_writers import IMAGE_TOPIC, INFO_TOPIC, write_kitti_bag
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.kitti import KittiSequence
+from djet_ros.recordings.sources import open_source, pose_of
+from djet_ros.recordings.trajectories import read_tum, TumWriter
+from djet_ros.replay.ground_truth import GroundTruth
+from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE

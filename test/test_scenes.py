@@ -8,13 +8,13 @@ import subprocess
 import sys
 
 import cv2
-from djet_ros.data.kitti import KittiSequence
 from djet_ros.errors import DjetError
-from djet_ros.scenes import make_scene, render_pair, render_sequence, Scene, ScenePair, SCENES
-from djet_ros.scenes.catalogue import car_camera, suggested_frames
-from djet_ros.scenes.panel import tiled, World
-from djet_ros.scenes.route import level_pose, Turntable
-from djet_ros.scenes.texture import fractal, make_texture, RipMap
+from djet_ros.lab.scenes import make_scene, render_pair, render_sequence, Scene, ScenePair, SCENES
+from djet_ros.lab.scenes.catalogue import car_camera, suggested_frames
+from djet_ros.lab.scenes.panel import tiled, World
+from djet_ros.lab.scenes.route import level_pose, Turntable
+from djet_ros.lab.scenes.texture import fractal, make_texture, RipMap
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 from numpy.typing import NDArray
 import pytest

@@ -8,11 +8,11 @@ from time import monotonic, sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
-from djet_ros.config import from_flat, with_values
+from djet_ros.config.flat import from_flat, with_values
+from djet_ros.live.session import Session
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.ros import session as sessions
-from djet_ros.ros.session import Session
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type, serialised

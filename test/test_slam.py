@@ -10,22 +10,22 @@ import tracemalloc
 
 from cards import Cards, K, pose
 import cv2
-from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.data.pose_graph import Edge, PoseGraph
-from djet_ros.data.trajectories import read_tum
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.alignment import aligned, position_rmse
+from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
-from djet_ros.slam.config import SlamConfig
-from djet_ros.slam.images import Seen, SeenFile
-from djet_ros.slam.keyframes import choose_keyframes, without_common_length
-from djet_ros.slam.loops import EdgeFinder, transferred_length
-from djet_ros.slam.places import PlaceIndex
+from djet_ros.posegraph.config import SlamConfig
+from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.images import Seen, SeenFile
+from djet_ros.posegraph.keyframes import choose_keyframes, without_common_length
+from djet_ros.posegraph.loops import EdgeFinder, transferred_length
+from djet_ros.posegraph.places import PlaceIndex
+from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 import pytest
 
@@ -336,7 +336,7 @@ def test_standing_where_one_has_been_is_a_loop_of_a_known_place():
 @pytest.fixture
 def optimise():
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    from djet_ros.slam.backend import optimise
+    from djet_ros.posegraph.backend import optimise
     return optimise
 
 

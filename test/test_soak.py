@@ -11,8 +11,8 @@ import sys
 from typing import Any
 
 from djet_ros.core.types import Status
-from djet_ros.evaluation import soak as module
-from djet_ros.evaluation.soak import resident_mb, soak
+from djet_ros.lab import soak as module
+from djet_ros.lab.soak import resident_mb, soak
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest

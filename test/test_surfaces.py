@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids

@@ -2,7 +2,8 @@
 
 from cards import Cards, K, pose, SIZE
 import cv2
-from djet_ros.config import Config, from_flat, with_values
+from djet_ros.config.flat import from_flat, with_values
+from djet_ros.config.sections import Config
 from djet_ros.core.types import Status
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
 from djet_ros.odometry.messages import stamp_ns

@@ -6,9 +6,9 @@ import signal
 import subprocess
 import sys
 
-from djet_ros.data.kitti import read_poses
-from djet_ros.data.trajectories import KittiWriter, read_tum, TumWriter
 from djet_ros.errors import DjetError
+from djet_ros.recordings.kitti import read_poses
+from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_the_quaternion_has_no_negative_real_part(vector):
 def test_a_killed_process_leaves_every_line_it_has_written(tmp_path):
     path = tmp_path / 'killed.tum'
     script = ('import sys, pathlib, numpy\n'
-              'from djet_ros.data.trajectories import TumWriter\n'
+              'from djet_ros.recordings.trajectories import TumWriter\n'
               'file = TumWriter(pathlib.Path(sys.argv[1]))\n'
               'for i in range(500): file.write(i * 10**8, numpy.eye(4))\n'
               'print("written", flush=True)\n'

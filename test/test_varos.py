@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import cv2
-from djet_ros.data.datasets import open_sequence
-from djet_ros.data.kitti import STAMP_OFFSET_NS
-from djet_ros.data.varos import SIZE, VarosSequence
 from djet_ros.errors import DjetError
+from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.kitti import STAMP_OFFSET_NS
+from djet_ros.recordings.varos import SIZE, VarosSequence
 import numpy as np
 import pytest
 

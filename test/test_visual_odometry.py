@@ -1,11 +1,10 @@
 """The odometry: what it does with good, bad, still and missing frames, and how sure it is."""
 
 from cards import Cards, K, pose
-from djet_ros.config import OdometryConfig
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.data.kitti import KittiSequence
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import (
@@ -18,6 +17,7 @@ from djet_ros.odometry.scale import (
 )
 from djet_ros.odometry.uncertainty import compose, motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

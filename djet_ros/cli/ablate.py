@@ -13,8 +13,8 @@ from djet_ros.cli.pair_runs import (
     split,
 )
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.ablation import ablation_entrants, PARTS
-from djet_ros.evaluation.ablation_report import write_ablation
+from djet_ros.lab.ablation import ablation_entrants, PARTS
+from djet_ros.lab.ablation_report import write_ablation
 from rich.console import Console
 
 DESCRIPTION = """\

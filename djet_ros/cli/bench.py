@@ -8,7 +8,7 @@ from typing import Any
 
 from djet_ros.cli.outputs import add_json_output, check_output, write_json
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.bench import bench, QUOTED_POINTS
+from djet_ros.lab.bench import bench, QUOTED_POINTS
 from rich.console import Console
 from rich.table import Table
 

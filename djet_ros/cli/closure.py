@@ -10,11 +10,11 @@ from typing import Any
 
 from djet_ros.cli.outputs import add_json_output, check_output, write_json
 from djet_ros.cli.pair_runs import split
-from djet_ros.core.config import METHODS
+from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.closure import closures, summary, Triangle
-from djet_ros.evaluation.entrants import check_names, TITLES
-from djet_ros.evaluation.sources import plain_name, readable_frames
+from djet_ros.lab.closure import closures, summary, Triangle
+from djet_ros.lab.entrants import check_names, TITLES
+from djet_ros.lab.sources import plain_name, readable_frames
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -85,7 +85,7 @@ def _table(title: str, summaries: dict[str, dict[str, Any]]) -> Table:
 
 def draw(found: dict[str, list[Triangle | None]], title: str, path: Path) -> None:
     """Plot which share of the triangles leaves less than an angle, and what was claimed."""
-    from djet_ros.evaluation.style import COLOURS, DASHES, figure
+    from djet_ros.lab.style import COLOURS, DASHES, figure
     with figure(path, 8.0, 3.2) as empty:
         left, right = empty.subplots(1, 2)
         for method, triangles in found.items():

@@ -9,8 +9,8 @@ import shlex
 from typing import Any
 
 from djet_ros.cli import main
-from djet_ros.data.results import PLOT, SUMMARY
 from djet_ros.errors import DjetError
+from djet_ros.replay.results import PLOT, SUMMARY
 from rich.console import Console
 from rich.table import Table
 

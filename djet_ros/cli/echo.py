@@ -8,7 +8,7 @@ from threading import Event
 from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
-from djet_ros.config import NODE_NAME
+from djet_ros.config.sections import NODE_NAME
 import numpy as np
 from rich.console import Console
 from rich.live import Live

@@ -12,9 +12,9 @@ from djet_ros.cli.pair_runs import (
     shared_values,
     split,
 )
-from djet_ros.evaluation.entrants import default_methods, entrants, TITLES
-from djet_ros.evaluation.evo import find_tool
-from djet_ros.evaluation.report import write_report
+from djet_ros.lab.entrants import default_methods, entrants, TITLES
+from djet_ros.lab.evo import find_tool
+from djet_ros.lab.report import write_report
 from rich.console import Console
 
 DESCRIPTION = """\

@@ -7,8 +7,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from djet_ros.data.pose_graph import read_results
-from djet_ros.data.pose_graph_files import FORMATS, write_graph
+from djet_ros.posegraph.graph_files import FORMATS, write_graph
+from djet_ros.replay.graph_of_results import read_results
 
 DESCRIPTION = """\
 Write the pose graph of a replay: a vertex for each tracked frame, and an edge for each pair with

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.data.bag_writers import STORAGES, write_kitti_bag
-from djet_ros.data.kitti import KittiSequence
+from djet_ros.recordings.bag_writers import STORAGES, write_kitti_bag
+from djet_ros.recordings.kitti import KittiSequence
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
-from djet_ros.config import Config, flat, load_yaml, NODE_NAME, parse_value, with_values
+from djet_ros.config.flat import flat, parse_value, with_values
+from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 
 DESCRIPTION = f"""\

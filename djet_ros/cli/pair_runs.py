@@ -12,15 +12,15 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from djet_ros.config import add_flags, flag_values
-from djet_ros.core.config import PRESETS
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.core.estimator_config import PRESETS
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.entrants import Entrant
-from djet_ros.evaluation.pairs import PairRecord
-from djet_ros.evaluation.runner import dask_workers, local_workers, run
-from djet_ros.evaluation.sources import open_sources, Selection, Source
-from djet_ros.evaluation.store import RecordStore
-from djet_ros.evaluation.tables import Table as ReadableTable
+from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.runner import dask_workers, local_workers, run
+from djet_ros.lab.sources import open_sources, Selection, Source
+from djet_ros.lab.store import RecordStore
+from djet_ros.lab.tables import Table as ReadableTable
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

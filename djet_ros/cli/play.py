@@ -9,8 +9,8 @@ import sys
 from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
-from djet_ros.data.sources import open_source
 from djet_ros.errors import DjetError
+from djet_ros.recordings.sources import open_source
 
 DESCRIPTION = f"""\
 Publish the images of a recording, their CameraInfo and the ground truth, at the pace of the

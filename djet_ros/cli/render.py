@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from djet_ros.scenes import render_sequence, SCENES
+from djet_ros.lab.scenes import render_sequence, SCENES
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

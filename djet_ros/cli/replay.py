@@ -7,11 +7,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-from djet_ros.config import add_flags, Config, flag_values, load_yaml, with_values
-from djet_ros.data.replay import Outcome, Replay
-from djet_ros.data.results import PLOT, ResultsFolder
-from djet_ros.data.sources import open_source
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import with_values
+from djet_ros.config.sections import Config
+from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
+from djet_ros.recordings.sources import open_source
+from djet_ros.replay.replay import Outcome, Replay
+from djet_ros.replay.results import PLOT, ResultsFolder
 from rich.console import Console
 from rich.progress import (
     BarColumn,

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.outputs import add_overwrite, check_output
-from djet_ros.config import add_flags, flag_values, from_flat
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.similarity import (
+from djet_ros.lab.similarity import (
     cross_similarity,
     draw_similarity,
     read_image,

@@ -10,20 +10,22 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from djet_ros.config import add_flags, Config, flag_values, load_yaml, with_values
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import with_values
+from djet_ros.config.safe_files import read_yaml
+from djet_ros.config.sections import Config
+from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.parameter import describe
-from djet_ros.data.bags import is_bag
-from djet_ros.data.pose_graph import read_results
-from djet_ros.data.replay import Replay
-from djet_ros.data.results import ResultsFolder
-from djet_ros.data.results import SUMMARY as REPLAY_SUMMARY
-from djet_ros.data.sources import open_source, pose_of, Source
-from djet_ros.data.text import read_yaml
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.ground_truth import GroundTruth
-from djet_ros.slam.config import SlamConfig
-from djet_ros.slam.report import FILES, PLOT, write_report
-from djet_ros.slam.run import run_slam
+from djet_ros.lab.slam_report import FILES, PLOT, write_report
+from djet_ros.posegraph.config import SlamConfig
+from djet_ros.posegraph.offline import run_slam
+from djet_ros.recordings.bags import is_bag
+from djet_ros.recordings.sources import open_source, pose_of, Source
+from djet_ros.replay.graph_of_results import read_results
+from djet_ros.replay.ground_truth import GroundTruth
+from djet_ros.replay.replay import Replay
+from djet_ros.replay.results import ResultsFolder, SUMMARY as REPLAY_SUMMARY
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table

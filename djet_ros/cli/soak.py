@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.outputs import add_json_output, check_output, write_json
-from djet_ros.evaluation.soak import SIZE, soak
+from djet_ros.lab.soak import SIZE, soak
 from rich.console import Console
 
 
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 def draw(figures: dict[str, Any], path: Path) -> None:
     """Plot memory and latency against the frames."""
-    from djet_ros.evaluation.style import figure
+    from djet_ros.lab.style import figure
     stretches = figures['stretches']
     frames = [stretch['frames'] for stretch in stretches]
     with figure(path, 8.0, 3.2) as empty:

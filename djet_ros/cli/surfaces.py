@@ -8,14 +8,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from djet_ros.cli.outputs import add_overwrite, check_output
-from djet_ros.config import add_flags, flag_values, from_flat
-from djet_ros.core.config import PRESETS
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import PRESETS
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.evaluation.similarity import read_image
-from djet_ros.evaluation.sources import pair_of_frames
-from djet_ros.evaluation.surface_steps import animate_course, draw_course, follow, telling_match
+from djet_ros.lab.similarity import read_image
+from djet_ros.lab.sources import pair_of_frames
+from djet_ros.lab.surface_steps import animate_course, draw_course, follow, telling_match
 import numpy as np
 from numpy.typing import NDArray
 

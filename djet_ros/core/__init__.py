@@ -1,1 +1,1 @@
-"""Floor 1: images and matrices in, frozen results out. No ROS, no files, no clock but timings."""
+"""Images and matrices in, frozen results out: features, matches, surfaces, JET. No ROS, no files."""

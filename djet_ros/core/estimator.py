@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-from djet_ros.core.config import EstimatorConfig
 from djet_ros.core.covariance import pose_covariance
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.geometry import (
     epipolar_lines,

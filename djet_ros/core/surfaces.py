@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import cv2
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.graded import graded_surfaces, grades
 from djet_ros.core.hamming import (
     describable,
@@ -31,7 +31,6 @@ from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-
 
 # The outermost of a descriptor's tests is 13 pixels off, and moves by a quarter of a pixel.
 _WARP_STEP = 0.02

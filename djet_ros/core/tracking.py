@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,

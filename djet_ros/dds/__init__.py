@@ -1,1 +1,1 @@
-"""The odometry on a ROS 2 graph without ROS: its topics are DDS topics, by Eclipse Cyclone DDS."""
+"""The live odometry on Eclipse Cyclone DDS, without ROS: wiring alone."""

@@ -10,17 +10,23 @@ import re
 from typing import Any, Self
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import DDSException, ReadCondition, WaitSet
-from cyclonedds.core import InstanceState, SampleState, ViewState
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from djet_ros.data.decoding import jazzy
 from djet_ros.dds.wire import dds_type_name, decode, encode, sample_type
 from djet_ros.errors import DjetError
+from djet_ros.recordings.decoding import jazzy
 
 # A write holds Python's interpreter lock; whoever has to wait longer asks again.
 _MAX_BLOCKING = duration(milliseconds=20)

@@ -9,15 +9,13 @@ from threading import Event
 from time import monotonic, time_ns
 from typing import Any
 
-from djet_ros.config import Config
-from djet_ros.data.decoding import message_type
+from djet_ros.config.sections import Config
 from djet_ros.dds.graph import Graph, Profile, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
 from djet_ros.errors import DjetError
-from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.ros.session import Session
-from djet_ros.ros.topics import (
+from djet_ros.live.session import Session
+from djet_ros.live.topics import (
     full_name,
     image_topics,
     IMAGE_TYPES,
@@ -25,6 +23,8 @@ from djet_ros.ros.topics import (
     odometry_outputs,
     SPEED_TYPES,
 )
+from djet_ros.odometry.tracker import Outgoing, Tracker
+from djet_ros.recordings.decoding import message_type
 
 _TICK = 1.0
 _GARBAGE_LOG_PERIOD = 5.0

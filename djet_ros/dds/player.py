@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from threading import Event
 from time import monotonic
 
-from djet_ros.data.bags import BagMessage
-from djet_ros.data.decoding import message_type
-from djet_ros.data.sources import Source
 from djet_ros.dds.graph import Graph, Profile, Publisher
 from djet_ros.dds.names import Names
+from djet_ros.recordings.bags import BagMessage
+from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.sources import Source
 
 # All that is sent waits for reliable subscriptions; best-effort ones take what they get.
 _STREAM = Profile(depth=None)

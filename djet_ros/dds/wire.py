@@ -14,8 +14,8 @@ from typing import Any, Self
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import uint8
-from djet_ros.data.decoding import jazzy
 from djet_ros.errors import DjetError, one_line
+from djet_ros.recordings.decoding import jazzy
 
 
 @cache

@@ -1,1 +1,1 @@
-"""Floor 2, odometry: frames to poses, and messages to messages. No clock, thread or file."""
+"""Frames to a trajectory, and messages to messages. No clock, thread, socket or file."""

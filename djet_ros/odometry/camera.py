@@ -14,8 +14,8 @@ from typing import Any
 
 import cv2
 from djet_ros.core.types import Array
-from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS
 from djet_ros.odometry.images import BadMessage, Gray
+from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS
 import numpy as np
 
 # Numbers of coefficients that OpenCV knows for the polynomial models.

@@ -13,8 +13,8 @@ import struct
 from typing import Any
 
 import cv2
-from djet_ros.data.sequence import LARGEST_IMAGE_PIXELS, PNG_START, whole_png
 from djet_ros.errors import DjetError
+from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START, whole_png
 import numpy as np
 from numpy.typing import NDArray
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from djet_ros.config import OdometryConfig
+from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import rotated

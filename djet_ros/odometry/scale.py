@@ -11,10 +11,10 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import Protocol
 
-from djet_ros.config import OdometryConfig
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.ground import Ground, GroundMotion
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
-from djet_ros.odometry.ground import Ground, GroundMotion
 import numpy as np
 from numpy.typing import NDArray
 

@@ -11,7 +11,7 @@ from collections import deque
 import math
 from typing import Any, NamedTuple
 
-from djet_ros.config import Config
+from djet_ros.config.sections import Config
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State

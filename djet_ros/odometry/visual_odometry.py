@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from djet_ros.config import OdometryConfig
-from djet_ros.core.config import EstimatorConfig
+from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.scale import CameraHeightScale, Length, scale_source, ScaleSource

@@ -1,1 +1,1 @@
-"""What needs a ROS 2 installation."""
+"""The live nodes on rclpy: wiring alone. All that needs a ROS 2 installation is here."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import partial
 from threading import Event
 
-from djet_ros.config import NODE_NAME
-from djet_ros.ros.graph_session import GraphSession
+from djet_ros.config.sections import NODE_NAME
+from djet_ros.live.graph_session import GraphSession
+from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs
+from djet_ros.posegraph.live_slam import LiveSlam
 from djet_ros.ros.parameters import graph_parameters
-from djet_ros.ros.topics import graph_input_type, GRAPH_INPUTS, graph_outputs
-from djet_ros.ros.wired_node import input_qos, message_type, trigger, WiredNode
-from djet_ros.ros.wired_node import run as run_node
-from djet_ros.slam.live import LiveSlam
+from djet_ros.ros.wired_node import input_qos, message_type, run as run_node, trigger, WiredNode
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 

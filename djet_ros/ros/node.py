@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import partial
 from threading import Event
 
-from djet_ros.config import Config, NODE_NAME
+from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.live.session import Session
+from djet_ros.live.topics import odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.ros.parameters import Parameters
-from djet_ros.ros.session import Session
-from djet_ros.ros.topics import odometry_outputs, SPEED_TYPES
-from djet_ros.ros.wired_node import input_qos, message_type, trigger, WiredNode
-from djet_ros.ros.wired_node import run as run_node
+from djet_ros.ros.wired_node import input_qos, message_type, run as run_node, trigger, WiredNode
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 

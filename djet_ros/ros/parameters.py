@@ -7,9 +7,11 @@ import difflib
 from importlib.util import find_spec
 from typing import Any
 
-from djet_ros.config import Config, flat, FlatParameter, from_flat, is_ros_own, with_values
+from djet_ros.config.flat import flat, FlatParameter, from_flat, with_values
+from djet_ros.config.sections import Config
+from djet_ros.config.yaml_files import is_ros_own
 from djet_ros.errors import DjetError
-from djet_ros.slam.live_config import flat_slam, LiveSlamConfig, slam_config
+from djet_ros.posegraph.live_config import flat_slam, LiveSlamConfig, slam_config
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,

@@ -8,9 +8,9 @@ from importlib import import_module
 from threading import Event
 from typing import Any, Protocol
 
-from djet_ros.config import Config
+from djet_ros.config.sections import Config
+from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 from djet_ros.odometry.tracker import Outgoing
-from djet_ros.ros.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks

@@ -1,0 +1,1 @@
+"""One schema of parameters: sections, flat names, YAML files and flags."""

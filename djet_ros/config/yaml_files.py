@@ -1,0 +1,117 @@
+"""The configuration as YAML, plain or in the layout of ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+import json
+from pathlib import Path
+import textwrap
+from typing import Any
+
+from djet_ros.config.flat import explain, flat, section, shown, Value, with_values
+from djet_ros.config.safe_files import read_yaml
+from djet_ros.config.sections import Config, NODE_NAME, SECTIONS
+from djet_ros.core.estimator_config import preset
+from djet_ros.errors import DjetError
+
+# Parameters that every ROS node may find in its section and that are not ours to judge.
+_ROS_OWN = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+
+
+_YAML_HEAD = """\
+# Parameters of vo_node, also read by `djet replay --config FILE`.
+# Made from djet_ros/config by its dump_yaml; a test holds that the two agree.
+"""
+
+
+_PRESET_NOTE = """\
+# The values that the preset sets are shown as comments; uncomment one to change it.
+"""
+
+
+def load_yaml(path: Path, base: Config | None = None) -> Config:
+    """
+    Read a YAML file over the base configuration (by default all defaults).
+
+    Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with the
+    node names ``/**`` and ``vo_node``. Raises DjetError, beginning with the path, on anything
+    that is not such a file.
+    """
+    content = read_yaml(path)
+    try:
+        return with_values(base or Config(), dict(_flatten(_ours(content))))
+    except DjetError as error:
+        raise DjetError(f'{path}: {error}') from None
+
+
+def _ours(content: Any) -> Any:
+    """Take this node's parameters out of ROS's layout; a plain layout stays as it is."""
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise DjetError('the file must hold sections with parameters')
+    nodes = {name: value['ros__parameters'] for name, value in content.items()
+             if isinstance(value, dict) and 'ros__parameters' in value}
+    if not nodes:
+        return content
+    merged: dict[str, Any] = {}
+    for name, parameters in nodes.items():
+        if str(name).rpartition('/')[2] in ('**', '*', NODE_NAME):
+            merged.update((key, value) for key, value in _flatten(parameters)
+                          if not is_ros_own(key))
+    return merged
+
+
+def is_ros_own(name: str) -> bool:
+    """Tell of a parameter whether every ROS node has it, such as use_sim_time."""
+    return name.partition('.')[0] in _ROS_OWN
+
+
+def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
+    """Flat names and values; only our own sections are entered, so the depth is bounded."""
+    if not isinstance(content, dict):
+        raise DjetError(f'{shown(content)} stands where parameters were expected')
+    for name, value in content.items():
+        if name in SECTIONS and isinstance(value, dict):
+            yield from ((f'{name}.{inner}', inner_value) for inner, inner_value in value.items())
+        elif name not in SECTIONS or value is not None:
+            yield str(name), value
+
+
+def dump_yaml(config: Config, *, preset_as_comments: bool = False) -> str:
+    """
+    Write the configuration as YAML in ROS's layout, each parameter under its description.
+
+    With preset_as_comments the estimator's values that the preset gives anyway are commented
+    out, so that the file leaves the choice of preset free.
+    """
+    silent = set()
+    if preset_as_comments:
+        given = flat(replace(config, estimator=preset(config.preset)))
+        silent = {item.name for item in section(config, 'estimator')
+                  if item.value == given[item.name].value}
+    lines = ['/**:', '  ros__parameters:']
+    for part in ('', *SECTIONS):
+        indent = '    '
+        if part:
+            lines += ['', f'{indent}{part}:']
+            indent = '      '
+        for item in section(config, part):
+            lines += textwrap.wrap(explain(item), 97, initial_indent=f'{indent}# ',
+                                   subsequent_indent=f'{indent}# ')
+            mark = '# ' if item.name in silent else ''
+            name = item.name.rpartition('.')[2]
+            lines.append(f'{indent}{mark}{name}: {_yaml_scalar(item.value)}')
+    if silent.issuperset(item.name for item in section(config, 'estimator')):
+        # A section of comments alone would be null, which ROS refuses.
+        lines = [f'    # {line.strip()}' if line == '    estimator:' else line for line in lines]
+    return _YAML_HEAD + (_PRESET_NOTE if silent else '') + '\n'.join(lines) + '\n'
+
+
+def _yaml_scalar(value: Value) -> str:
+    if isinstance(value, float):
+        mantissa, e, exponent = repr(value).partition('e')
+        # YAML 1.1 readers take 1e-06 for a string, and 1.0e-06 for the number that it is.
+        return f'{mantissa}.0e{exponent}' if e and '.' not in mantissa else repr(value)
+    return json.dumps(value)

@@ -1,1 +1,0 @@
-"""Floor 2, data: image sequences, bags and trajectory files. Everything that touches a disk."""

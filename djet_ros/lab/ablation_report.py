@@ -1,0 +1,100 @@
+"""The results folder of an ablation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from djet_ros.core.estimator_config import PRESETS
+from djet_ros.lab.entrants import Entrant, TITLES
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.published import TABLE_2
+from djet_ros.lab.report import CAPTION, Picture, write, write_page
+from djet_ros.lab.sources import Source
+from djet_ros.lab.style import COLOURS, figure
+from djet_ros.lab.summary import table_rows, TableRow
+from djet_ros.lab.tables import (
+    ablation_table,
+    markdown,
+    pairs_csv,
+    published_table,
+    rows_csv,
+    Table,
+    timings_csv,
+)
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator
+
+_CAPTION = f'D-JET with one change at a time from a preset; – is the preset itself. {CAPTION}'
+_GOOD_START = ('All were given the pose of RP-E, preset best, as a start, and only the matches '
+               'that agree with it.')
+_PUBLISHED = ("The paper's Table 2, as printed there: another sequence (VAROS, all frames), and "
+              'errors in what the table calls degrees.')
+_MARKERS = {'djet': 'o', 'rpe': 'D', 'five_point': 's'}
+_LINE = 0.24
+
+
+def write_ablation(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant],
+                   records: Sequence[PairRecord]) -> list[Table]:
+    """Write everything but the records' store into the folder; gives the readable tables."""
+    rows = table_rows(records)
+    caption = f'{_CAPTION} {_GOOD_START}' if entrants[0].good_start else _CAPTION
+    tables = [ablation_table(caption, rows), published_table(_PUBLISHED, TABLE_2)]
+    write(folder / 'ablation.csv', rows_csv(rows, with_change=True))
+    write(folder / 'ablation.md', '\n'.join(markdown(table) for table in tables))
+    write(folder / 'pairs.csv', pairs_csv(records, with_change=True))
+    write(folder / 'timings.csv', timings_csv(records, with_change=True))
+    pictures = {}
+    for source in sources:
+        path = folder / 'plots' / f'{source.name}_ablation.png'
+        plot_ablation(path, source.name, [row for row in rows if row.sequence == source.name])
+        pictures[source.name] = [Picture(path, 'mean and median error of each variant')]
+    write_page(folder, 'D-JET: what each part contributes', tables, pictures, entrants,
+               ['ablation.csv', 'ablation.md', 'pairs.csv', 'timings.csv'])
+    return tables
+
+
+def plot_ablation(path: Path, title: str, rows: Sequence[TableRow]) -> None:
+    """Draw mean and median errors of one sequence, a line per change, a panel per preset."""
+    by_preset = {preset: [row for row in rows if row.preset == preset] for preset in PRESETS}
+    by_preset = {preset: found for preset, found in by_preset.items() if found}
+    heights = [len(_changes(found)) + 3 for found in by_preset.values()]
+    with figure(path, 11, _LINE * sum(heights) + 1.6) as drawing:
+        drawing.suptitle(f'{title}: one change at a time (filled: mean, hollow: median)')
+        panels = drawing.subplots(len(by_preset), 2, squeeze=False, sharex='col', sharey='row',
+                                  height_ratios=heights)
+        for line, (preset, found) in zip(panels, by_preset.items()):
+            for axes, kind in zip(line, ('rotation', 'translation')):
+                _draw(axes, kind, found)
+            line[0].set_title(f'preset {preset}', loc='left')
+        for axes, kind in zip(panels[-1], ('rotation', 'translation')):
+            axes.set_xlabel(f'{kind} error, deg')
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        drawing.legend(handles, labels, loc='outside lower center', ncols=len(labels))
+
+
+def _changes(rows: Sequence[TableRow]) -> list[str]:
+    return list(dict.fromkeys(row.change for row in rows))
+
+
+def _draw(axes: Axes, kind: str, rows: Sequence[TableRow]) -> None:
+    changes = _changes(rows)
+    for method in dict.fromkeys(row.method for row in rows):
+        own = [row for row in rows if row.method == method]
+        places = [changes.index(row.change) for row in own]
+        look: dict[str, Any] = {'marker': _MARKERS[method], 'color': COLOURS[method], 'ms': 6,
+                                'ls': 'none'}
+        means = [getattr(row, f'{kind}_mean_deg') for row in own]
+        medians = [getattr(row, f'{kind}_median_deg') for row in own]
+        axes.hlines(places, medians, means, color=COLOURS[method], lw=1)
+        axes.plot(means, places, label=TITLES[method], **look)
+        axes.plot(medians, places, markerfacecolor='white', **look)
+        # The preset itself, to read the changes against.
+        axes.axvline(means[0], color=COLOURS[method], lw=0.8, ls=(0, (4, 4)))
+    axes.set_xscale('log')
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter('{x:g}')
+    axes.xaxis.set_minor_formatter('')
+    axes.set_ylim(len(changes) - 0.4, -0.6)
+    axes.set_yticks(range(len(changes)), [change or 'as it is' for change in changes])

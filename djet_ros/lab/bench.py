@@ -1,0 +1,208 @@
+"""
+How fast the pipeline is: ratios against OpenCV's plain chain, measured side by side in one run.
+
+Absolute times mean little on another machine; the ratios hold, because both sides of each were
+measured in turn, pair by pair, in the same process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import preset
+from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, smooth
+from djet_ros.core.orb_pattern import REACH
+from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.errors import DjetError
+from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.sequence import FrameSequence
+import numpy as np
+from numpy.typing import NDArray
+
+POINTS = (250, 500, 1000, 2000, 4000)
+WINDOWS = (3, 5, 7, 9, 11, 13, 15)
+
+# The number of points at which the D-JET stage is quoted.
+QUOTED_POINTS = 1000
+
+_REPEATS = 7
+
+
+def bench(source: Path, pairs: int,
+          progress: Callable[[str], None] = lambda stage: None) -> dict[str, Any]:
+    """
+    Measure the first pairs of a sequence with one thread, then with all that OpenCV takes.
+
+    Gives the figures of the single-threaded run, and those of the other under 'all_cores'.
+    Raises DjetError where the source is no sequence of at least two frames.
+    """
+    sequence = _open(source)
+    progress('one thread')
+    cv2.setNumThreads(1)
+    figures = measure(sequence, pairs)
+    progress('all cores')
+    cv2.setNumThreads(-1)
+    figures['all_cores'] = measure_pipeline(sequence, pairs)
+    return figures
+
+
+def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
+    """Measure everything: pipeline, D-JET stage, kernel, growth with points and window, memory."""
+    figures = measure_pipeline(sequence, pairs)
+    previous, current, x, y = _crowded_pair(sequence)
+    figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
+    by_points = {n: _stage_ms(previous, current, x[:n], y[:n], 'best')
+                 for n in POINTS if n <= len(x)}
+    figures['djet_ms_by_points'] = by_points
+    figures['djet_stage_ms'] = by_points.get(QUOTED_POINTS, float('nan'))
+    figures['djet_ms_by_window'] = {
+        w: _stage_ms(previous, current, x[:QUOTED_POINTS], y[:QUOTED_POINTS], 'best', window=w)
+        for w in WINDOWS}
+    figures['bytes_per_frame'] = view_bytes(_estimator().view(sequence.image(0), sequence.K))
+    return figures
+
+
+def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
+    """Time decoding to pose, ours and OpenCV's plain chain, in turn on each new frame."""
+    ours, plain = _Pipeline(sequence), _PlainChain(sequence)
+    times: dict[str, list[float]] = {'ours': [], 'plain': []}
+    for index in range(min(pairs + 1, len(sequence))):
+        # Who goes first changes, so that neither always finds the file in the cache.
+        order = [('ours', ours.take), ('plain', plain.take)]
+        for name, step in order if index % 2 else reversed(order):
+            start = perf_counter()
+            step(index)
+            times[name].append(perf_counter() - start)
+    # The first frame has no pair, and warms the caches up.
+    ours_s, plain_s = (float(np.median(times[name][1:])) for name in ('ours', 'plain'))
+    return {'pairs': len(times['ours']) - 1, 'pipeline_over_opencv': ours_s / plain_s,
+            'pairs_per_second': 1 / float(np.mean(times['ours'][1:])),
+            'pipeline_ms': 1e3 * ours_s, 'opencv_ms': 1e3 * plain_s,
+            'stages_ms': ours.stages_ms()}
+
+
+class _Pipeline:
+    """Our pipeline, frame by frame, from the file to the pose."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        self._sequence, self._estimator = sequence, _estimator()
+        self._view: View | None = None
+        self._prior: RelativePose | None = None
+        self._timings: list[dict[str, float]] = []
+
+    def take(self, index: int) -> None:
+        start = perf_counter()
+        view = self._estimator.view(self._sequence.image(index), self._sequence.K)
+        decoded_and_seen = perf_counter() - start
+        if self._view is not None:
+            self._prior = self._estimator.estimate(self._view, view, self._prior)
+            self._timings.append({'decode + ORB': decoded_and_seen, **self._prior.timings})
+        self._view = view
+
+    def stages_ms(self) -> dict[str, float]:
+        return {stage: 1e3 * float(np.median([t[stage] for t in self._timings if stage in t]))
+                for stage in (self._timings[0] if self._timings else {})}
+
+
+class _PlainChain:
+    """OpenCV's usual chain: ORB, brute-force cross-check, 5-point RANSAC, recoverPose."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        self._sequence = sequence
+        self._orb = cv2.ORB.create(preset('best').max_features)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        self._last: tuple[Any, Any] | None = None
+
+    def take(self, index: int) -> None:
+        K = self._sequence.K
+        keypoints, descriptors = self._orb.detectAndCompute(self._sequence.image(index), None)
+        if self._last is not None:
+            matches = self._matcher.match(self._last[1], descriptors)
+            x = np.array([self._last[0][m.queryIdx].pt for m in matches])
+            y = np.array([keypoints[m.trainIdx].pt for m in matches])
+            E, mask = cv2.findEssentialMat(x, y, K, method=cv2.RANSAC, prob=0.999, threshold=1.0)
+            cv2.recoverPose(E[:3], x, y, K, mask=mask)
+        self._last = keypoints, descriptors
+
+
+def kernel_speedup(view: View) -> float:
+    """
+    Time per dense descriptor of cv2.ORB.compute over that of our Hamming surfaces (7x7).
+
+    OpenCV's side includes the list of keypoints that it needs, ours the counting of the bits.
+    """
+    radius = 3
+    height, width = view.gray.shape
+    rng = np.random.default_rng(0)
+    border = REACH + radius + 20
+    points = np.stack([rng.integers(border, width - border, QUOTED_POINTS),
+                       rng.integers(border, height - border, QUOTED_POINTS)], axis=1)
+    offsets = np.mgrid[-radius:radius + 1, -radius:radius + 1].reshape(2, -1).T
+    dense = (points[:, None] + offsets).reshape(-1, 2)
+    orb = cv2.ORB.create(nlevels=1, edgeThreshold=REACH + 1)
+
+    def opencv() -> None:
+        keypoints = [cv2.KeyPoint(float(x), float(y), 31.0, 0.0) for x, y in dense.tolist()]
+        orb.compute(view.gray, keypoints)
+
+    def ours() -> None:
+        smoothed = smooth(view.gray)
+        hamming_surfaces(descriptor_bits(smoothed, points), smoothed, points, radius)
+
+    return _fastest(opencv) / _fastest(ours)
+
+
+def view_bytes(view: View) -> int:
+    """Count the memory in bytes that a frame takes while it is kept."""
+    features = view.features
+    arrays: tuple[NDArray[Any], ...] = (
+        view.gray, view.smoothed, features.points, features.octaves, features.angles,
+        features.responses, features.descriptors)
+    return sum(array.nbytes for array in arrays)
+
+
+def _estimator(**changes: Any) -> TwoViewEstimator:
+    return TwoViewEstimator(preset('best', **changes))
+
+
+def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
+    """First two frames with very many matches, in random order: any first n are a fair n."""
+    crowd = _estimator(max_features=4 * max(POINTS), fast_threshold=5)
+    previous, current = (crowd.view(sequence.image(i), sequence.K) for i in (0, 1))
+    x, y = crowd.match(previous, current)
+    order = np.random.default_rng(0).permutation(len(x))
+    return previous, current, x[order], y[order]
+
+
+def _stage_ms(previous: View, current: View, x: Array, y: Array, name: str,
+              **changes: Any) -> float:
+    """Least time in ms of surfaces and optimisation together, on given matches."""
+    estimator = TwoViewEstimator(preset(name, **changes))
+    runs: list[dict[str, float]] = [{} for _ in range(_REPEATS)]
+    for timings in runs:
+        estimator.estimate_matched(previous, current, x, y, timings=timings)
+    return 1e3 * min(timings['jet'] for timings in runs)
+
+
+def _fastest(action: Callable[[], None]) -> float:
+    times = []
+    for _ in range(_REPEATS):
+        start = perf_counter()
+        action()
+        times.append(perf_counter() - start)
+    return min(times)
+
+
+def _open(source: Path) -> FrameSequence:
+    sequence = open_sequence(source)
+    if isinstance(sequence, BagSource):
+        raise DjetError(f'{source} is a bag; the bench reads image files, give a sequence folder')
+    if len(sequence) < 2:
+        raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
+    return sequence

@@ -1,0 +1,207 @@
+"""The unit of work: some consecutive pairs of one sequence, estimated by every entrant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import preset
+from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.lab import peers
+from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.sources import opened, Source
+from djet_ros.replay.pair_errors import has_direction, motion_errors
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+# What an odometry could not live with, in degrees; FAILURE says it in words.
+GROSS_ROTATION = 1.0
+GROSS_TRANSLATION = 10.0
+FAILURE = (f'no pose, rotation off by more than {GROSS_ROTATION:g} deg, or direction of '
+           f'translation unknown or off by more than {GROSS_TRANSLATION:g} deg')
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Pairs first, first + 1, … (count of them) of a source."""
+
+    source: Source
+    first: int
+    count: int
+
+    @property
+    def name(self) -> str:
+        """Name that is the same in every run."""
+        return f'{self.source.name}:{self.first}+{self.count}'
+
+
+@dataclass(frozen=True)
+class PairRecord:
+    """
+    What one entrant made of one pair of frames.
+
+    previous, current: indices of the frames in their sequence; errors in degrees, NaN where the
+    estimate or the truth does not tell; failed: see FAILURE; hamming_mean: bits, over the
+    inliers; rotation (vector in rad) and translation (unit length): the current camera in the
+    previous one; milliseconds: features of one frame, matching and estimation together.
+    """
+
+    sequence: str
+    pair: int
+    previous: int
+    current: int
+    method: str
+    preset: str
+    change: str
+    status: str
+    matches: int
+    inliers: int
+    failed: bool
+    rotation_error_deg: float
+    translation_error_deg: float
+    hamming_mean: float
+    rotation: tuple[float, float, float]
+    translation: tuple[float, float, float]
+    milliseconds: float
+
+
+def evaluate_chunk(chunk: Chunk, entrants: Sequence[Entrant]) -> list[PairRecord]:
+    """
+    Estimate the pairs of a chunk by every entrant; pairs without ground truth are left out.
+
+    Each pair is estimated on its own, without the motion before it as a start, so that the
+    records do not depend on how pairs are spread over workers.
+    """
+    # Workers are as many as cores: threads of their own would only be in each other's way.
+    cv2.setNumThreads(1)
+    sequence, frames = opened(chunk.source), chunk.source.frames
+    assert sequence.poses is not None  # sources without poses are refused at the start
+    records: list[PairRecord] = []
+    current: _Image | None = None
+    for pair in range(chunk.first, chunk.first + chunk.count):
+        previous = current or _Image(sequence.image(frames[pair]), sequence.K)
+        current = _Image(sequence.image(frames[pair + 1]), sequence.K)
+        true_motion = (np.linalg.inv(sequence.poses[frames[pair]])
+                       @ sequence.poses[frames[pair + 1]])
+        if np.isfinite(true_motion).all():
+            shared = _SharedWork(previous, current)
+            records += [_record(chunk.source, pair, entrant, shared, true_motion)
+                        for entrant in entrants]
+    return records
+
+
+@dataclass(frozen=True)
+class Given:
+    """
+    What an entrant is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
+
+    seconds: what the features of one view and the matches took.
+    """
+
+    views: tuple[View, View]
+    x: Array
+    y: Array
+    start: RelativePose | None
+    seconds: float
+
+
+def estimate(entrant: Entrant, given: Given) -> RelativePose:
+    """Estimate a pair by the entrant's method."""
+    config = entrant.config
+    if entrant.method in peers.ESTIMATORS:
+        return peers.estimate(entrant.method, *given.views, given.x, given.y,
+                              config.ransac_threshold, config.min_matches)
+    return TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
+
+
+class _Image:
+    """An image and its features, found once for each setting of the detector."""
+
+    def __init__(self, gray: NDArray[np.uint8], K: Array) -> None:
+        self._gray, self._K = gray, K
+        self._views: dict[Any, tuple[View, float]] = {}
+
+    def view(self, entrant: Entrant) -> tuple[View, float]:
+        """Give the view with its features, and the seconds that they took."""
+        key = (entrant.config.max_features, entrant.config.fast_threshold)
+        if key not in self._views:
+            start = perf_counter()
+            view = TwoViewEstimator(entrant.config).view(self._gray, self._K)
+            self._views[key] = view, perf_counter() - start
+        return self._views[key]
+
+
+class _SharedWork:
+    """What all entrants with the same settings share in a pair: two views and their matches."""
+
+    def __init__(self, previous: _Image, current: _Image) -> None:
+        self._images = previous, current
+        self._given: dict[Any, Given] = {}
+
+    def given(self, entrant: Entrant) -> Given:
+        """Give what the entrant starts from."""
+        (previous, _), (current, seconds) = (image.view(entrant) for image in self._images)
+        key = (id(previous), entrant.config.search_radius, entrant.good_start)
+        if key not in self._given:
+            start = perf_counter()
+            x, y = TwoViewEstimator(entrant.config).match(previous, current)
+            given = Given((previous, current), x, y, None, seconds + perf_counter() - start)
+            self._given[key] = _with_good_start(given) if entrant.good_start else given
+        return self._given[key]
+
+
+def _with_good_start(given: Given) -> Given:
+    """Add the robust pose that RP-E finds, and keep the matches that agree with it."""
+    robust = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
+        *given.views, given.x, given.y)
+    if not robust.inliers.any():
+        return given
+    return replace(given, x=robust.x[robust.inliers], y=robust.y[robust.inliers], start=robust)
+
+
+def _record(source: Source, pair: int, entrant: Entrant, shared: _SharedWork,
+            true_motion: Array) -> PairRecord:
+    given = shared.given(entrant)
+    start = perf_counter()
+    result = estimate(entrant, given)
+    seconds = given.seconds + perf_counter() - start
+    motion = camera_motion(result)
+    rotation_error, translation_error = motion_errors(result.status, motion, true_motion)
+    hamming = result.hamming[result.inliers] if len(result.hamming) else result.hamming
+    hamming = hamming[np.isfinite(hamming)]
+    return PairRecord(
+        sequence=source.name, pair=pair, previous=source.frames[pair],
+        current=source.frames[pair + 1], method=entrant.method, preset=entrant.preset,
+        change=entrant.change, status=result.status.value, matches=len(given.x),
+        inliers=int(result.inliers.sum()),
+        failed=has_failed(rotation_error, translation_error, true_motion),
+        rotation_error_deg=rotation_error, translation_error_deg=translation_error,
+        hamming_mean=float(hamming.mean()) if len(hamming) else float('nan'),
+        rotation=_triple(Rotation.from_matrix(motion[:3, :3]).as_rotvec()),
+        translation=_triple(motion[:3, 3]), milliseconds=seconds * 1e3)
+
+
+def camera_motion(result: RelativePose) -> Array:
+    """Pose (4, 4) of the current camera in the previous one, with a translation of length one."""
+    motion = np.eye(4)
+    motion[:3, :3] = result.R.T
+    motion[:3, 3] = -result.R.T @ result.t
+    return motion
+
+
+def has_failed(rotation_error_deg: float, translation_error_deg: float,
+               true_motion: Array) -> bool:
+    """Tell whether errors against the true motion (4, 4) are what FAILURE says."""
+    # Comparisons with NaN are false, so that what is unknown fails as well.
+    return not (rotation_error_deg <= GROSS_ROTATION
+                and (translation_error_deg <= GROSS_TRANSLATION or not has_direction(true_motion)))
+
+
+def _triple(vector: Array) -> tuple[float, float, float]:
+    a, b, c = vector.tolist()
+    return a, b, c

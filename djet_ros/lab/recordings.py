@@ -1,0 +1,80 @@
+"""Frames of a bag as files: pairs are wanted in any order, bags are read in one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.sequence import ImageFiles
+from djet_ros.recordings.sources import pose_of
+from djet_ros.replay.ground_truth import GroundTruth
+import numpy as np
+from numpy.typing import NDArray
+
+_INDEX = 'frames.npz'
+
+
+class ExtractedSequence:
+    """A FrameSequence of images that were rectified when they were taken out of a bag."""
+
+    def __init__(self, folder: Path) -> None:
+        with np.load(folder / _INDEX, allow_pickle=False) as index:
+            self.K: Array = index['K']
+            self.stamps_ns: NDArray[np.int64] = index['stamps_ns']
+            poses: Array = index['poses']
+        self.name = folder.name
+        self.poses = poses if len(poses) else None
+        self._images = ImageFiles(sorted(folder.glob('*.png')))
+        self.size = self._images.size
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.stamps_ns)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Give a frame in gray, (H, W) uint8."""
+        return self._images.gray(index)
+
+
+def is_extracted(folder: Path) -> bool:
+    """Tell whether a folder holds the frames of a bag."""
+    return (folder / _INDEX).exists()
+
+
+def extract(source: BagSource, folder: Path) -> Path:
+    """
+    Write the frames of a bag into a new folder, rectified, and the truth at their stamps.
+
+    Gives the folder. Raises DjetError where the bag has no usable frames.
+    """
+    folder.mkdir(parents=True)
+    camera: Camera | None = None
+    stamps: list[int] = []
+    truth = GroundTruth()
+    for topic, _, message in source:
+        if topic == source.info_topic:
+            camera = camera or Camera(message, means_rectified('auto', source.image_topic))
+        elif topic == source.ground_truth_topic:
+            truth.add(*pose_of(message))
+        elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):
+            image = camera.undistort(gray_image(message))
+            (folder / f'{len(stamps):06d}.png').write_bytes(_png(image))
+            stamps.append(stamp_ns(message.header))
+    if camera is None or not stamps:
+        raise DjetError(f'{source.bag.path} has no image after its first CameraInfo')
+    stamps_ns = np.array(stamps, np.int64)
+    poses = truth.at(stamps_ns) if len(truth) else np.empty((0, 4, 4))
+    np.savez(folder / _INDEX, K=camera.K, stamps_ns=stamps_ns, poses=poses)
+    return folder
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    # Fast compression: the files live as long as the run.
+    _, data = cv2.imencode('.png', image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return data.tobytes()

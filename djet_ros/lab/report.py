@@ -1,0 +1,197 @@
+"""The results folder of an evaluation: tables, records, trajectories, plots, and one page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, astuple, dataclass
+import html
+import os
+from pathlib import Path
+from urllib.parse import quote
+
+from djet_ros import __version__
+from djet_ros.lab import plots
+from djet_ros.lab.entrants import Entrant, TITLES
+from djet_ros.lab.evo import trajectory_metrics
+from djet_ros.lab.pairs import FAILURE, PairRecord
+from djet_ros.lab.published import TABLE_1
+from djet_ros.lab.sources import Source
+from djet_ros.lab.summary import table_rows
+from djet_ros.lab.tables import (
+    html_table,
+    latex,
+    Line,
+    markdown,
+    number,
+    pairs_csv,
+    results_table,
+    rows_csv,
+    Table,
+    table_csv,
+    timings_csv,
+)
+from djet_ros.lab.trajectories import (
+    estimated_trajectory,
+    Trajectory,
+    true_trajectory,
+)
+
+CAPTION = ('Errors of relative poses against the ground truth in degrees, of rotation (rot.) and '
+           'of the direction of translation (tr.); Hamming distances in bits; milliseconds a '
+           f'pair. Failed are pairs with {FAILURE}.')
+PUBLISHED_NOTE = ' What stands under "the paper" is printed there, for the whole sequence.'
+
+_CSS = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem;
+       color: #1a1a1a; background: #fff; }
+h1, h2, h3 { line-height: 1.2; }
+table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; padding: 0.5rem 0; color: #444; }
+th, td { padding: 0.25rem 0.6rem; text-align: left; border-bottom: 1px solid #ddd; }
+thead th { border-bottom: 2px solid #888; }
+.section td { border-top: 2px solid #bbb; }
+.number { text-align: right; white-space: nowrap; }
+tr:has(i) { background: #f4f1ea; }
+.wide { overflow-x: auto; }
+img { max-width: 100%; height: auto; display: block; margin: 1rem 0; }
+"""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A plot of the page: where it is, and what it shows in words."""
+
+    path: Path
+    text: str
+
+
+def write_report(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant],
+                 records: Sequence[PairRecord], *, with_evo: bool = False) -> list[Table]:
+    """
+    Write everything but the records' store into the folder; gives the readable tables.
+
+    with_evo adds evo's metrics of the trajectories.
+    """
+    rows = table_rows(records)
+    printed = {source.name: TABLE_1[source.benchmark] for source in sources
+               if source.benchmark in TABLE_1}
+    tables = [results_table(CAPTION + PUBLISHED_NOTE if printed else CAPTION, rows, printed)]
+    write(folder / 'table1.csv', rows_csv(rows, with_change=False))
+    write(folder / 'table1.md', markdown(tables[0]))
+    write(folder / 'table1.tex', latex(tables[0]))
+    write(folder / 'pairs.csv', pairs_csv(records, with_change=False))
+    write(folder / 'timings.csv', timings_csv(records, with_change=False))
+    files = ['table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv']
+    pictures = {source.name: list(_pictures(folder, source, records)) for source in sources}
+    if with_evo:
+        tables.append(_evo_table(folder, sources, entrants))
+        write(folder / 'evo.csv', table_csv(tables[1]))
+        files.append('evo.csv')
+    write_page(folder, 'Relative pose of two frames: evaluation', tables, pictures, entrants,
+               files)
+    return tables
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    unfinished = path.with_name(f'.{path.name}.part')
+    unfinished.write_text(text, 'utf-8')
+    os.replace(unfinished, path)
+
+
+def trajectory_file(folder: Path, sequence: str, preset: str, method: str) -> Path:
+    """Where the trajectory of a method stands."""
+    return folder / 'trajectories' / sequence / f'{method}_{preset}.tum'
+
+
+def truth_file(folder: Path, sequence: str) -> Path:
+    """Where the ground truth beside the trajectories stands."""
+    return folder / 'trajectories' / sequence / 'ground_truth.tum'
+
+
+def _pictures(folder: Path, source: Source, records: Sequence[PairRecord]) -> Iterator[Picture]:
+    groups = plots.grouped([record for record in records if record.sequence == source.name])
+    place, title = folder / 'plots', source.name
+    for kind, draw, text in (
+            ('errors', plots.plot_errors_by_frame, 'error of each pair along the sequence'),
+            ('cumulative', plots.plot_cumulative, 'share of pairs whose error is below a limit'),
+            ('boxes', plots.plot_boxes, 'distribution of the errors by method')):
+        path = place / f'{source.name}_{kind}.png'
+        draw(path, title, groups)
+        yield Picture(path, text)
+    truth, estimates = _trajectories(folder, source, groups)
+    path = place / f'{source.name}_trajectory.png'
+    plots.plot_trajectories(path, title, truth, estimates)
+    yield Picture(path, 'trajectories from above')
+
+
+def _trajectories(folder: Path, source: Source, groups: plots.Groups
+                  ) -> tuple[Trajectory, dict[str, dict[str, Trajectory]]]:
+    """Integrate the motions of every method, and write them beside the ground truth."""
+    estimates: dict[str, dict[str, Trajectory]] = {}
+    for preset, methods in groups.items():
+        for method, records in methods.items():
+            trajectory = estimated_trajectory(source, records)
+            trajectory.write_tum(trajectory_file(folder, source.name, preset, method))
+            estimates.setdefault(preset, {})[method] = trajectory
+            truth = true_trajectory(source, records)
+    truth.write_tum(truth_file(folder, source.name))
+    return truth, estimates
+
+
+def _evo_table(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant]) -> Table:
+    """Let evo compare every trajectory with the ground truth, several at a time."""
+    keys = [(source.name, entrant.preset, entrant.method)
+            for source in sources for entrant in entrants]
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        metrics = list(threads.map(lambda key: trajectory_metrics(
+            truth_file(folder, key[0]), trajectory_file(folder, *key)), keys))
+    lines = [Line((*key[:2], TITLES[key[2]], *(number(value, 3) for value in astuple(found))))
+             for key, found in zip(keys, metrics)]
+    return Table("evo's metrics of the trajectories (root mean squares, lengths from the ground "
+                 'truth): absolute error of position after alignment, and relative errors from '
+                 'frame to frame.',
+                 ('sequence', 'preset', 'method', 'APE, m', 'RPE, m', 'RPE, deg'),
+                 tuple(lines), 2, 3)
+
+
+def write_page(folder: Path, title: str, tables: Iterable[Table],
+               pictures: dict[str, list[Picture]], entrants: Sequence[Entrant],
+               files: Sequence[str]) -> None:
+    """Write index.html: tables, plots by section, parameters, and links to the files."""
+    parts = [f'<h1>{html.escape(title)}</h1>',
+             *(f'<div class="wide">{html_table(table)}</div>' for table in tables),
+             f'<p>Files: {", ".join(_link(name) for name in files)}.</p>']
+    for section, shown in pictures.items():
+        parts.append(f'<h2>{html.escape(section)}</h2>')
+        parts += [_image(picture, folder, section) for picture in shown]
+    parts.append(_parameters(entrants))
+    body = '\n'.join(parts)
+    write(folder / 'index.html',
+          '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+          '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+          f'<title>{html.escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n'
+          f'{body}\n<p>Written by djet_ros {__version__}.</p>\n</body>\n</html>\n')
+
+
+def _link(name: str) -> str:
+    return f'<a href="{html.escape(name)}">{html.escape(name)}</a>'
+
+
+def _image(picture: Picture, folder: Path, section: str) -> str:
+    source = quote(picture.path.relative_to(folder).as_posix())
+    text = html.escape(f'{section}: {picture.text}')
+    return f'<img src="{source}" alt="{text}" loading="lazy">'
+
+
+def _parameters(entrants: Sequence[Entrant]) -> str:
+    """Parameters of each preset and change, folded away; methods share them."""
+    blocks = {}
+    for entrant in entrants:
+        head = f'{entrant.preset}, {entrant.change}' if entrant.change else entrant.preset
+        values = ''.join(f'{name}: {value}\n' for name, value in asdict(entrant.config).items()
+                         if name != 'method')
+        blocks[head] = (f'<details><summary>{html.escape(head)}</summary>'
+                        f'<pre>{html.escape(values)}</pre></details>')
+    return '<h2>Parameters</h2>\n' + '\n'.join(blocks.values())

@@ -1,0 +1,111 @@
+"""Chunks of pairs on workers, of this machine or of a Dask cluster, and their results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import as_completed, BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+import os
+import signal
+from threading import Thread
+
+from djet_ros.errors import DjetError
+from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.pairs import Chunk, evaluate_chunk, PairRecord
+from djet_ros.lab.sources import Source
+from djet_ros.lab.store import in_order, RecordStore
+
+# Few enough that a broken run loses little, enough that features of the first frame don't count.
+PAIRS_PER_CHUNK = 5
+
+_THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
+
+def chunks_of(sources: Sequence[Source]) -> list[Chunk]:
+    """Cut the pairs of all sources into chunks."""
+    return [Chunk(source, first, min(PAIRS_PER_CHUNK, source.pairs - first))
+            for source in sources for first in range(0, source.pairs, PAIRS_PER_CHUNK)]
+
+
+def run(executor: Executor, sources: Sequence[Source], entrants: Sequence[Entrant],
+        store: RecordStore, progress: Callable[[int, int], None]) -> list[PairRecord]:
+    """
+    Evaluate all pairs that the store does not have yet; gives all records in a fixed order.
+
+    progress is called with (pairs done, pairs in all). Raises DjetError where a worker died;
+    what was done until then is in the store.
+    """
+    chunks = chunks_of(sources)
+    total = sum(chunk.count for chunk in chunks)
+    missing = [chunk for chunk in chunks if chunk.name not in store.chunks]
+    done = total - sum(chunk.count for chunk in missing)
+    progress(done, total)
+    futures = {executor.submit(evaluate_chunk, chunk, list(entrants)): chunk
+               for chunk in missing}
+    try:
+        for future in as_completed(futures):
+            chunk = futures[future]
+            store.add(chunk.name, future.result())
+            done += chunk.count
+            progress(done, total)
+    except BrokenExecutor as error:
+        raise DjetError('a worker died (killed, or out of memory); run the same command again: '
+                        f'{store.path} keeps what was done') from error
+    finally:
+        _cancel(futures)
+        _keep_finished(futures, store)
+    return in_order(store, (chunk.name for chunk in chunks))
+
+
+def _cancel(futures: Iterable[Future[list[PairRecord]]]) -> None:
+    for future in futures:
+        future.cancel()
+
+
+def _keep_finished(futures: dict[Future[list[PairRecord]], Chunk], store: RecordStore) -> None:
+    for future, chunk in futures.items():
+        if chunk.name not in store.chunks and future.done() and not future.cancelled() \
+                and future.exception() is None:
+            store.add(chunk.name, future.result())
+
+
+@contextmanager
+def local_workers(count: int | None = None) -> Iterator[Executor]:
+    """Give an executor of processes on this machine, by default one per core, one thread each."""
+    # Set before the workers import NumPy; equal thread counts also keep its sums equal.
+    os.environ.update(dict.fromkeys(_THREADS, '1'))
+    with ProcessPoolExecutor(count, get_context('spawn'), _follow_parent) as executor:
+        yield executor
+
+
+@contextmanager
+def dask_workers(address: str) -> Iterator[Executor]:
+    """
+    Give an executor that hands work to a Dask cluster by the address of its scheduler.
+
+    Its workers need this package and must see the datasets under the same paths. DjetError where
+    no scheduler answers.
+    """
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout='10s', set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise DjetError(f"no Dask scheduler answers at '{address}': {error}") from error
+    with client:
+        yield client.get_executor()
+
+
+def _follow_parent() -> None:
+    """Leave Ctrl-C to the parent, and end with it even where it was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        # A pool's worker would wait for its next chunk for ever.
+        os._exit(1)

@@ -1,0 +1,84 @@
+"""A scene: a world, a trajectory through it, and a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.lab.scenes.camera import Effect, Shot
+from djet_ros.lab.scenes.panel import World
+from djet_ros.lab.scenes.raster import look, Raster, reduce, shade, View, visible
+from djet_ros.lab.scenes.route import Trajectory
+from djet_ros.lab.scenes.texture import Gray
+import numpy as np
+from numpy.typing import NDArray
+
+_SUPERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    Everything that determines its pictures, which are the same bytes whenever they are rendered.
+
+    K: (3, 3) pixels, pixel centres at integers; size: (width, height); background: gray where
+    there is nothing; effects: what the camera does to the light, in this order; reach: metres
+    beyond which nothing is drawn.
+    Poses given and taken are camera to first camera, so the first is the identity.
+    """
+
+    name: str
+    world: World
+    path: Trajectory
+    K: Array
+    size: tuple[int, int]
+    seed: int
+    background: float = 0.0
+    effects: tuple[Effect, ...] = ()
+    reach: float = np.inf
+
+    def trajectory(self, frames: int) -> Array:
+        """Poses (frames, 4, 4), camera to first camera, in metres; DjetError if it is too long."""
+        if not 1 <= frames <= self.path.limit:
+            raise DjetError(f"scene '{self.name}' has 1 to {self.path.limit} frames, "
+                            f'{frames} were asked for')
+        return np.stack([self._from_level @ self.path.pose(i) for i in range(frames)])
+
+    def render(self, pose: Array, index: int = 0) -> NDArray[np.uint8]:
+        """
+        Picture (H, W) from a pose (4, 4), camera to first camera.
+
+        index: frame number; it only matters for what moves by itself (traffic, particles, noise).
+        """
+        shot = self._expose(pose, index)
+        for effect in self.effects:
+            shot = replace(shot, radiance=effect(shot))
+        return np.asarray(np.clip(np.rint(shot.radiance), 0, 255), np.uint8)
+
+    def depth(self, pose: Array, index: int = 0) -> Gray:
+        """Exact z in metres (H, W) at the pixel centres, infinite where there is nothing."""
+        _, inverse = visible(*self._look(self._to_level @ pose, index, 1))
+        with np.errstate(divide='ignore'):
+            return np.asarray(1 / inverse, np.float32)
+
+    @cached_property
+    def _to_level(self) -> Array:
+        return self.path.pose(0)
+
+    @cached_property
+    def _from_level(self) -> Array:
+        return np.asarray(np.linalg.inv(self._to_level))
+
+    def _look(self, level: Array, index: int, factor: int) -> tuple[View, Raster]:
+        raster = Raster(self.size, factor)
+        return look(self.world.at(index), level, self.K, raster, self.reach), raster
+
+    def _expose(self, pose: Array, index: int) -> Shot:
+        """Light that arrives at the camera through clear air."""
+        level = self._to_level @ pose
+        view, raster = self._look(level, index, _SUPERSAMPLING)
+        ids, inverse = visible(view, raster)
+        radiance = reduce(shade(view, ids, raster, self.background), _SUPERSAMPLING)
+        return Shot(radiance, reduce(inverse, _SUPERSAMPLING), self.K, level, index, self.seed)

@@ -1,0 +1,90 @@
+"""Rendering a scene into files, in the layout of the KITTI odometry benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+from djet_ros.config.safe_files import read_text
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.lab.scenes.catalogue import find, make_scene, suggested_frames
+from djet_ros.recordings.trajectories import KittiWriter
+import numpy as np
+from numpy.typing import NDArray
+
+FRAME_PERIOD = 0.1
+# Says what was rendered; a folder without it is not ours to replace.
+_LABEL = 'scene.txt'
+
+
+def render_sequence(name: str, out: Path, frames: int | None = None, seed: int = 0,
+                    size: tuple[int, int] | None = None,
+                    progress: Callable[[int, int], None] | None = None, *,
+                    overwrite: bool = False) -> Path:
+    """
+    Render a named scene into ``out/sequences/NN`` and its ground truth into ``out/poses/NN.txt``.
+
+    frames and size (width, height): as the scene suggests unless given; progress is called with
+    (frames done, frames in all). Gives the sequence's folder. Raises DjetError if it is there
+    already, unless ``overwrite``, or can't be written. Times and poses come last, so that an
+    interrupted rendering can't be taken for a whole one.
+    """
+    scene, number = make_scene(name, seed, size), find(name).number
+    poses = scene.trajectory(frames if frames is not None else suggested_frames(scene))
+    folder = out / 'sequences' / f'{number:02d}'
+    truth = out / 'poses' / f'{number:02d}.txt'
+    try:
+        _clear(folder, truth, overwrite)
+        (folder / _LABEL).write_text(f'djet render {name}: seed {seed}, {len(poses)} frames, '
+                                     f'{scene.size[0]}x{scene.size[1]}\n')
+        (folder / 'calib.txt').write_text(f'P0: {_projection(scene.K)}\n')
+        for index, pose in enumerate(poses):
+            path = folder / 'image_0' / f'{index:06d}.png'
+            path.write_bytes(_png(scene.render(pose, index)))
+            if progress is not None:
+                progress(index + 1, len(poses))
+        (folder / 'times.txt').write_text(''.join(f'{i * FRAME_PERIOD:.6e}\n'
+                                                  for i in range(len(poses))))
+    except OSError as error:
+        raise DjetError(f'{error.filename or out} could not be written: {error.strerror}; '
+                        'choose another folder or make room') from error
+    with KittiWriter(truth) as writer:
+        for index, pose in enumerate(poses):
+            writer.write(round(index * FRAME_PERIOD * 1e9), pose)
+    return folder
+
+
+def rendered_scene(folder: Path) -> str | None:
+    """Name of the scene that a folder of images was rendered from; None for any other folder."""
+    label = folder / _LABEL
+    if not label.is_file():
+        return None
+    words = read_text(label).partition(':')[0].split()
+    return words[-1] if words[:2] == ['djet', 'render'] else None
+
+
+def _clear(folder: Path, truth: Path, overwrite: bool) -> None:
+    """Make the folders; take away an earlier rendering, and nothing else, if that is wanted."""
+    present = next((path for path in (folder, truth) if path.exists()), None)
+    if present is not None and not overwrite:
+        raise DjetError(f'{present} exists already; choose another folder or say --overwrite')
+    if present is not None and not (folder / _LABEL).exists():
+        raise DjetError(f'{present} was not rendered ({folder / _LABEL} is missing) and is left '
+                        'as it is; choose another folder')
+    for path in (truth, folder / 'calib.txt', folder / 'times.txt',
+                 *(folder / 'image_0').glob('[0-9]*.png')):
+        path.unlink(missing_ok=True)
+    (folder / 'image_0').mkdir(parents=True, exist_ok=True)
+    truth.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _png(gray: NDArray[np.uint8]) -> bytes:
+    _, data = cv2.imencode('.png', gray)
+    return data.tobytes()
+
+
+def _projection(K: Array) -> str:
+    """Row of a calib.txt: the 3x4 projection of a rectified camera at the origin."""
+    return ' '.join(f'{value:.12e}' for value in np.hstack([K, np.zeros((3, 1))]).ravel())

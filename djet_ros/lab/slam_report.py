@@ -1,0 +1,121 @@
+"""What is written about a run of the offline SLAM."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+import json
+from pathlib import Path
+from typing import Any
+
+from djet_ros import __version__
+from djet_ros.config.sections import Config
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.lab.alignment import aligned, position_rmse
+from djet_ros.lab.evo import trajectory_metrics
+from djet_ros.lab.style import COLOURS, figure
+from djet_ros.posegraph.config import SlamConfig
+from djet_ros.posegraph.graph_files import write_graph
+from djet_ros.posegraph.offline import Slam, travelled
+from djet_ros.recordings.trajectories import TumWriter
+import numpy as np
+from numpy.typing import NDArray
+
+PLOT = 'slam.png'
+SUMMARY = 'slam.json'
+FILES = (SUMMARY, PLOT, 'pose_graph.g2o', 'pose_graph.csv', 'before_tum.txt', 'after_tum.txt',
+         'truth_tum.txt')
+
+_LINES: dict[str, Any] = {'before': {'color': COLOURS['rpe'], 'ls': '--'},
+                          'after': {'color': COLOURS['djet']}}
+
+
+def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Config,
+                 parameters: SlamConfig) -> dict[str, Any]:
+    """
+    Write trajectories, graph, plot and summary into a folder, and give the summary.
+
+    truth: (N, 4, 4) of the frames, NaN where it is not known; name: of the recording. The
+    optimised graph holds all edges; those that the kernel does not trust are in the csv too.
+    """
+    frames, graph = slam.frames, slam.solution.graph
+    ways = {'before': slam.before(), 'after': slam.after()}
+    for which, poses in ways.items():
+        _write_tum(folder / f'{which}_tum.txt', frames.stamps_ns, poses)
+    for kind in ('g2o', 'csv'):
+        write_graph(graph, folder / f'pose_graph.{kind}', kind)
+    kinds = Counter(edge.kind for edge in graph.edges)
+    summary: dict[str, Any] = {
+        'source': name, 'scale': config.odometry.scale, 'scale_known': slam.scale_known,
+        'scale_uncertainty': config.odometry.scale_uncertainty if slam.scale_known else None,
+        'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
+        'rejected': {kind: slam.rejected(kind) for kind in ('link', 'loop') if kinds[kind]},
+        'way': travelled(slam.before()), 'parameters': asdict(parameters),
+        'version': __version__}
+    known = np.isfinite(truth).all(axis=(1, 2))
+    if known.sum() > 2:
+        _write_tum(folder / 'truth_tum.txt', frames.stamps_ns[known], truth[known])
+        summary['errors'] = {which: _error(poses, truth, slam.scale_known)
+                             for which, poses in ways.items()}
+        try:
+            for which, errors in summary['errors'].items():
+                errors.update(_evo(folder, which, slam.scale_known))
+        except DjetError as error:
+            # It is not installed, or refuses a way that is straight.
+            summary['evo'] = str(error)
+    _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, Path(name).name)
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n')
+    return summary
+
+
+def _error(poses: Array, truth: Array, scaled: bool) -> dict[str, float]:
+    there = truth[:, :3, 3]
+    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], there, scaled), there)}
+
+
+def _evo(folder: Path, which: str, scaled: bool) -> dict[str, float]:
+    """Metrics of a trajectory file by evo's own commands."""
+    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{which}_tum.txt', scaled)
+    return {f'evo_{name}': value for name, value in asdict(metrics).items()}
+
+
+def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
+    """Draw the way from above, before and after, and both errors along it."""
+    ways = {'before': slam.before()[:, :3, 3], 'after': slam.after()[:, :3, 3]}
+    if truth is not None:
+        ways = {which: aligned(way, truth[:, :3, 3], slam.scale_known)
+                for which, way in ways.items()}
+    with figure(path, 7 if truth is None else 12, 6) as page:
+        axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
+        if truth is not None:
+            axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
+        for which, way in ways.items():
+            axes.plot(way[:, 0], way[:, 2], label=which, **_LINES[which])
+        axes.plot(*_closed(slam, ways['after'])[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4,
+                  label='loop closed')
+        unit = 'm' if slam.scale_known or truth is not None else 'units'
+        axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
+        axes.legend()
+        if truth is not None:
+            errors = page.add_subplot(1, 2, 2)
+            seconds = (slam.frames.stamps_ns - slam.frames.stamps_ns[0]) * 1e-9
+            for which, way in ways.items():
+                errors.plot(seconds, np.linalg.norm(way - truth[:, :3, 3], axis=1), label=which,
+                            **_LINES[which])
+            errors.set(xlabel='time (s)', ylabel='distance from the truth, aligned (m)')
+            errors.legend()
+
+
+def _closed(slam: Slam, way: Array) -> Array:
+    """Positions (L, 3), among those of all frames (N, 3), from which a trusted loop was closed."""
+    _, first = np.unique(slam.keyframes.keyframe, return_index=True)
+    closing = [edge.source for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
+               if edge.kind == 'loop' and trust >= 0.5]
+    return np.asarray(way[first[np.array(closing, np.int64)]])
+
+
+def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+    with TumWriter(path) as writer:
+        for stamp, pose in zip(stamps_ns.tolist(), poses):
+            writer.write(stamp, pose)

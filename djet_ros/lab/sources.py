@@ -1,0 +1,164 @@
+"""What an evaluation runs on: sequences with ground truth, of any layout that can be opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+import hashlib
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.lab.recordings import extract, ExtractedSequence, is_extracted
+from djet_ros.lab.scenes.sequence import rendered_scene
+from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.sequence import FrameSequence
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Frames start, start + stride, … of a sequence, below end; each two in a row are a pair."""
+
+    start: int = 0
+    end: int | None = None
+    stride: int = 1
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    A sequence that takes part.
+
+    name: what tables call it, unique in a run; benchmark: what it is publicly known as, or
+    empty; folder: where every worker can open its frames; frames: indices of those that are used;
+    content: a digest of camera, truth and some pixels.
+    """
+
+    name: str
+    benchmark: str
+    folder: Path
+    frames: range
+    content: str
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of frames that follow one another."""
+        return len(self.frames) - 1
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that decides the results, as plain values."""
+        frames = [self.frames.start, self.frames.stop, self.frames.step]
+        return {'name': self.name, 'frames': frames, 'content': self.content}
+
+
+def open_sources(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Source]:
+    """
+    Open datasets, those in a folder of KITTI sequences one by one, and check that all can be used.
+
+    The frames of bags are written into the workspace, because pairs must be had in any order.
+    Raises DjetError on what is no dataset, has no ground truth, or has not enough frames.
+    """
+    sources: list[Source] = []
+    for path in chain.from_iterable(map(_sequences, paths)):
+        name = _unused(plain_name(path), {source.name for source in sources})
+        sources.append(_source(path, name, selection, workspace))
+    return sources
+
+
+@lru_cache(maxsize=2)
+def opened(source: Source) -> FrameSequence:
+    """Open the frames of a source, once in each process as long as its chunks follow another."""
+    return _frames_in(source.folder)
+
+
+def _frames_in(folder: Path) -> FrameSequence:
+    if is_extracted(folder):
+        return ExtractedSequence(folder)
+    sequence = open_sequence(folder)
+    assert not isinstance(sequence, BagSource)  # bags are extracted when sources are opened
+    return sequence
+
+
+def pair_of_frames(path: Path, index: int, workspace: Path
+                   ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
+    """Images (H, W) of frames index and index + 1 of any dataset, and their camera matrix."""
+    sequence = readable_frames(path, workspace)
+    if not 0 <= index < len(sequence) - 1:
+        raise DjetError(f'pair {index} was asked for, {path} has pairs 0 to {len(sequence) - 2}')
+    return sequence.image(index), sequence.image(index + 1), sequence.K
+
+
+def readable_frames(path: Path, workspace: Path) -> FrameSequence:
+    """Open any dataset so that its frames can be had in any order, a bag's in the workspace."""
+    return _frames_in(_readable(path, workspace / 'frames'))
+
+
+def _readable(path: Path, place: Path) -> Path:
+    """Folder in which frames can be had in any order: a bag's are written to a place for it."""
+    sequence = open_sequence(path)
+    if not isinstance(sequence, BagSource):
+        return path.resolve()
+    with sequence:
+        return extract(sequence, place)
+
+
+def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Source:
+    folder = _readable(path, workspace / name)
+    sequence = _frames_in(folder)
+    frames = _selected(path, sequence, selection)
+    if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):
+        raise DjetError(f'{path} has no ground truth for two frames in a row; errors need it '
+                        '(KITTI: ../../poses/NN.txt, TUM: groundtruth.txt, bags: a pose topic '
+                        'with ground_truth in its name)')
+    # Rendered sequences have KITTI's layout and numbers, but nothing was published about them.
+    benchmark = '' if rendered_scene(folder) else sequence.name
+    return Source(name, benchmark, folder, frames, _digest(sequence, frames))
+
+
+def _sequences(path: Path) -> Iterator[Path]:
+    """Sequences of a whole benchmark folder, or the path itself."""
+    inner = sorted(image_folder.parent for image_folder in path.glob('sequences/*/image_0'))
+    yield from inner or [path]
+
+
+def plain_name(path: Path) -> str:
+    """Name that tables call a dataset by: a rendered one by its scene, others by their folder."""
+    resolved = path.resolve()
+    return rendered_scene(resolved) or (resolved.stem if resolved.is_file() else resolved.name)
+
+
+def _unused(name: str, used: set[str]) -> str:
+    candidates = [name, *(f'{name}-{number}' for number in range(2, len(used) + 2))]
+    return next(candidate for candidate in candidates if candidate not in used)
+
+
+def _selected(path: Path, sequence: FrameSequence, selection: Selection) -> range:
+    end = len(sequence) if selection.end is None else min(selection.end, len(sequence))
+    if selection.start < 0 or selection.stride < 1:
+        raise DjetError(f'start is {selection.start} and stride {selection.stride}; start must '
+                        'be 0 or more, stride 1 or more')
+    frames = range(selection.start, end, selection.stride)
+    if len(frames) < 2:
+        raise DjetError(f'{path} has {len(sequence)} frames, of which {len(frames)} are chosen '
+                        'by start, end and stride; two are needed')
+    return frames
+
+
+def _has_true_pair(poses: Array) -> bool:
+    known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    return bool((known[1:] & known[:-1]).any())
+
+
+def _digest(sequence: FrameSequence, frames: range) -> str:
+    """Tell one recording from another of the same name."""
+    digest = hashlib.sha256()
+    for values in (sequence.K, sequence.poses, sequence.stamps_ns, sequence.image(frames[0]),
+                   sequence.image(frames[-1])):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,119 @@
+"""
+Records on disk while they come in, so that a broken run loses only what was under way.
+
+One JSON object a line: first what decides the results, then one chunk of pairs each, in the order
+in which they were done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+import json
+import math
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+from djet_ros import __version__
+from djet_ros.errors import DjetError
+from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.sources import Source
+import numpy as np
+
+FILE_NAME = 'records.jsonl'
+
+
+class RecordStore:
+    """
+    The records of a run in ``folder/records.jsonl``: those of an earlier run, and new ones.
+
+    Raises DjetError where the file is of a run with other settings, unless overwrite is set.
+    """
+
+    def __init__(self, folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant], *,
+                 overwrite: bool = False) -> None:
+        self.path = folder / FILE_NAME
+        self.chunks: dict[str, list[PairRecord]] = {}
+        settings = _settings(sources, entrants)
+        if self.path.exists() and not overwrite:
+            self._read(settings)
+            self._file = self.path.open('a', encoding='ascii')
+        else:
+            self._file = self.path.open('w', encoding='ascii')
+            self._write(settings)
+
+    def add(self, chunk: str, records: list[PairRecord]) -> None:
+        """Keep the records of a chunk; they are on disk when this returns."""
+        self.chunks[chunk] = records
+        self._write({'chunk': chunk, 'records': [_plain(record) for record in records]})
+
+    def __enter__(self) -> Self:
+        """Give the store itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _write(self, line: dict[str, Any]) -> None:
+        self._file.write(json.dumps(line, allow_nan=False) + '\n')
+        self._file.flush()
+
+    def _read(self, settings: dict[str, Any]) -> None:
+        whole = _whole_lines(self.path)
+        if not whole or json.loads(whole[0]) != settings:
+            before = _parsed(self.path, 1, whole[0]) if whole else {}
+            other = [name for name in settings if settings[name] != before.get(name)]
+            raise DjetError(f'{self.path.parent} holds results of other settings '
+                            f'({", ".join(other)}); choose another folder, or --overwrite')
+        for number, line in enumerate(whole[1:], 2):
+            content = _parsed(self.path, number, line)
+            self.chunks[content['chunk']] = [_record(values) for values in content['records']]
+
+
+def _settings(sources: Sequence[Source], entrants: Sequence[Entrant]) -> dict[str, Any]:
+    return {
+        'djet_ros': __version__,
+        'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__},
+        'sequences': [source.settings() for source in sources],
+        'methods': [entrant.settings() for entrant in entrants]}
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Lines of the file, cutting off a last one that a killed run has left unfinished."""
+    content = path.read_bytes()
+    whole = content[:content.rfind(b'\n') + 1]
+    if len(whole) < len(content):
+        path.write_bytes(whole)
+    return whole.decode('ascii', 'replace').splitlines()
+
+
+def _parsed(path: Path, number: int, line: str) -> dict[str, Any]:
+    try:
+        content = json.loads(line)
+    except json.JSONDecodeError:
+        content = None
+    if not isinstance(content, dict):
+        raise DjetError(f'{path} line {number} is damaged; run again with --overwrite')
+    return content
+
+
+def _plain(record: PairRecord) -> dict[str, Any]:
+    return {name: None if isinstance(value, float) and math.isnan(value) else value
+            for name, value in asdict(record).items()}
+
+
+def _record(values: dict[str, Any]) -> PairRecord:
+    told: dict[str, Any] = {name: float('nan') if value is None else value
+                            for name, value in values.items()}
+    vectors = {name: tuple(told[name]) for name in ('rotation', 'translation')}
+    return PairRecord(**{**told, **vectors})
+
+
+def in_order(store: RecordStore, chunk_names: Iterable[str]) -> list[PairRecord]:
+    """Give the records of all chunks, in the order of the names."""
+    return [record for name in chunk_names for record in store.chunks[name]]

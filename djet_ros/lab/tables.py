@@ -1,0 +1,220 @@
+"""Results as tables: exact ones for programs (CSV), and readable ones in several markups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+import csv
+from dataclasses import asdict, dataclass, fields, replace
+import html
+import io
+import math
+from typing import Any
+
+from djet_ros.lab.entrants import TITLES
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.published import PublishedRow
+from djet_ros.lab.summary import TableRow
+
+PUBLISHED = 'the paper'
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a table; bold: columns to stress; foreign: its figures are not ours."""
+
+    cells: tuple[str, ...]
+    bold: frozenset[int] = frozenset()
+    foreign: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """
+    A readable table.
+
+    sections: how many of the first columns say which section a line belongs to; numeric: from
+    which column on cells are numbers, to be set to the right.
+    """
+
+    caption: str
+    header: tuple[str, ...]
+    lines: tuple[Line, ...]
+    sections: int
+    numeric: int
+
+
+# Columns of figures: their titles, their fields, and the decimals that mean something.
+_FIGURES = (
+    ('rot. mean', 'rotation_mean_deg', 3), ('rot. median', 'rotation_median_deg', 3),
+    ('rot. p95', 'rotation_p95_deg', 3), ('tr. mean', 'translation_mean_deg', 2),
+    ('tr. median', 'translation_median_deg', 2), ('tr. p95', 'translation_p95_deg', 2),
+    ('Hamming', 'hamming_mean', 2), ('failed', 'failures', 0), ('ms', 'ms_per_pair', 0))
+_TITLES = tuple(title for title, _, _ in _FIGURES)
+# Of these the least in a section is stressed.
+_STRESSED = _TITLES[:7]
+
+
+def results_table(caption: str, rows: Sequence[TableRow],
+                  published: dict[str, list[PublishedRow]]) -> Table:
+    """
+    Lay out rows by sequence and preset, the best figures stressed, printed ones below them.
+
+    published: rows of the paper by the name of the sequence.
+    """
+    lines: list[Line] = []
+    for sequence in dict.fromkeys(row.sequence for row in rows):
+        ours = [row for row in rows if row.sequence == sequence]
+        for preset in dict.fromkeys(row.preset for row in ours):
+            group = [row for row in ours if row.preset == preset]
+            lines += [_line(row, (sequence, preset, TITLES[row.method]), group) for row in group]
+        lines += [_printed_line((sequence, PUBLISHED, TITLES[row.method]), row)
+                  for row in published.get(sequence, ())]
+    return Table(caption, ('sequence', 'preset', 'method', *_TITLES), tuple(lines), 2, 3)
+
+
+def ablation_table(caption: str, rows: Sequence[TableRow]) -> Table:
+    """Lay out rows by sequence and preset, with what was changed; the first row is the base."""
+    lines = [_line(row, (row.sequence, row.preset, TITLES[row.method], row.change or '–'), ())
+             for row in rows]
+    return Table(caption, ('sequence', 'preset', 'method', 'change', *_TITLES), tuple(lines), 2, 4)
+
+
+def published_table(caption: str, rows: Iterable[PublishedRow]) -> Table:
+    """Lay out rows of the paper's Table 2."""
+    header = ('sequence', 'method', 'sampling area', 'rotation', 'translation', 'Hamming')
+    lines = [Line(('VAROS', TITLES[row.method], f'{row.window}×{row.window}' if row.window else
+                   '–', number(row.rotation_deg, 3), number(row.translation_deg, 3),
+                   number(row.hamming, 2)), foreign=True) for row in rows]
+    return Table(caption, header, tuple(lines), 1, 3)
+
+
+def _printed_line(head: tuple[str, ...], row: PublishedRow) -> Line:
+    """Lay out a row of the paper, which prints means only."""
+    return Line((*head, number(row.rotation_deg, 3), '', '', number(row.translation_deg, 3), '',
+                 '', number(row.hamming, 2), '', ''), foreign=True)
+
+
+def _line(row: TableRow, head: tuple[str, ...], group: Sequence[TableRow]) -> Line:
+    cells, bold = list(head), set()
+    for title, name, digits in _FIGURES:
+        value = getattr(row, name)
+        if title in _STRESSED and len(group) > 1 and value == _least(group, name):
+            bold.add(len(cells))
+        cells.append(_share(row) if name == 'failures' else number(value, digits))
+    return Line(tuple(cells), frozenset(bold))
+
+
+def _share(row: TableRow) -> str:
+    return f'{row.failures} ({100 * row.failures / row.pairs:.0f}%)' if row.failures else '0'
+
+
+def _least(group: Sequence[TableRow], name: str) -> float:
+    return min((getattr(row, name) for row in group if math.isfinite(getattr(row, name))),
+               default=math.nan)
+
+
+def number(value: float, digits: int) -> str:
+    """Text of a number with so many decimals; a dash where it is not known."""
+    return f'{value:.{digits}f}' if math.isfinite(value) else '–'
+
+
+def rows_csv(rows: Sequence[TableRow], *, with_change: bool) -> str:
+    """Rows as CSV; the column ``change`` only where asked for."""
+    names = [field.name for field in fields(TableRow) if with_change or field.name != 'change']
+    return _csv(names, (asdict(row) for row in rows))
+
+
+# Columns of pairs.csv; times stand in a file of their own, because they alone differ from run
+# to run.
+_PAIR_KEY = ('sequence', 'pair', 'previous', 'current', 'method', 'preset', 'change')
+
+
+def pairs_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
+    """Give the records of all pairs as CSV, without their times."""
+    vectors = {'rotation': ('rx', 'ry', 'rz'), 'translation': ('tx', 'ty', 'tz')}
+    names = [column for field in fields(PairRecord)
+             for column in vectors.get(field.name, (field.name,))
+             if column != 'milliseconds' and (with_change or column != 'change')]
+    return _csv(names, ({**asdict(record), 'failed': int(record.failed),
+                         **dict(zip(('rx', 'ry', 'rz'), record.rotation)),
+                         **dict(zip(('tx', 'ty', 'tz'), record.translation))}
+                        for record in records))
+
+
+def timings_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
+    """Give the times of all pairs as CSV."""
+    names = [name for name in _PAIR_KEY if with_change or name != 'change']
+    return _csv([*names, 'milliseconds'], (asdict(record) for record in records))
+
+
+def table_csv(table: Table) -> str:
+    """Give a readable table as CSV."""
+    return _csv(table.header, (dict(zip(table.header, line.cells)) for line in table.lines))
+
+
+def _csv(names: Sequence[str], rows: Iterable[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(names)
+    writer.writerows([_value(row[name]) for name in names] for row in rows)
+    return text.getvalue()
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, float):
+        return f'{value:.9g}' if math.isfinite(value) else ''
+    return value
+
+
+def markdown(table: Table) -> str:
+    """Give the table in Markdown, its caption as a paragraph before it."""
+    rule = ['--:' if column >= table.numeric else '---' for column in range(len(table.header))]
+    rows = [table.header, tuple(rule), *(_marked(line, '**', '**', '*', '*')
+                                         for line in table.lines)]
+    return f'{table.caption}\n\n' + ''.join(f'| {" | ".join(row)} |\n' for row in rows)
+
+
+def latex(table: Table) -> str:
+    """Give the table as a LaTeX table that needs no package."""
+    escaped = replace(table, lines=tuple(
+        replace(line, cells=tuple(_latex_text(cell) for cell in line.cells))
+        for line in table.lines))
+    layout = 'l' * table.numeric + 'r' * (len(table.header) - table.numeric)
+    marks = (r'\textbf{', '}', r'\textit{', '}')
+    body = ''.join(' & '.join(_marked(line, *marks)) + ' \\\\\n' for line in escaped.lines)
+    return (f'\\begin{{table}}\n\\caption{{{_latex_text(table.caption)}}}\n'
+            f'\\begin{{tabular}}{{{layout}}}\n\\hline\n'
+            f'{" & ".join(map(_latex_text, table.header))} \\\\\n\\hline\n{body}\\hline\n'
+            '\\end{tabular}\n\\end{table}\n')
+
+
+def html_table(table: Table) -> str:
+    """Give the table in HTML."""
+    kinds = [' class="number"' if column >= table.numeric else ''
+             for column in range(len(table.header))]
+    head = ''.join(f'<th{kind}>{html.escape(title)}</th>'
+                   for kind, title in zip(kinds, table.header))
+    body = []
+    for line, before in zip(table.lines, (None, *table.lines)):
+        begins = before is None or before.cells[:table.sections] != line.cells[:table.sections]
+        escaped = replace(line, cells=tuple(html.escape(cell) for cell in line.cells))
+        cells = ''.join(f'<td{kind}>{cell}</td>' for kind, cell in
+                        zip(kinds, _marked(escaped, '<b>', '</b>', '<i>', '</i>')))
+        body.append(f'<tr class="section">{cells}</tr>\n' if begins else f'<tr>{cells}</tr>\n')
+    return (f'<table>\n<caption>{html.escape(table.caption)}</caption>\n'
+            f'<thead><tr>{head}</tr></thead>\n<tbody>\n{"".join(body)}</tbody>\n</table>\n')
+
+
+def _marked(line: Line, bold: str, end_bold: str, foreign: str,
+            end_foreign: str) -> tuple[str, ...]:
+    cells = (f'{bold}{cell}{end_bold}' if column in line.bold else cell
+             for column, cell in enumerate(line.cells))
+    return tuple(f'{foreign}{cell}{end_foreign}' if line.foreign and cell else cell
+                 for cell in cells)
+
+
+def _latex_text(text: str) -> str:
+    special = {'&': r'\&', '%': r'\%', '_': r'\_', '#': r'\#', '$': r'\$', '{': r'\{',
+               '}': r'\}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
+               '\\': r'\textbackslash{}', '–': '--', '×': r'$\times$'}
+    return ''.join(special.get(letter, letter) for letter in text)

@@ -1,0 +1,78 @@
+"""From the motions of pairs to a trajectory, with the lengths that the ground truth gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+from djet_ros.core.types import Array
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.sources import opened, Source
+from djet_ros.recordings.trajectories import TumWriter
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses (N, 4, 4) of the camera in its first frame, in metres, at stamps (N,) in ns."""
+
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+
+    def write_tum(self, path: Path) -> None:
+        """Write the file anew in TUM's format."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        with TumWriter(path) as writer:
+            for stamp, pose in zip(self.stamps_ns.tolist(), self.poses):
+                writer.write(stamp, pose)
+
+
+def true_trajectory(source: Source, records: Sequence[PairRecord]) -> Trajectory:
+    """Ground truth over the longest run of pairs among the records of one entrant."""
+    sequence, frames = opened(source), _frames(_longest_run(records))
+    assert sequence.poses is not None  # sources without poses are refused at the start
+    poses = sequence.poses[frames]
+    return Trajectory(sequence.stamps_ns[frames], np.linalg.inv(poses[0]) @ poses)
+
+
+def estimated_trajectory(source: Source, records: Sequence[PairRecord]) -> Trajectory:
+    """
+    Integrate the motions of one entrant over the longest run of pairs.
+
+    Each unit translation gets its true length, which one camera cannot know. Where no pose was
+    told the camera stands still.
+    """
+    truth = true_trajectory(source, records)
+    lengths = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
+    poses = [np.eye(4)]
+    for record, length in zip(_longest_run(records), lengths.tolist()):
+        poses.append(poses[-1] @ _camera_motion(record, length))
+    return Trajectory(truth.stamps_ns, np.array(poses))
+
+
+def _camera_motion(record: PairRecord, length: float) -> Array:
+    """Pose (4, 4) of the current camera in the previous one."""
+    motion = np.eye(4)
+    if math.isfinite(record.rotation_error_deg):
+        motion[:3, :3] = Rotation.from_rotvec(record.rotation).as_matrix()
+        motion[:3, 3] = length * np.array(record.translation)
+    return motion
+
+
+def _longest_run(records: Sequence[PairRecord]) -> list[PairRecord]:
+    runs: list[list[PairRecord]] = []
+    for record in records:
+        if runs and runs[-1][-1].pair + 1 == record.pair:
+            runs[-1].append(record)
+        else:
+            runs.append([record])
+    return max(runs, key=len)
+
+
+def _frames(run: Sequence[PairRecord]) -> list[int]:
+    return [run[0].previous, *(record.current for record in run)]

@@ -1,0 +1,1 @@
+"""What both live faces share, without ROS or DDS: sessions, their queue, topics, wiring."""

@@ -1,0 +1,148 @@
+"""
+A pose graph at work on a live odometry: its queue, its thread, and what happens around them.
+
+As with the odometry's session, the wiring alone is left to the faces.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from threading import Thread
+from time import monotonic, time_ns
+from typing import Any, NamedTuple
+
+from djet_ros.live.frame_queue import FrameQueue
+from djet_ros.live.session import Latencies, SILENCE, Throttle, Wiring
+from djet_ros.odometry.tracker import Outgoing
+from djet_ros.posegraph.live_slam import LiveSlam
+import numpy as np
+
+# Messages of the odometry that may wait while a graph is optimised.
+_WAITING = 1000
+
+
+class _Task(NamedTuple):
+    """What is to be done with the graph, in its thread, and since when (monotonic seconds)."""
+
+    do: Callable[[], list[Outgoing]]
+    since: float
+
+
+class GraphSession:
+    """
+    Works on the odometry's messages in a thread of its own, and on loops while none waits.
+
+    topics: resolved names of 'odometry', 'relative_pose_cov', 'image' and 'camera_info', for
+    people. Everything may be called from any one thread; nothing of it waits.
+    """
+
+    def __init__(self, slam: LiveSlam, wiring: Wiring, topics: Mapping[str, str]) -> None:
+        self._slam = slam
+        self._wiring = wiring
+        self._topics = topics
+        self._log = Throttle(wiring)
+        self._queue: FrameQueue[_Task] = FrameQueue('latest', _WAITING)
+        # Taken by the thread before anything else: what waits here costs it nothing.
+        self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
+        self._infos: deque[Any] = deque(maxlen=1)
+        self._latencies = Latencies()
+        self._heard = dict.fromkeys(topics, -np.inf)
+        self._stopping = False
+        self._worker = Thread(target=self._work, name='pose_graph', daemon=True)
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._heard = dict.fromkeys(self._topics, monotonic())
+        self._worker.start()
+
+    def stop(self, timeout: float = 0.5) -> None:
+        """Publish nothing more, and wait up to timeout seconds for what is in work."""
+        self._stopping = True
+        self._queue.close()
+        if self._worker.is_alive():
+            self._worker.join(timeout)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the work ended by an error; Python has printed its traceback."""
+        return not (self._worker.is_alive() or self._stopping)
+
+    # What comes in
+
+    def odometry(self, message: Any) -> None:
+        """Take an Odometry."""
+        self._take('odometry', lambda: self._slam.odometry(message))
+
+    def relative_pose(self, message: Any) -> None:
+        """Take a PoseWithCovarianceStamped."""
+        self._take('relative_pose_cov', lambda: self._slam.relative_pose(message))
+
+    def image(self, message: Any) -> None:
+        """Take an Image or a CompressedImage."""
+        self._heard['image'] = monotonic()
+        self._images.append(message)
+
+    def camera_info(self, message: Any) -> None:
+        """Take a CameraInfo."""
+        self._heard['camera_info'] = np.inf
+        self._infos.append(message)
+
+    def reset(self) -> None:
+        """Forget the map and what waits, as soon as what is in work is done."""
+        self._queue.clear()
+        self._images.clear()
+        self._put(self._forget)
+
+    def tick(self) -> None:
+        """Say what no message makes the graph say; to be called about once a second."""
+        silent = monotonic() - self._heard['odometry'] > SILENCE
+        for what in self._topics:
+            if monotonic() - self._heard[what] > SILENCE:
+                self._log.warn_of_missing(what, self._topics[what])
+        if silent and not len(self._queue):
+            self._put(self._settle)
+
+    # In the thread
+
+    def _take(self, what: str, do: Callable[[], list[Outgoing]]) -> None:
+        self._heard[what] = monotonic()
+        self._put(do)
+
+    def _put(self, do: Callable[[], list[Outgoing]]) -> None:
+        self._queue.put(_Task(do, monotonic()))
+
+    def _work(self) -> None:
+        while not self._stopping:
+            task = self._queue.get(timeout=None if self._slam.idle else 0.0)
+            self._take_images()
+            if task is None:
+                self._publish(self._slam.work())
+                continue
+            self._slam.face_values = self._face_values()
+            self._publish(task.do())
+            self._latencies.add(task.since)
+            if self._slam.problem is not None:
+                self._log.warn(type(self._slam.problem).__name__, str(self._slam.problem))
+
+    def _take_images(self) -> None:
+        while self._infos:
+            self._slam.camera_info(self._infos.popleft())
+        while self._images:
+            self._slam.image(self._images.popleft())
+
+    def _forget(self) -> list[Outgoing]:
+        self._slam.reset()
+        self._latencies.clear()
+        return [self._slam.diagnostics(time_ns())]
+
+    def _settle(self) -> list[Outgoing]:
+        """Use the silence: optimise what is left to optimise."""
+        return [*self._slam.work(at_once=True), self._slam.diagnostics(time_ns())]
+
+    def _face_values(self) -> dict[str, str]:
+        return {'messages dropped': str(self._queue.dropped), **self._latencies.values()}
+
+    def _publish(self, outgoing: Sequence[Outgoing]) -> None:
+        if outgoing and not self._stopping:
+            self._wiring.publish(outgoing)

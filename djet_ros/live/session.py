@@ -1,0 +1,313 @@
+"""
+A tracker at work on a live stream: its queue, its thread, and what happens around the frames.
+
+Every live face shares this and adds the wiring alone: how messages come and go.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from threading import Lock, Thread
+from time import monotonic, time_ns
+from typing import Any, NamedTuple, Protocol
+
+from djet_ros.config.sections import Config
+from djet_ros.live.frame_queue import FrameQueue
+from djet_ros.odometry.diagnostics import LEVELS, State
+from djet_ros.odometry.tracker import Outgoing, Tracker
+import numpy as np
+
+# Seconds without an image after which a camera counts as gone.
+SILENCE = 2.0
+
+# Seconds before the same is said in the log again.
+_LOG_PERIOD = 5.0
+
+# Seconds after which diagnostics come also where no image makes the tracker say them.
+_DIAGNOSTICS_PERIOD = 1.0
+
+# Speeds that may wait for the next frame.
+_WAITING_SPEEDS = 10_000
+
+_LATENCIES = 100
+
+# States that somebody asked for, or that are logged with the names of topics.
+_SAID_ELSEWHERE = (State.PAUSED, State.WAITING_FOR_IMAGE, State.WAITING_FOR_CAMERA_INFO)
+
+
+class Wiring(Protocol):
+    """What a session needs of the graph; all but ``publish`` is asked from any thread."""
+
+    def publish(self, outgoing: Sequence[Outgoing]) -> None:
+        """Send messages, from the session's thread or from the one that calls it."""
+
+    def log(self, level: str, text: str) -> None:
+        """Say something to people; level is 'info' or 'warning'."""
+
+    def count_publishers(self, topic: str) -> int:
+        """Count who publishes a topic."""
+
+    def wants_debug_image(self) -> bool:
+        """Tell whether anybody looks at the debug image."""
+
+
+class _Received(NamedTuple):
+    """An image, the CameraInfo that was the newest when it came, and when (monotonic seconds)."""
+
+    image: Any
+    info: Any
+    at: float
+
+
+class Throttle:
+    """A log that says the same only now and then; for one thread at a time."""
+
+    def __init__(self, wiring: Wiring) -> None:
+        self._wiring = wiring
+        self._said: dict[str, float] = {}
+
+    def warn(self, key: str, text: str) -> None:
+        """Say something, unless what goes by the same key was said a short while ago."""
+        now = monotonic()
+        if now - self._said.get(key, -np.inf) >= _LOG_PERIOD:
+            self._said[key] = now
+            self._wiring.log('warning', text)
+
+    def warn_of_missing(self, what: str, topic: str) -> None:
+        """Say that nothing comes over a topic."""
+        count = self._wiring.count_publishers(topic)
+        self.warn(what, f'waiting for {what} on {topic}: ' + (
+            f'{count} publish it, none sends' if count else 'nobody publishes it'))
+
+    def clear(self) -> None:
+        """Forget what was said."""
+        self._said.clear()
+
+
+class Latencies:
+    """How long the newest pieces of work took, from receipt to publication."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_LATENCIES)
+
+    def add(self, since: float) -> None:
+        """Take a piece of work that came in at a moment (monotonic seconds) and is done now."""
+        self._seconds.append(monotonic() - since)
+
+    def clear(self) -> None:
+        """Forget what was taken."""
+        self._seconds.clear()
+
+    def values(self) -> dict[str, str]:
+        """Give what diagnostics say of them; nothing where there are none."""
+        if not self._seconds:
+            return {}
+        median, high = np.percentile(self._seconds, (50, 95)) * 1e3
+        return {'latency, median (ms)': f'{median:.1f}', 'latency, 95 % (ms)': f'{high:.1f}'}
+
+
+class Session:
+    """
+    Works on images in a thread of its own, in the order in which they come.
+
+    topics: resolved names of 'image' and 'camera_info', for people. Messages may come from any
+    one thread; everything else may be called from any thread. With the queue policy 'every'
+    ``image`` waits where the queue is full. What is published for one image is published as a
+    whole or not at all, and nothing of before a reset or a stop after it.
+    """
+
+    def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
+        node = tracker.config.ros
+        self._tracker = tracker
+        self._wiring = wiring
+        self._topics = topics
+        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size)
+        # Held while an image is worked on and published, and by what happens in between.
+        self._lock = Lock()
+        self._turnstile = Lock()
+        self._newest_info: Any = None
+        self._taken_info: Any = None
+        self._speeds: deque[Any] = deque(maxlen=_WAITING_SPEEDS)
+        self._counted_drops = self._lost = 0
+        self._latencies = Latencies()
+        self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
+        self._log = Throttle(wiring)
+        self._stopping = False
+        self._worker = Thread(target=self._work, name='odometry', daemon=True)
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._started = self._last_image = monotonic()
+        self._worker.start()
+
+    def stop(self, timeout: float = 0.5) -> None:
+        """
+        Publish nothing more, and wait up to timeout seconds for the image in work.
+
+        An image whose messages are being published at this moment is published as a whole.
+        """
+        self._stopping = True
+        self._queue.close()
+        self._queue.clear()
+        if self._worker.is_alive():
+            self._worker.join(timeout)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the work ended by an error; Python has printed its traceback."""
+        return not (self._worker.is_alive() or self._stopping)
+
+    # What comes in
+
+    def image(self, message: Any) -> None:
+        """Take an Image or a CompressedImage."""
+        self._last_image = monotonic()
+        self._queue.put(_Received(message, self._newest_info, self._last_image))
+
+    def camera_info(self, message: Any) -> None:
+        """Take a CameraInfo; it holds for the images that come after it."""
+        self._newest_info = message
+
+    def speed(self, message: Any) -> None:
+        """Take a TwistStamped or an Odometry as the camera's speed."""
+        self._speeds.append(message)
+
+    def count_lost(self, number: int) -> None:
+        """Count images that were sent and never came."""
+        self._lost += number
+
+    # What is asked for between two images
+
+    def reset(self) -> None:
+        """Forget all images, poses, speeds and counts, those that still wait included."""
+        with self._between_images():
+            # An image that has left the queue may wait for the lock just now.
+            self._forgotten = monotonic()
+            self._queue.clear()
+            self._speeds.clear()
+            self._latencies.clear()
+            self._log.clear()
+            self._counted_drops, self._lost = self._queue.dropped, 0
+            self._tracker.reset()
+            self._say()
+
+    def pause(self) -> None:
+        """Drop and count all images until ``resume``."""
+        with self._between_images():
+            self._tracker.pause()
+            self._say()
+
+    def resume(self) -> None:
+        """Work on images again."""
+        with self._between_images():
+            self._tracker.resume()
+            self._say()
+
+    def configure(self, config: Config) -> None:
+        """Take other parameters from the next image on; the queue stays as it was made."""
+        with self._between_images():
+            self._tracker.configure(config)
+
+    @contextmanager
+    def _between_images(self) -> Iterator[None]:
+        # Who waits for the lock holds the turnstile meanwhile: the thread, which wants the lock
+        # again as soon as it has released it, has to queue up.
+        with self._turnstile, self._lock:
+            yield
+
+    # Once a second
+
+    def tick(self) -> None:
+        """
+        Say what no image makes the tracker say; to be called about once a second.
+
+        That is: which topic is still waited for, and diagnostics while no images come.
+        """
+        if not self._lock.acquire(blocking=False):
+            # An image is in work, and says everything by itself.
+            return
+        try:
+            silent = monotonic() - self._last_image > SILENCE
+            if silent:
+                # No image waits that came before this CameraInfo.
+                self._take_info(self._newest_info)
+                self._tracker.no_image_comes()
+            if self._tracker.state is not State.PAUSED:
+                self._log_what_is_missing(silent)
+            if monotonic() - self._last_diagnostics > _DIAGNOSTICS_PERIOD:
+                self._say()
+        finally:
+            self._lock.release()
+
+    def _log_what_is_missing(self, silent: bool) -> None:
+        without_info = self._newest_info is None and monotonic() - self._started > SILENCE
+        for what in ['image'] * silent + ['camera_info'] * without_info:
+            self._log.warn_of_missing(what, self._topics[what])
+
+    # In the thread
+
+    def _work(self) -> None:
+        try:
+            while (received := self._queue.get()) is not None:
+                with self._turnstile:
+                    pass
+                with self._lock:
+                    if received.at > self._forgotten:
+                        self._process(received)
+        finally:
+            # Nobody may wait for room that no one will make.
+            self._queue.close()
+
+    def _process(self, received: _Received) -> None:
+        tracker = self._tracker
+        self._count_drops()
+        tracker.face_values = self._face_values()
+        self._take_info(received.info)
+        while self._speeds:
+            tracker.speed(self._speeds.popleft())
+        self._publish(tracker.image(received.image))
+        self._latencies.add(received.at)
+        self._log_trouble()
+        if self._wiring.wants_debug_image() and (picture := tracker.debug_image()):
+            self._publish([picture])
+
+    def _count_drops(self) -> None:
+        new = self._queue.dropped - self._counted_drops
+        if new:
+            self._counted_drops += new
+            counts = self._tracker.counts
+            self._tracker.count_dropped('queue_full', new)
+            self._log.warn('queue_full', f'{counts.dropped["queue_full"]} of {counts.received} '
+                           'images dropped: they come faster than they are worked on')
+
+    def _take_info(self, info: Any) -> None:
+        if info is not self._taken_info:
+            self._taken_info = info
+            self._publish(self._tracker.camera_info(info))
+            self._log_trouble()
+
+    def _face_values(self) -> dict[str, str]:
+        return {'frames lost on the way': str(self._lost),
+                'queue policy': self._tracker.config.ros.queue_policy,
+                **self._latencies.values()}
+
+    def _publish(self, outgoing: Sequence[Outgoing]) -> None:
+        if self._stopping or not outgoing:
+            return
+        if any(one.topic == '/diagnostics' for one in outgoing):
+            self._last_diagnostics = monotonic()
+        self._wiring.publish(outgoing)
+
+    def _say(self) -> None:
+        self._tracker.face_values = self._face_values()
+        self._publish([self._tracker.diagnostics(time_ns())])
+
+    def _log_trouble(self) -> None:
+        """Put into the log, now and then, what is wrong for as long as it is."""
+        tracker = self._tracker
+        if tracker.state in _SAID_ELSEWHERE or LEVELS[tracker.state] == 'OK':
+            return
+        summary = tracker.diagnosis().summary
+        self._log.warn(summary, f'{summary}: {tracker.problem}' if tracker.problem else summary)

@@ -1,0 +1,79 @@
+"""The optimisation of a pose graph, by GTSAM."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from djet_ros.core.types import Array
+from djet_ros.posegraph.graph import Edge, PoseGraph
+import gtsam
+import numpy as np
+
+# GTSAM has the rotation before the translation.
+_ORDER = [3, 4, 5, 0, 1, 2]
+
+# The first pose is held where it is.
+_HELD = 1e-6
+
+
+# Kinds of edges that are believed as their covariances say.
+_TRUSTED = ('odometry', 'unknown')
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The graph with optimised poses; trust: (E,) its edges' final weights, 0 to 1."""
+
+    graph: PoseGraph
+    trust: Array
+
+
+def optimise(graph: PoseGraph) -> Solution:
+    """
+    Find the poses that fit the edges best.
+
+    Links and loops may be wrong altogether and are under a robust kernel: Geman-McClure by
+    graduated non-convexity (Yang et al., RA-L 2020), which does not depend on how far the
+    odometry had drifted. DjetError names an edge whose covariance can't be inverted.
+    """
+    parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+    parameters.setLossType(gtsam.GncLossType.GM)
+    # The first factor holds the first pose.
+    parameters.setKnownInliers([0, *(number for number, edge in enumerate(graph.edges, 1)
+                                     if edge.kind in _TRUSTED)])
+    # While the kernel is still wide the costs stand still: that is not yet the end.
+    parameters.setRelativeCostTol(0.0)
+    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), initial_values(graph.poses), parameters)
+    poses = poses_of(optimizer.optimize(), len(graph.poses))
+    return Solution(replace(graph, poses=poses), np.asarray(optimizer.getWeights())[1:])
+
+
+def factor_graph(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:
+    """Factor graph of the edges, in their order, after one that holds the first pose."""
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(gtsam.PriorFactorPose3(
+        0, gtsam.Pose3(graph.poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
+    for edge in graph.edges:
+        factors.add(_factor(graph, edge))
+    return factors
+
+
+def _factor(graph: PoseGraph, edge: Edge) -> gtsam.BetweenFactorPose3:
+    information = graph.information(edge)[np.ix_(_ORDER, _ORDER)]
+    return gtsam.BetweenFactorPose3(
+        edge.source, edge.target, gtsam.Pose3(edge.motion),
+        gtsam.noiseModel.Gaussian.Information(information))
+
+
+def initial_values(poses: Sequence[Array] | Array) -> gtsam.Values:
+    """Give poses (4, 4) the keys 0, 1 and so on."""
+    values = gtsam.Values()
+    for key, pose in enumerate(poses):
+        values.insert(key, gtsam.Pose3(pose))
+    return values
+
+
+def poses_of(values: gtsam.Values, count: int) -> Array:
+    """Poses (N, 4, 4) of the keys 0 to N - 1."""
+    return np.array([values.atPose3(key).matrix() for key in range(count)])

@@ -1,0 +1,130 @@
+"""The images of keyframes: out of a recording, and where they are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from tempfile import TemporaryFile
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from djet_ros.config.sections import Config
+from djet_ros.core.types import Features
+from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.sources import Source
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A keyframe's image and its features."""
+
+    frame: Frame
+    features: Features
+
+
+class SeenFile(MutableMapping[int, Seen]):
+    """
+    Keyframes in a file without a name, so that thousands of them take no memory.
+
+    folder: where the file is made, None for the system's temporary one. It is gone when it is
+    closed or the process ends, however that ends. DjetError where the disk is full.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """Make the file."""
+        # What is no array is small, and stays in memory.
+        self._kept: dict[int, _Kept] = {}
+        self._features = [field.name for field in fields(Features)]
+        try:
+            self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by __exit__)
+        except OSError as error:
+            raise DjetError(f'no temporary file could be made in {folder}: '
+                            f'{error.strerror}') from error
+
+    def __setitem__(self, number: int, seen: Seen) -> None:
+        """Write a keyframe at the end of the file."""
+        frame = seen.frame
+        try:
+            offset = self._file.seek(0, 2)
+            for array in (frame.gray, frame.K,
+                          *(getattr(seen.features, name) for name in self._features)):
+                np.save(self._file, array, allow_pickle=False)
+        except OSError as error:
+            raise DjetError('the images of keyframes could not be written to a temporary file: '
+                            f'{error.strerror}; make room, or take fewer keyframes '
+                            '(--keyframe-distance)') from error
+        nothing = np.empty((0, 0), np.uint8)
+        self._kept[number] = _Kept(offset, replace(frame, gray=nothing))
+
+    def __getitem__(self, number: int) -> Seen:
+        """Read a keyframe."""
+        offset, frame = self._kept[number]
+        self._file.seek(offset)
+        gray, K, *features = (np.load(self._file, allow_pickle=False)
+                              for _ in range(2 + len(self._features)))
+        return Seen(replace(frame, gray=gray, K=K),
+                    Features(**dict(zip(self._features, features))))
+
+    def __contains__(self, number: object) -> bool:
+        """Tell whether there is such a keyframe, without reading it."""
+        return number in self._kept
+
+    def __delitem__(self, number: int) -> None:
+        """Forget a keyframe; the file keeps its place."""
+        del self._kept[number]
+
+    def __iter__(self) -> Iterator[int]:
+        """Give the numbers of all keyframes."""
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        """Count the keyframes."""
+        return len(self._kept)
+
+    def __enter__(self) -> Self:
+        """Give the file itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Close the file, which is its end."""
+        self._file.close()
+
+
+class _Kept(NamedTuple):
+    """Where the arrays of a keyframe begin, and the frame without its image."""
+
+    offset: int
+    frame: Frame
+
+
+def frames_at(source: Source, config: Config, stamps_ns: NDArray[np.int64]) -> Iterator[Frame]:
+    """
+    Yield the frames of some stamps (N,), in the order of recording, as the odometry had them.
+
+    DjetError where the recording does not hold them all.
+    """
+    rectified = means_rectified(config.odometry.rectified, source.image_topic)
+    wanted = iter(stamps_ns.tolist())
+    stamp = next(wanted, None)
+    camera: Camera | None = None
+    for message in source.messages({source.image_topic, source.info_topic}):
+        if message.topic == source.info_topic:
+            camera = Camera(message.message, rectified)
+        elif message.topic == source.image_topic and camera is not None \
+                and stamp_ns(message.message.header) == stamp:
+            gray = camera.undistort(gray_image(message.message))
+            yield Frame(gray, camera.K, stamp, message.message.header.frame_id)
+            stamp = next(wanted, None)
+        if stamp is None:
+            return
+    if stamp is not None:
+        raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
+                        'give the recording that was replayed')

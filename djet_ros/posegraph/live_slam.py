@@ -1,0 +1,250 @@
+"""
+Messages in, messages out: the SLAM beside a live odometry, without clock, thread or socket.
+
+Its poses come from the odometry, its loops from the images of keyframes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from dataclasses import replace
+from typing import Any
+
+from djet_ros.config.sections import Config
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.images import BadMessage, gray_image
+from djet_ros.odometry.messages import Messages, MessageType, OPTICAL_TO_BODY, stamp_ns
+from djet_ros.odometry.tracker import Outgoing
+from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.keyframes import without_common_length
+from djet_ros.posegraph.live_config import LiveSlamConfig
+from djet_ros.posegraph.live_map import LiveMap
+from djet_ros.posegraph.steps import Step, Steps
+import numpy as np
+
+_DIAGNOSTICS_PERIOD_NS = 10**9
+
+# Where nobody knows them, steps have this length.
+_UNIT = 1.0
+
+
+class LiveSlam:
+    """
+    Closes loops while the odometry goes on.
+
+    config: that of the odometry, as far as both share it (estimator, odometry.frame_convention,
+    odometry.rectified, odometry.scale_uncertainty); message_type gives the class for a type name;
+    image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
+
+    Outgoing topics: /tf (the odometry's frame in the map, for each frame that was tracked), path
+    (the optimised poses of the keyframes and of the newest frame), /diagnostics.
+    """
+
+    def __init__(self, config: Config, slam: LiveSlamConfig, message_type: MessageType,
+                 image_topic: str = '') -> None:
+        self.config, self.slam = config, slam
+        # What a face adds to each diagnostics message.
+        self.face_values: dict[str, str] = {}
+        self._messages = _Messages(message_type, config.odometry)
+        self._rectified = means_rectified(config.odometry.rectified, image_topic)
+        self._turn = np.eye(4)
+        if config.odometry.frame_convention == 'body':
+            self._turn[:3, :3] = OPTICAL_TO_BODY
+        self._info: Any = None
+        self._camera: Camera | None = None
+        self._images: OrderedDict[int, Any] = OrderedDict()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the map and everything that waits; the CameraInfo stays."""
+        self._images.clear()
+        self._begin()
+
+    def _begin(self) -> None:
+        self.map = LiveMap(self.config.estimator, self.slam)
+        # Why the newest message could not be used, for a log; None when it could.
+        self.problem: DjetError | None = None
+        self.rejected: Counter[str] = Counter()
+        self._steps = Steps(self.config.odometry.frame_convention)
+        self._last: Step | None = None
+        self._path_stamp = self._said_stamp = -np.inf
+        self._said = ''
+
+    # What comes in
+
+    def camera_info(self, message: Any) -> None:
+        """Take a CameraInfo; it holds for the images that become keyframes from now on."""
+        if self._info is None or not same_camera(self._info, message):
+            self._info = message
+            try:
+                self._camera, self.problem = Camera(message, self._rectified), None
+            except BadMessage as problem:
+                self._camera = None
+                self._reject('camera_info', problem)
+
+    def image(self, message: Any) -> None:
+        """Take an Image or a CompressedImage; it waits for the odometry of its stamp."""
+        stamp = stamp_ns(message.header)
+        self._images[stamp] = message
+        self._images.move_to_end(stamp)
+        if len(self._images) > self.slam.image_buffer:
+            self._images.popitem(last=False)
+
+    def relative_pose(self, message: Any) -> list[Outgoing]:
+        """Take a PoseWithCovarianceStamped of the current camera in the previous one."""
+        try:
+            return self._take(self._steps.relative_pose(message))
+        except DjetError as problem:
+            self._reject('relative_pose_cov', problem)
+            return []
+
+    def odometry(self, message: Any) -> list[Outgoing]:
+        """Take an Odometry; a step back in time begins everything anew."""
+        if self._steps.goes_back(message):
+            # Its image has come already.
+            self._begin()
+        try:
+            return self._take(self._steps.odometry(message))
+        except DjetError as problem:
+            self._reject('odometry', problem)
+            return []
+
+    # What comes of it
+
+    def work(self, *, at_once: bool = False) -> list[Outgoing]:
+        """
+        Do one piece of what takes long: seek a keyframe's loops, and optimise if it is time.
+
+        To be called when nothing else waits. at_once: also where it is not yet time.
+        """
+        if not self.map.work(at_once=at_once) or self._last is None:
+            return []
+        return [self._path(self._last)]
+
+    @property
+    def idle(self) -> bool:
+        """Whether no keyframe waits for its loops."""
+        return not self.map.waiting
+
+    @property
+    def state(self) -> tuple[str, str]:
+        """Level (OK, WARN, ERROR) and words for what it is doing."""
+        if self.problem is not None:
+            return 'ERROR', 'message rejected'
+        if self._last is None:
+            return 'WARN', 'waiting for odometry'
+        if not self.map.keyframes:
+            return 'WARN', ('waiting for camera_info' if self._info is None
+                            else 'waiting for the images of the odometry')
+        return 'OK', 'mapping'
+
+    def diagnostics(self, stamp: int) -> Outgoing:
+        """Give the diagnostics message of this moment, in nanoseconds."""
+        graph, (level, summary) = self.map, self.state
+        values = {
+            'state': summary,
+            'keyframes': str(len(graph.keyframes)),
+            'keyframes forgotten': str(graph.first),
+            'keyframes waiting': str(graph.waiting),
+            'keyframes without image': str(graph.imageless),
+            'loops': str(graph.count('loop')),
+            'loops not trusted': str(graph.distrusted),
+            'links': str(graph.count('link')),
+            'unknown motions': str(graph.count('unknown')),
+            'optimisations': str(graph.optimisations),
+            'relative poses missing': str(self._steps.missing),
+            **{f'messages rejected: {topic}': str(count)
+               for topic, count in sorted(self.rejected.items())},
+            **self.face_values}
+        return Outgoing('/diagnostics', self._messages.diagnostics(
+            stamp, level, f'{summary}: {self.problem}' if self.problem else summary, values))
+
+    def _take(self, steps: list[Step]) -> list[Outgoing]:
+        outgoing = []
+        for step in steps:
+            self.problem = None
+            if step.edge is not None:
+                step = replace(step, edge=self._with_own_length(step.edge))
+            self.map.extend(step, self._frame)
+            self._last = step
+            if self.slam.publish_tf and self.map.keyframes:
+                outgoing.append(Outgoing('/tf', self._messages.frame(
+                    step.stamp_ns, self.slam.map_frame, step.odom_frame,
+                    self._turned(self.map.correction))))
+            if self.map.keyframes and \
+                    step.stamp_ns - self._path_stamp >= self.slam.path_period * 1e9:
+                outgoing.append(self._path(step))
+            outgoing += self._diagnostics_if_due(step.stamp_ns)
+        return outgoing
+
+    def _with_own_length(self, edge: Edge) -> Edge:
+        """
+        Give an edge whose length is as sure as it is among those of the map.
+
+        Without what is common to all known lengths, but no more than the edge has of it. A length
+        that nobody knows is in the odometry's units, which the map shares: were it free within
+        the map, loops of a few keyframes could turn motions round.
+        """
+        way = float(np.linalg.norm(edge.motion[:3, 3]))
+        if edge.kind == 'unknown':
+            return edge
+        if not edge.scale_known:
+            covariance = edge.covariance.copy()
+            covariance[:3, :3] = _clipped(covariance[:3, :3], (way or _UNIT)**2)
+            return replace(edge, covariance=covariance)
+        if not way:
+            return edge
+        along = edge.motion[:3, 3] / way
+        variance = float(along @ edge.covariance[:3, :3] @ along)
+        uncertainty = min(np.sqrt(variance) / way, self.config.odometry.scale_uncertainty)
+        graph = PoseGraph(np.zeros(2, np.int64), np.array([np.eye(4), edge.motion]), (edge,))
+        return without_common_length(graph, uncertainty, self.slam.length_noise).edges[0]
+
+    def _frame(self, stamp: int) -> Frame | None:
+        """Frame of the image with a stamp, which waits no longer, nor do those before it."""
+        message = self._images.pop(stamp, None)
+        if message is None or self._camera is None:
+            return None
+        try:
+            return Frame(self._camera.undistort(gray_image(message)), self._camera.K, stamp,
+                         message.header.frame_id)
+        except BadMessage as problem:
+            self._reject('image', problem)
+            return None
+
+    def _path(self, last: Step) -> Outgoing:
+        self._path_stamp = last.stamp_ns
+        poses = [(one.stamp_ns, one.pose) for one in self.map.keyframes]
+        if poses[-1][0] != last.stamp_ns:
+            poses.append((last.stamp_ns, self.map.correction @ last.pose))
+        return Outgoing('path', self._messages.path([
+            self._messages.pose_in(stamp, self.slam.map_frame, self._turned(pose))
+            for stamp, pose in poses]))
+
+    def _turned(self, pose: Array) -> Array:
+        return np.asarray(self._turn @ pose @ self._turn.T)
+
+    def _reject(self, topic: str, problem: DjetError) -> None:
+        self.rejected[topic] += 1
+        self.problem = problem
+
+    def _diagnostics_if_due(self, stamp: int) -> list[Outgoing]:
+        if self._said == self.state[1] and stamp - self._said_stamp < _DIAGNOSTICS_PERIOD_NS:
+            return []
+        self._said, self._said_stamp = self.state[1], stamp
+        return [self.diagnostics(stamp)]
+
+
+def _clipped(covariance: Array, variance: float) -> Array:
+    """Give a covariance with no direction less sure than a variance."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.minimum(values, variance) @ axes.T)
+
+
+class _Messages(Messages):
+    """Messages of the map."""
+
+    component = 'djet_ros: pose graph'

@@ -1,0 +1,199 @@
+"""Edges between keyframes that are no neighbours: links over a few, and loops."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator, MutableMapping
+from dataclasses import replace
+
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import rays, unit
+from djet_ros.core.hamming import smooth
+from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.messages import LEAST_COVARIANCE
+from djet_ros.odometry.scale import Length, unknown
+from djet_ros.odometry.uncertainty import motion_covariance
+from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
+from djet_ros.posegraph.config import SlamConfig
+from djet_ros.posegraph.graph import Edge
+from djet_ros.posegraph.images import Seen
+from djet_ros.posegraph.places import PlaceIndex
+import numpy as np
+from numpy.typing import NDArray
+
+# A place is seen again from beside, from nearer or from farther off: its features are sought in
+# a wider circle than those of the next frame.
+_SEARCH_RADIUS = 0.4
+
+# Points that two pairs of views must share, for the one to tell the other its length.
+_LEAST_SHARED = 20
+
+# Points in a cell of this side in pixels err together; and what correlation over longer distances
+# adds to the variance of a length: both as for the pose.
+_CELL, _INFLATION = 32, 4.0
+
+# Parallax in rad below which a depth is noise (about a pixel of a car's camera).
+_LEAST_PARALLAX = 1.5e-3
+
+
+class EdgeFinder:
+    """
+    Estimates edges between keyframes from their images, which are kept until they are forgotten.
+
+    Keyframes have the numbers in which they come: 0, 1 and so on. seen: where their images and
+    features are kept; in memory unless said otherwise.
+    """
+
+    def __init__(self, estimator: EstimatorConfig, config: SlamConfig,
+                 seen: MutableMapping[int, Seen] | None = None) -> None:
+        self._config = config
+        self._near = TwoViewEstimator(estimator)
+        self._wide = TwoViewEstimator(replace(
+            estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
+        self._seen: MutableMapping[int, Seen] = {} if seen is None else seen
+        self._stamps: list[int] = []
+        self._places = PlaceIndex()
+        # The neighbour before each keyframe: the motion to it has a length.
+        self._before: dict[int, Edge] = {}
+        self._first = 0
+
+    def add(self, frame: Frame, before: Edge | None = None) -> None:
+        """Take the next keyframe, later than all others, and the edge from its neighbour."""
+        number = self._first + len(self._stamps)
+        features = self._near.features(frame.gray)
+        self._seen[number] = Seen(frame, features)
+        self._stamps.append(frame.stamp_ns)
+        self._places.add(features)
+        if before is not None and before.kind == 'odometry':
+            self._before[number] = before
+
+    def forget(self, first: int) -> None:
+        """Forget the keyframes before one; nothing is found between them and others any more."""
+        for number in range(self._first, first):
+            self._seen.pop(number, None)
+            self._before.pop(number, None)
+        del self._stamps[:first - self._first]
+        self._first = first
+        self._places.forget(first)
+
+    def links(self, current: int) -> Iterator[Edge]:
+        """
+        Link a keyframe to the last few before it, but for its neighbour, by direct estimates.
+
+        Their lengths are taken as unknown: the odometry's are in the graph already.
+        """
+        motion, previous = np.eye(4), current
+        for step in range(self._config.links):
+            before = self._before.get(previous)
+            if before is None or before.source not in self._seen:
+                return
+            motion, previous = before.motion @ motion, before.source
+            if step:
+                yield from self._link(current, previous, float(np.linalg.norm(motion[:3, 3])))
+
+    def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
+        relative = self._near.estimate(self._view(previous), self._view(current))
+        if relative.status is Status.OK and self._is_sure(relative):
+            yield _edge(previous, current, relative, unknown(guess), 'link')
+
+    def loops(self, current: int) -> Iterator[Edge]:
+        """Propose keyframes that look like this one, and give those that geometry bears out."""
+        config, here = self._config, current - self._first
+        latest = self._stamps[here] - config.loop_gap * 1e9
+        before = self._first + bisect_left(self._stamps, latest, hi=here)
+        votes = self._places.votes(self._seen[current].features, before)
+        votes[:self._first] = 0
+        best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
+        for place in best[votes[best] >= config.loop_votes].tolist():
+            yield from self._loop(current, place)
+
+    def _loop(self, current: int, place: int) -> Iterator[Edge]:
+        view, seen = self._view(current), self._view(place)
+        # The estimator takes both views to be of one camera.
+        if not np.array_equal(view.K, seen.K):
+            return
+        relative = self._wide.estimate(view, seen)
+        if relative.status in TRACKED and self._is_sure(relative):
+            yield _edge(current, place, relative, self._length(current, view, relative), 'loop')
+
+    def _length(self, current: int, view: View, relative: RelativePose) -> Length:
+        """Length of a loop's translation, by the points that the last step of the way saw too."""
+        step = self._before.get(current)
+        guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
+        if step is None or step.source not in self._seen or not step.scale_known or not guess:
+            return unknown(guess)
+        if relative.status is Status.NO_PARALLAX:
+            # The same place again: nearer than any step, in whatever direction.
+            return Length(guess, guess, True)
+        back = self._near.estimate(view, self._view(step.source))
+        if back.status is not Status.OK:
+            return unknown(guess)
+        share = np.sqrt(_variance_along(step)) / guess
+        return transferred_length(back, relative, Length(guess, guess * share, True), view.K)
+
+    def _is_sure(self, relative: RelativePose) -> bool:
+        inliers = int(relative.inliers.sum())
+        return (inliers >= self._config.loop_inliers
+                and inliers >= self._config.loop_share * len(relative.x))
+
+    def _view(self, keyframe: int) -> View:
+        seen = self._seen[keyframe]
+        frame = seen.frame
+        # A copy of the features: what they cache of themselves is large.
+        return View(frame.gray, frame.K, replace(seen.features), smooth(frame.gray))
+
+
+def transferred_length(step: RelativePose, other: RelativePose, length: Length,
+                       K: Array) -> Length:
+    """
+    Length of another motion from the same first view, from the length of a step.
+
+    A point that both pairs saw has one depth, so that its inverse depths in units of the two
+    translations are as the lengths of these. Unknown where too few points are shared.
+    """
+    _, here, there = np.intersect1d(_pixels(step), _pixels(other), return_indices=True)
+    depths, parallax = _inverse_depths(step, K)
+    others, _ = _inverse_depths(other, K)
+    told = parallax[here] > _LEAST_PARALLAX
+    ratios = others[there][told] / depths[here][told]
+    ratios = ratios[np.isfinite(ratios)]
+    if len(ratios) < _LEAST_SHARED:
+        return unknown(length.value)
+    ratio = float(np.median(ratios))
+    if ratio <= 0:
+        return unknown(length.value)
+    # Standard deviation of a median, if places apart err independently: as for the pose.
+    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
+    places = len(np.unique(step.x[step.inliers][here][told] // _CELL, axis=0))
+    sigma = 1.2533 * spread * np.sqrt(_INFLATION / places)
+    return Length(length.value * ratio,
+                  float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
+
+
+def _pixels(relative: RelativePose) -> NDArray[np.int64]:
+    """Numbers (M,) for the inliers, equal where the pixels in the first view are."""
+    columns, rows = np.rint(4 * relative.x[relative.inliers]).astype(np.int64).T
+    return np.asarray(columns + (rows << 20))
+
+
+def _inverse_depths(relative: RelativePose, K: Array) -> tuple[Array, Array]:
+    """Inverse depths in units of the translation, and parallaxes in rad, (M,) of the inliers."""
+    m = rays(K, relative.x[relative.inliers]) @ relative.R.T
+    y = rays(K, relative.y_opt[relative.inliers])
+    # y x (m + rho t) = 0, by least squares: linear, so that noise about zero stays about zero
+    shift, lever = np.cross(y, m), np.cross(y, relative.t)
+    inverse = -(shift * lever).sum(1) / np.maximum((lever**2).sum(1), 1e-12)
+    return inverse, np.linalg.norm(shift, axis=1) / (y**2).sum(1)
+
+
+def _edge(source: int, target: int, relative: RelativePose, length: Length, kind: str) -> Edge:
+    return Edge(source, target, camera_motion(relative, length),
+                motion_covariance(relative, length) + LEAST_COVARIANCE, kind, length.known)
+
+
+def _variance_along(edge: Edge) -> float:
+    """Variance of the length of an edge's motion."""
+    direction = unit(edge.motion[:3, 3])
+    return float(direction @ edge.covariance[:3, :3] @ direction)

@@ -1,0 +1,279 @@
+"""
+Reading recordings: rosbag2 folders and files, and ROS 1 bags, as one stream of messages.
+
+``Bag`` gives any topics; ``BagSource`` finds the camera and the ground truth in a bag.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, ExitStack
+from pathlib import Path, PurePosixPath
+import re
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from djet_ros.config.safe_files import read_yaml
+from djet_ros.errors import DjetError, one_line
+from djet_ros.recordings.decoding import Decoder, decoder
+from djet_ros.recordings.storages import BrokenFile, Connection, open_storage, Storage
+from djet_ros.recordings.storages.compression import decompress_file, ZSTD_MAGIC
+
+IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)
+POSE_TYPES = ('geometry_msgs/msg/PoseStamped', 'nav_msgs/msg/Odometry',
+              'geometry_msgs/msg/TransformStamped')
+
+STORAGE_NAMES = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
+
+
+class Topic(NamedTuple):
+    """A topic of a bag: its name, its type and how many messages it has."""
+
+    name: str
+    msgtype: str
+    message_count: int
+
+
+class BagMessage(NamedTuple):
+    """One message: its topic, the time in ns at which it was recorded, and the Jazzy object."""
+
+    topic: str
+    stamp_ns: int
+    message: Any
+
+
+class Bag:
+    """
+    A recording, read as a stream: only a few messages are in memory at any time.
+
+    Takes a rosbag2 folder (with or without metadata.yaml), one of its files (.mcap, .db3, also
+    .zstd), or a ROS 1 bag. Raises DjetError where that is not what the path holds. Close it, or
+    use it in a ``with`` statement: a bag compressed file by file is unpacked for as long.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Find out the topics."""
+        self.path = path
+        self._stack = ExitStack()
+        try:
+            with _blaming(path):
+                files = _files(path)
+            self._storages = [(file, self._opened(file)) for file in files]
+        except BaseException:
+            self.close()
+            raise
+        counts: Counter[tuple[str, str]] = Counter()
+        for _, storage in self._storages:
+            for connection in storage.connections:
+                counts[connection.topic, connection.msgtype] += connection.message_count
+        self.topics = [Topic(*key, count) for key, count in sorted(counts.items())]
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """
+        Yield the messages of some topics (by default of all) in the order of recording.
+
+        Where the bag is damaged, everything before the damage comes first, then DjetError.
+        """
+        for file, storage in self._storages:
+            chosen = {connection.number: connection for connection in storage.connections
+                      if topics is None or connection.topic in topics}
+            with _blaming(file):
+                yield from _decoded(storage, chosen)
+
+    def close(self) -> None:
+        """Remove what was unpacked."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        """Give the bag itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Remove what was unpacked."""
+        self.close()
+
+    def _opened(self, file: Path) -> Storage:
+        with _blaming(file):
+            with file.open('rb') as stream:
+                packed = stream.read(len(ZSTD_MAGIC)) == ZSTD_MAGIC
+            if packed:
+                folder = self._stack.enter_context(TemporaryDirectory(prefix='djet-'))
+                return open_storage(decompress_file(file, Path(folder)))
+            return open_storage(file)
+
+
+class BagSource:
+    """
+    The camera in a bag: its images, their CameraInfo, and the ground truth where there is one.
+
+    Iterating yields BagMessage in the order of recording; which is which tell the attributes
+    ``image_topic``, ``info_topic`` and ``ground_truth_topic`` (None where there is none).
+    ``len()`` is the number of images. Topics that aren't named are found; DjetError lists the
+    choices where that is not possible.
+    """
+
+    def __init__(self, path: Path, image_topic: str | None = None,
+                 info_topic: str | None = None, ground_truth_topic: str | None = None) -> None:
+        """Open the bag and choose the topics."""
+        self.bag = Bag(path)
+        try:
+            self._topics = [topic for topic in self.bag.topics if topic.message_count]
+            if not self._topics:
+                # If a break is the reason, this tells it.
+                next(self.bag.messages(), None)
+                raise DjetError(f'{path} holds no message; record it again')
+            image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
+            self.image_topic = image.name
+            self.info_topic = self._info_topic(info_topic)
+            self.ground_truth_topic = self._ground_truth_topic(ground_truth_topic)
+            self._count = image.message_count
+        except BaseException:
+            self.bag.close()
+            raise
+
+    def __len__(self) -> int:
+        """Count the images (in a damaged bag, those that can be counted)."""
+        return self._count
+
+    def __iter__(self) -> Iterator[BagMessage]:
+        """Yield the messages of the chosen topics."""
+        topics = {self.image_topic, self.info_topic}
+        if self.ground_truth_topic is not None:
+            topics.add(self.ground_truth_topic)
+        return self.bag.messages(topics)
+
+    def close(self) -> None:
+        """Close the bag."""
+        self.bag.close()
+
+    def __enter__(self) -> Self:
+        """Give the source itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Close the bag."""
+        self.close()
+
+    def _fitting(self, types: Collection[str]) -> list[Topic]:
+        return [topic for topic in self._topics if topic.msgtype in types]
+
+    def _choose(self, what: str, option: str, types: Collection[str], name: str | None) -> Topic:
+        """Topic of some types by its name or, without one, because there is only one."""
+        fitting = self._fitting(types)
+        chosen = [topic for topic in fitting if name in (None, topic.name)]
+        if len(chosen) == 1:
+            return chosen[0]
+        if not fitting:
+            others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
+            raise DjetError(f'{self.bag.path} has no {what} topic, but {one_line(others)}; '
+                            'record it too')
+        choices = one_line(', '.join(
+            f'{topic.name} ({topic.message_count})' for topic in fitting))
+        if name is not None:
+            raise DjetError(f"{self.bag.path} has no {what} topic '{name}'; choose from {choices}")
+        raise DjetError(f'{self.bag.path} has {len(chosen)} {what} topics: {choices}; '
+                        f'choose one with {option}')
+
+    def _info_topic(self, name: str | None) -> str:
+        """Topic beside the images (image_transport's rule), or the only one of an only camera."""
+        if name is None:
+            have = self._fitting(CAMERA_INFO_TYPES)
+            # .../image_raw/compressed belongs to .../camera_info, as .../image_raw does.
+            for folder in list(PurePosixPath(self.image_topic).parents)[:2]:
+                if (beside := str(folder / 'camera_info')) in {topic.name for topic in have}:
+                    return beside
+            if len(have) == 1 and len(self._fitting(IMAGE_TYPES)) > 1:
+                raise DjetError(f'{self.bag.path} has no CameraInfo beside {self.image_topic}; '
+                                f'if {have[0].name} is meant, say so with --info-topic')
+        return self._choose('CameraInfo', '--info-topic', CAMERA_INFO_TYPES, name).name
+
+    def _ground_truth_topic(self, name: str | None) -> str | None:
+        """Topic given, or the only one that calls itself ground truth."""
+        if name is not None:
+            return self._choose('pose', '--ground-truth-topic', POSE_TYPES, name).name
+        fitting = [topic.name for topic in self._fitting(POSE_TYPES)
+                   if re.search('ground_?truth', topic.name)]
+        return fitting[0] if len(fitting) == 1 else None
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a path looks like a recording, by its name and not by its content."""
+    if path.is_dir():
+        return (path / 'metadata.yaml').exists() or bool(_storage_files(path))
+    return bool(STORAGE_NAMES.fullmatch(path.name)) or path.name.endswith(('.bag', '.bag.active'))
+
+
+@contextmanager
+def _blaming(path: Path) -> Iterator[None]:
+    """Name the file in what the user is told."""
+    try:
+        yield
+    except BrokenFile as error:
+        raise DjetError(f'{path}: {one_line(error)}') from error
+    except OSError as error:
+        raise DjetError(f'{path} could not be read: {error.strerror or error}') from error
+
+
+def _decoded(storage: Storage, chosen: dict[int, Connection]) -> Iterator[BagMessage]:
+    decoders: dict[int, Decoder] = {}
+    for number, stamp, data in storage.messages(chosen):
+        topic = chosen[number].topic
+        try:
+            if number not in decoders:
+                decoders[number] = decoder(chosen[number])
+            message = decoders[number](data)
+        except BrokenFile as error:
+            raise BrokenFile(f'the message on {topic} at {stamp} ns: {error}') from error
+        yield BagMessage(topic, stamp, message)
+
+
+def _files(path: Path) -> list[Path]:
+    """Storage files of a bag in the order of recording."""
+    if path.is_dir():
+        return _listed(path)
+    if not path.is_file():
+        state = 'is no regular file' if path.exists() else 'does not exist'
+        raise DjetError(f'{path} {state}; give a bag')
+    return [path]
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    """Storage files of a folder in the order of recording: name_2 comes before name_10."""
+    files = [path for path in folder.iterdir() if STORAGE_NAMES.fullmatch(path.name)]
+    return sorted(files, key=lambda path: [
+        (int(word), '') if word.isdecimal() else (0, word)
+        for word in re.split(r'(\d+)', path.name)])
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Storage files of a rosbag2 folder as its metadata.yaml lists them."""
+    metadata = folder / 'metadata.yaml'
+    if not metadata.exists() or not metadata.stat().st_size:
+        # It is written last: a recorder that was killed, or found the disk full, leaves the
+        # storage files only.
+        if files := _storage_files(folder):
+            return files
+        raise DjetError(f'{folder} is no bag: it has neither metadata.yaml nor .mcap or .db3 '
+                        'files')
+    try:
+        names = read_yaml(metadata)['rosbag2_bagfile_information']['relative_file_paths']
+        paths = [PurePosixPath(name) for name in names]
+    except (KeyError, TypeError) as error:
+        raise DjetError(f"{metadata} has no list 'relative_file_paths' of file names; remove it "
+                        'to read the storage files themselves') from error
+    for path in paths:
+        listed = f"{metadata} lists '{one_line(path)}'"
+        if path.is_absolute() or '..' in path.parts:
+            raise DjetError(f'{listed}, which lies outside the bag; correct the list or get the '
+                            'bag from somebody you trust')
+        # Before version 4 the folder's own name came first.
+        if not (folder / path.name).is_file():
+            raise DjetError(f'{listed}, which does not exist; copy it there')
+    if not paths:
+        raise DjetError(f'{metadata} lists no file; remove it to read the storage files')
+    return [folder / path.name for path in paths]

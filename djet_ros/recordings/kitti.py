@@ -1,0 +1,148 @@
+"""Sequences in the layout of the KITTI odometry benchmark (Geiger et al., CVPR 2012)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.recordings.sequence import from_first, ImageFiles
+from djet_ros.recordings.text import (
+    check_positions,
+    increasing,
+    lines,
+    nanoseconds,
+    number_rows,
+    numbers,
+    stamped_rows,
+)
+import numpy as np
+from numpy.typing import NDArray
+
+# times.txt counts from 0, but in ROS a stamp of 0 means "no time" and a look back by some
+# seconds must not fall below it. A round offset is easily taken off again, and still leaves
+# sub-nanosecond resolution in a double.
+STAMP_OFFSET_NS = 1000 * 10**9
+
+
+class KittiSequence:
+    """
+    A folder ``.../sequences/NN`` with ``image_0/*.png``, ``calib.txt`` and ``times.txt``.
+
+    A FrameSequence of the left gray camera (already rectified). Stamps are those of times.txt
+    plus STAMP_OFFSET_NS. Ground truth is taken from ``poses`` or, where it exists, from
+    ``../../poses/NN.txt``, and expressed in the first camera of the range start <= i < end.
+    Raises DjetError where the folder does not keep to the layout.
+    """
+
+    def __init__(self, folder: Path, poses: Path | None = None, start: int = 0,
+                 end: int | None = None) -> None:
+        """Read everything but the images, and check that it belongs together."""
+        self.folder = folder.resolve()
+        self.name = f'KITTI {self.folder.name}'
+        paths = _image_paths(self.folder)
+        chosen = _frame_range(len(paths), start, end, self.folder)
+        self.K = read_camera(self.folder / 'calib.txt')
+        self.stamps_ns = _stamps(self.folder / 'times.txt', len(paths))[chosen]
+        self._images = ImageFiles(paths[chosen])
+        self.frame_paths = self._images.paths
+        self.size = self._images.size
+        self.poses: Array | None = None
+        if (file := _poses_file(self.folder, poses)) is not None:
+            self.poses = from_first(_poses(file, len(paths))[chosen])
+
+    def __len__(self) -> int:
+        """Count the frames in the chosen range."""
+        return len(self.frame_paths)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Gray pixels (H, W) of a frame of the chosen range."""
+        return self._images.gray(index)
+
+
+def read_camera(path: Path) -> Array:
+    """Camera matrix K (3, 3) from the row P0 of a calib.txt; DjetError where it makes none."""
+    rows = [(number, text.partition(':')[2]) for number, text in lines(path)
+            if text.partition(':')[0].strip() == 'P0']
+    if not rows:
+        raise DjetError(f"{path} has no line 'P0:'; it must give the 3x4 projection of camera 0")
+    number, row = rows[0]
+    try:
+        values = numbers(row)
+    except ValueError as error:
+        raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
+    if len(values) != 12:
+        raise DjetError(f'{path} line {number}: P0 has {len(values)} numbers, 12 belong there')
+    P = np.array(values).reshape(3, 4)
+    if min(P[0, 0], P[1, 1]) <= 0 or P[2].tolist() != [0, 0, 1, 0] or P[1, 0] != 0:
+        raise DjetError(f'{path} line {number}: P0 is no projection of a rectified camera '
+                        f'(focal lengths {P[0, 0]:g} and {P[1, 1]:g}, last row '
+                        f'{" ".join(f"{v:g}" for v in P[2])})')
+    return P[:, :3].copy()
+
+
+def read_poses(path: Path) -> Array:
+    """Poses (N, 4, 4) of a KITTI pose file; DjetError names the first line that is no pose."""
+    rows = number_rows(path, 12)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    check_rigid(poses, path)
+    return poses
+
+
+def check_rigid(poses: Array, path: Path) -> None:
+    """Raise DjetError that names the file and the first of poses (N, 4, 4) that is no motion."""
+    check_positions(poses[:, :3, 3], path)
+    # Squares of anything larger would not be finite, and compare as nothing does.
+    R = np.clip(np.nan_to_num(poses[:, :3, :3], nan=9.0), -9.0, 9.0)
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    wrong = np.flatnonzero((error > 1e-3) | (np.linalg.det(R) < 0)
+                           | (poses[:, 3] != (0, 0, 0, 1)).any(axis=1))
+    if wrong.size:
+        raise DjetError(f'{path}: pose {wrong[0]} is no rigid motion (its rotation part is off '
+                        f'by {error[wrong[0]]:.2g}); is it a file of poses?')
+
+
+def _image_paths(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        state = 'is a file' if folder.exists() else 'does not exist'
+        raise DjetError(f'{folder} {state}; give a KITTI sequence folder such as sequences/00')
+    paths = sorted((folder / 'image_0').glob('*.png'))
+    if not paths:
+        inner = sorted(path.parent.relative_to(folder) for depth in ('*', 'sequences/*')
+                       for path in folder.glob(f'{depth}/image_0'))
+        hint = (f'it holds {", ".join(map(str, inner[:8]))}: give one of these' if inner else
+                'give a KITTI sequence folder such as sequences/00')
+        raise DjetError(f'{folder} has no images image_0/*.png; {hint}')
+    return paths
+
+
+def _frame_range(count: int, start: int, end: int | None, folder: Path) -> slice:
+    stop = count if end is None else end
+    if not 0 <= start < stop <= count:
+        raise DjetError(f'frames {start} to {stop} were asked for, {folder} has 0 to {count}; '
+                        'start must lie below end (end itself is left out)')
+    return slice(start, stop)
+
+
+def _stamps(path: Path, count: int) -> NDArray[np.int64]:
+    stamps, _ = stamped_rows(path, 1, nanoseconds)
+    _check_length(path, len(stamps), count)
+    return increasing(stamps, path) + STAMP_OFFSET_NS
+
+
+def _poses_file(folder: Path, given: Path | None) -> Path | None:
+    beside = folder.parent.parent / 'poses' / f'{folder.name}.txt'
+    return given if given is not None else beside if beside.exists() else None
+
+
+def _poses(path: Path, count: int) -> Array:
+    poses = read_poses(path)
+    _check_length(path, len(poses), count)
+    return poses
+
+
+def _check_length(path: Path, have: int, count: int) -> None:
+    if have != count:
+        raise DjetError(f'{path} has {have} lines for {count} images in image_0; '
+                        'there must be one for each')

@@ -1,0 +1,135 @@
+"""rosbag2's sqlite3 storage (.db3), in the schemas of all ROS 2 distributions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import closing
+from pathlib import Path
+import sqlite3
+import struct
+from typing import Any, TypeAlias
+from urllib.parse import quote
+
+from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE, ros2_name
+
+MAGIC = b'SQLite format 3\x00'
+
+Message: TypeAlias = tuple[int, int, memoryview]
+
+
+class SqliteFile:
+    """One rosbag2 database."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the topics; BrokenFile where the file is no rosbag2 database."""
+        self.path = path
+        with closing(_connect(path)) as database:
+            try:
+                self.connections = self._read_topics(database)
+            except sqlite3.Error as error:
+                raise BrokenFile(str(error)) from error
+
+    def _read_topics(self, database: sqlite3.Connection) -> list[Connection]:
+        tables = {name for name, in database.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if missing := {'topics', 'messages'} - tables:
+            raise BrokenFile(f"it has no table '{min(missing)}': it was cut short, or not written "
+                             'by rosbag2')
+        # Databases older than ROS 2 Iron hold no definitions.
+        definitions = dict(database.execute(
+            'SELECT topic_type, encoded_message_definition FROM message_definitions '
+            "WHERE encoding = 'ros2msg'")) if 'message_definitions' in tables else {}
+        counts = _count(database)
+        rows = database.execute('SELECT id, name, type, serialization_format FROM topics '
+                                'ORDER BY id').fetchall()
+        for row in rows:
+            if not isinstance(row[0], int) or not all(isinstance(word, str) for word in row[1:]):
+                raise BrokenFile(f"its table 'topics' holds the row {row!r:.80}")
+        return [Connection(number, topic, ros2_name(msgtype), encoding,
+                           str(definitions.get(msgtype, '')), counts.get(number, 0))
+                for number, topic, msgtype, encoding in rows]
+
+    def messages(self, wanted: Collection[int]) -> Iterator[Message]:
+        """
+        Yield (connection number, stamp in ns, serialised message) in the order of stamps.
+
+        After the last message before a break in the file, raises BrokenFile.
+        """
+        messages = self._in_order(wanted)
+        return _but_last_before_break(messages) if _ends_within_page(self.path) else messages
+
+    def _in_order(self, wanted: Collection[int]) -> Iterator[Message]:
+        query = ('SELECT topic_id, timestamp, data FROM messages '
+                 f'WHERE topic_id IN ({", ".join("?" * len(wanted))}) ORDER BY ')
+        delivered = False
+        with closing(_connect(self.path)) as database:
+            # A break can take the index by stamps and leave the messages: then as recorded.
+            for order in ('timestamp, id', 'id'):
+                try:
+                    for row in database.execute(query + order, tuple(wanted)):
+                        yield _checked(row)
+                        delivered = True
+                    return
+                except sqlite3.Error as error:
+                    if delivered or order == 'id':
+                        raise BrokenFile(f'{error}; everything before that was read') from error
+
+
+def _ends_within_page(path: Path) -> bool:
+    with path.open('rb') as file:
+        size, = struct.unpack_from('>H', file.read(18), 16)
+    # The format writes 65536 as 1.
+    return path.stat().st_size % (65536 if size == 1 else max(size, 1)) != 0
+
+
+def _but_last_before_break(messages: Iterator[Message]) -> Iterator[Message]:
+    """Leave out the message that a break lies in: sqlite fills a page cut in two with zeros."""
+    held = next(messages, None)
+    for message in messages:
+        if held is not None:
+            yield held
+        held = message
+    if held is not None:
+        yield held
+
+
+def _checked(row: tuple[Any, Any, Any]) -> Message:
+    number, stamp, data = row
+    if not isinstance(stamp, int) or not isinstance(data, bytes):
+        raise BrokenFile(f"its table 'messages' holds the stamp {stamp!r:.40} with the data "
+                         f'{data!r:.40}')
+    return number, stamp, memoryview(data)
+
+
+def _count(database: sqlite3.Connection) -> dict[int, int]:
+    """Messages per topic id; in a damaged file 1 each, as what is left can't be counted."""
+    try:
+        return dict(database.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
+    except sqlite3.DatabaseError:
+        return dict.fromkeys((number for number, in database.execute('SELECT id FROM topics')), 1)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open a database read-only; BrokenFile where it can't be."""
+    try:
+        try:
+            return _opened(path, 'mode=ro')
+        except sqlite3.OperationalError:
+            # A recorder that was killed leaves a journal, which a reader must not roll back.
+            return _opened(path, 'immutable=1')
+    except sqlite3.Error as error:
+        raise BrokenFile(str(error)) from error
+
+
+def _opened(path: Path, mode: str) -> sqlite3.Connection:
+    database = sqlite3.connect(f'file:{quote(str(path.resolve()))}?{mode}', uri=True)
+    try:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_PIECE)
+        database.execute('PRAGMA trusted_schema = OFF')
+        # Lets a file that was cut short be read as far as it goes.
+        database.execute('PRAGMA writable_schema = ON')
+        database.execute('SELECT count(*) FROM sqlite_master').fetchone()
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database

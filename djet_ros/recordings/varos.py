@@ -1,0 +1,94 @@
+"""
+The synthetic underwater sequence VAROS (Zwilgmeyer et al., ICCV Workshops 2021).
+
+The layout is taken from public programs that read the data set, not from the data set itself:
+vehicle0/cam0 holds A/*.png (rendered with water and lamps), camM0_timestamps.csv (a row per image,
+beginning with its stamp in ns) and camM0_poses/camM0_poses_transformation_matrix.csv (stamp in ns
+and the rows of a 3x4 matrix: the camera, along optical axes, in the world).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.recordings.kitti import check_rigid, STAMP_OFFSET_NS
+from djet_ros.recordings.sequence import from_first, ImageFiles
+from djet_ros.recordings.text import increasing, lines, number_rows, stamped, whole_nanoseconds
+import numpy as np
+from numpy.typing import NDArray
+
+# Camera of the public programs: focal length in pixels of an image of this size (width, height).
+FOCAL_LENGTH = 990.323
+SIZE = (1280, 720)
+
+
+class VarosSequence:
+    """
+    A folder of VAROS: the recording's own, vehicle0, or cam0. A FrameSequence.
+
+    Stamps are those of the data set plus STAMP_OFFSET_NS. Ground truth is known where a pose has
+    the stamp of an image. Raises DjetError where the folder does not keep to the layout.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Read everything but the images, and check that it belongs together."""
+        camera = varos_camera(folder)
+        if camera is None:
+            raise DjetError(f'{folder} is no VAROS folder; it must hold vehicle0/cam0')
+        self.name = f'VAROS {folder.resolve().name}'
+        self._images = ImageFiles(sorted((camera / 'A').glob('*.png')))
+        self.size = self._images.size
+        if self.size != SIZE:
+            raise DjetError(f'{camera / "A"} has images of {self.size[0]}x{self.size[1]}, the '
+                            f'known camera of VAROS is for {SIZE[0]}x{SIZE[1]}')
+        self.K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
+                           [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
+        stamps = _stamps(camera / 'camM0_timestamps.csv')
+        if len(stamps) != len(self):
+            raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
+                            f'{len(self)} images; there must be one for each')
+        self.stamps_ns = stamps + STAMP_OFFSET_NS
+        self.poses = _poses(
+            camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self._images.paths)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Give a frame in gray, (H, W) uint8."""
+        return self._images.gray(index)
+
+
+def varos_camera(folder: Path) -> Path | None:
+    """Find the camera's folder in the recording's, the vehicle's or itself, by what it holds."""
+    for camera in (folder / 'vehicle0' / 'cam0', folder / 'cam0', folder):
+        if (camera / 'camM0_timestamps.csv').exists() and any((camera / 'A').glob('*.png')):
+            return camera
+    return None
+
+
+def _stamps(path: Path) -> NDArray[np.int64]:
+    stamps = [stamped(path, number, text.partition(',')[0].strip(), whole_nanoseconds)
+              for number, text in lines(path)]
+    return increasing(np.array(stamps, np.int64), path)
+
+
+def _poses(path: Path, stamps: NDArray[np.int64]) -> Array | None:
+    """Poses (N, 4, 4) at stamps (N,), relative to the first known; NaN where none is."""
+    if not path.exists():
+        return None
+    rows = number_rows(path, 13)
+    known = dict(zip(rows[:, 0].astype(np.int64).tolist(), rows[:, 1:].reshape(-1, 3, 4)))
+    poses = np.full((len(stamps), 4, 4), np.nan)
+    for index, stamp in enumerate(stamps.tolist()):
+        if stamp in known:
+            poses[index, :3], poses[index, 3] = known[stamp], (0, 0, 0, 1)
+    found = np.isfinite(poses).all(axis=(1, 2))
+    if not found.any():
+        return None
+    check_rigid(poses[found], path)
+    poses[found] = from_first(poses[found])
+    return poses

@@ -1,0 +1,1 @@
+"""A recording through the odometry into a results folder, and errors against ground truth."""

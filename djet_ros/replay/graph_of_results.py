@@ -1,0 +1,117 @@
+"""The pose graph of a replay, read from its results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import csv
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+from djet_ros.config.safe_files import read_text
+from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.config.yaml_files import load_yaml
+from djet_ros.core.types import Array, Status
+from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import OPTICAL_TO_BODY
+from djet_ros.odometry.uncertainty import rotated, UNKNOWN_MOTION
+from djet_ros.odometry.visual_odometry import STARTED, TRACKED
+from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.sources import pose_of
+from djet_ros.recordings.trajectories import read_tum
+from djet_ros.replay.results import BAG
+import numpy as np
+
+
+class _Row(NamedTuple):
+    """Of a frame, what a graph needs."""
+
+    stamp_ns: int
+    status: str
+    previous_stamp_ns: int | None
+    scale_known: bool
+
+
+def read_results(folder: Path) -> PoseGraph:
+    """
+    Read the graph of a results folder of ``djet replay``.
+
+    Vertices are the frames that a motion was told to or from. Where the odometry began anew, an
+    edge of kind 'unknown' keeps the graph in one piece. Raises DjetError.
+    """
+    if not (folder / 'frames.csv').is_file():
+        raise DjetError(f"{folder} holds no results; give a folder that 'djet replay' wrote")
+    rows = _rows(folder / 'frames.csv')
+    stamps, poses = read_tum(folder / 'trajectory_tum.txt')
+    # A run that was killed may have lost the end of one of the files.
+    rows = rows[:len(stamps)]
+    if [row.stamp_ns for row in rows] != stamps[:len(rows)].tolist():
+        raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run')
+    motions = _motions(folder / BAG, load_yaml(folder / 'config.yaml'))
+    edges = list(_edges(rows, poses, motions, folder))
+    if not edges:
+        raise DjetError(f'{folder}: no motion was told between any two frames; there is no graph')
+    kept = sorted({end for edge in edges for end in (edge.source, edge.target)})
+    return PoseGraph(stamps[kept], poses[kept], tuple(_renumbered(edges, kept)))
+
+
+def _rows(path: Path) -> list[_Row]:
+    """Rows of frames.csv that were processed."""
+    rows = []
+    for number, row in enumerate(csv.DictReader(io.StringIO(read_text(path))), 2):
+        try:
+            if row['status'] == 'UNUSED':
+                continue
+            previous = row['previous_stamp_ns']
+            rows.append(_Row(int(row['stamp_ns']), Status(row['status']).value,
+                             int(previous) if previous else None, row['scale_known'] == '1'))
+        except (KeyError, TypeError, ValueError) as error:
+            raise DjetError(f'{path} line {number} is no row of a replay: {error}') from error
+    return rows
+
+
+def _motions(bag: Path, config: Config) -> dict[int, tuple[Array, Array]]:
+    """Motion (4, 4) and covariance (6, 6), along optical axes, by the stamp of the frame."""
+    topic = f'/{NODE_NAME}/relative_pose_cov'
+    turn = np.eye(4)
+    if config.odometry.frame_convention == 'body':
+        turn[:3, :3] = OPTICAL_TO_BODY.T
+    motions = {}
+    with Bag(bag) as opened:
+        for _, _, message in opened.messages({topic}):
+            stamp, motion = pose_of(message)
+            covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
+            motions[stamp] = turn @ motion @ turn.T, rotated(turn[:3, :3], covariance)
+    return motions
+
+
+def _edges(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array]],
+           folder: Path) -> Iterator[Edge]:
+    """Edges between rows: told motions, and unknown ones to where the odometry began anew."""
+    references = {row.previous_stamp_ns for row in rows if row.status in TRACKED}
+    at: dict[int, int] = {}
+    last: int | None = None
+    for i, row in enumerate(rows):
+        at[row.stamp_ns] = i
+        if row.status in TRACKED:
+            if row.stamp_ns not in motions or row.previous_stamp_ns not in at:
+                raise DjetError(f'{folder}: the motion to the frame of {row.stamp_ns} ns is '
+                                'missing from the bag; replay the recording once more')
+            motion, covariance = motions[row.stamp_ns]
+            yield Edge(at[row.previous_stamp_ns], i, motion, covariance,
+                       scale_known=row.scale_known)
+        elif row.status in STARTED or row.stamp_ns in references:
+            if last is not None:
+                yield Edge(last, i, np.linalg.inv(poses[last]) @ poses[i], UNKNOWN_MOTION,
+                           'unknown', False)
+        else:
+            continue
+        last = i
+
+
+def _renumbered(edges: list[Edge], kept: list[int]) -> Iterator[Edge]:
+    number = {row: vertex for vertex, row in enumerate(kept)}
+    for edge in edges:
+        yield Edge(number[edge.source], number[edge.target], edge.motion, edge.covariance,
+                   edge.kind, edge.scale_known)

@@ -1,0 +1,232 @@
+"""Offline replay: a recording through the tracker into a results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import cv2
+from djet_ros import __version__
+from djet_ros.config.sections import Config
+from djet_ros.core.types import Array, Status
+from djet_ros.errors import DjetError
+from djet_ros.odometry.diagnostics import Counts
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.scale import scale_source, ScaleSource
+from djet_ros.odometry.tracker import Outgoing, Tracker
+from djet_ros.odometry.visual_odometry import TRACKED
+from djet_ros.recordings.bags import BagMessage
+from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.sources import pose_of, Source
+from djet_ros.replay.ground_truth import GroundTruth
+from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
+from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
+import numpy as np
+
+
+class Outcome(NamedTuple):
+    """The summary as it was written, and in one line what the user must know of, if anything."""
+
+    summary: dict[str, Any]
+    problem: str | None
+
+
+class Replay:
+    """
+    One run of a recording through the tracker, with everything that comes of it written.
+
+    name: path of the source, for people. What goes wrong in the middle does not raise: it ends the
+    run, and the summary and the outcome say what it was.
+    """
+
+    def __init__(self, source: Source, config: Config, folder: ResultsFolder, name: str) -> None:
+        """Prepare the run; DjetError where the scale needs what the source does not have."""
+        self._source = source
+        self._config = config
+        self._folder = folder
+        self._name = name
+        self._tracker = Tracker(config, message_type, _scale(source, config), source.image_topic)
+        self._truth = GroundTruth()
+        self._log = _Log()
+
+    def run(self, progress: Callable[[], None] | None = None) -> Outcome:
+        """Run to the end, calling progress after each image; an interrupt is passed on."""
+        started = perf_counter()
+        complete, problem = False, 'broken off'
+        try:
+            for message in self._source.messages():
+                if self._take(message) and progress is not None:
+                    progress()
+            complete, problem = True, self._complaint()
+        except DjetError as error:
+            problem = str(error)
+        finally:
+            # Also when interrupted: what was written is to be understood.
+            summary = {**self._summary(perf_counter() - started),
+                       'complete': complete, 'error': problem or None}
+            self._folder.finish(summary)
+        self._evaluate(summary)
+        self._folder.finish(summary)
+        return Outcome(summary, problem or None)
+
+    def _take(self, message: BagMessage) -> bool:
+        """Hand one message on; tell whether it was an image."""
+        source, tracker = self._source, self._tracker
+        if message.topic == source.image_topic:
+            self._image(message)
+            return True
+        if message.topic == source.info_topic:
+            self._publish(tracker.camera_info(message.message), message.stamp_ns)
+            if tracker.counts.rejected_infos and tracker.problem:
+                raise tracker.problem
+        elif message.topic == source.ground_truth_topic:
+            self._truth.add(*pose_of(message.message))
+        elif message.topic == source.speed_topic:
+            tracker.speed(message.message)
+        return False
+
+    def _image(self, message: BagMessage) -> None:
+        tracker, log = self._tracker, self._log
+        number, processed = tracker.counts.received, tracker.counts.processed
+        started = perf_counter()
+        outgoing = tracker.image(message.message)
+        seconds = perf_counter() - started
+        if tracker.counts.processed > processed and tracker.last is not None:
+            result = tracker.last
+            log.steps.append(_Step(result.stamp_ns, result.previous_stamp_ns, result.status,
+                                   result.motion, result.pose))
+            log.metric &= result.scale_known or result.status is not Status.OK
+            log.scaled += result.scale_known and result.status in TRACKED
+            self._folder.add_frame(number, result, seconds)
+        else:
+            self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
+        self._publish(outgoing, message.stamp_ns)
+        if tracker.problem is not None:
+            if not tracker.counts.processed:
+                # The first image that could be used decides whether any can.
+                raise tracker.problem
+            log.first_problem = log.first_problem or f'image {number}: {tracker.problem}'
+
+    def _publish(self, outgoing: list[Outgoing], stamp: int) -> None:
+        for one in outgoing:
+            self._folder.publish(one, stamp)
+
+    def _complaint(self) -> str:
+        """Say what was wrong with a recording that was read to its end."""
+        counts, log = self._tracker.counts, self._log
+        if not counts.processed:
+            return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
+                    f'{self._source.info_topic}; record it too, or choose one with --info-topic')
+        if log.first_problem:
+            return (f'{self._name}: {counts.rejected.total()} of {counts.received} images could '
+                    f'not be used; {log.first_problem}')
+        if changes := counts.status[Status.SIZE_CHANGED.value]:
+            return (f'{self._name}: the image size or the camera changes {changes} times; each '
+                    'time the motion is unknown and the trajectory has a hole')
+        return ''
+
+    def _summary(self, seconds: float) -> dict[str, Any]:
+        counts: Counts = self._tracker.counts
+        config = self._config
+        return {
+            'source': self._name, 'image_topic': self._source.image_topic,
+            'method': config.estimator.method, 'preset': config.preset,
+            'scale': config.odometry.scale, 'pairs_of_known_scale': self._log.scaled,
+            'frames': counts.processed, 'pairs': len(self._log.pairs()),
+            'seconds': round(seconds, 3),
+            'images': counts.received, 'dropped': dict(counts.dropped),
+            'rejected': dict(counts.rejected), 'status': dict(counts.status),
+            'versions': {'djet_ros': __version__, 'numpy': np.__version__,
+                         'opencv': cv2.__version__},
+        }
+
+    def _evaluate(self, summary: dict[str, Any]) -> None:
+        """Add errors against ground truth to the summary, and draw the trajectory."""
+        log = self._log
+        pairs = log.pairs()
+        truth = self._truth.at(np.array([step.stamp_ns for step in log.steps], np.int64))
+        if len(self._truth) and pairs:
+            at = {step.stamp_ns: i for i, step in enumerate(log.steps)}
+            ends = np.array([(at[p.previous_stamp_ns], at[p.stamp_ns]) for p in pairs])
+            errors = pair_errors(pairs, truth[ends[:, 0]], truth[ends[:, 1]])
+            summary.update(
+                compared_pairs=errors.compared, failures=errors.failures,
+                translation_failures=errors.translation_failures,
+                rotation_error_deg=statistics(errors.rotation_deg),
+                translation_error_deg=statistics(errors.translation_deg))
+            self._folder.add_errors(pairs, errors)
+        if len(log.steps) > 1:
+            self._plot(truth)
+
+    def _plot(self, truth: Array) -> None:
+        """Draw the trajectory; without a scale its lengths are those of the ground truth."""
+        log, unit = self._log, 'm'
+        title = f'{Path(self._name).name}: {self._config.estimator.method}, {self._config.preset}'
+        estimate = np.array([step.pose for step in log.steps])
+        known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
+        if not log.metric and known.size:
+            estimate = log.with_lengths_of(truth)
+            title += '\n(lengths of the steps from ground truth)'
+        elif not log.metric:
+            unit = 'steps of unit length'
+        # The two agree where the ground truth begins.
+        true_way = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
+            if known.size else None
+        plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], true_way, title, unit)
+
+
+class _Step(NamedTuple):
+    """Of a frame, what is needed at the end: small, however long the recording is."""
+
+    stamp_ns: int
+    previous_stamp_ns: int | None
+    status: Status
+    motion: Array
+    pose: Array
+
+
+@dataclass
+class _Log:
+    """Steps of a run; metric: whether all their lengths were known; scaled: how many were."""
+
+    steps: list[_Step] = field(default_factory=list)
+    metric: bool = True
+    scaled: int = 0
+    first_problem: str | None = None
+
+    def pairs(self) -> list[Pair]:
+        return [Pair(step.previous_stamp_ns, step.stamp_ns, step.status, step.motion)
+                for step in self.steps if step.previous_stamp_ns is not None]
+
+    def with_lengths_of(self, truth: Array) -> Array:
+        """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
+        poses: list[Array] = []
+        at: dict[int, int] = {}
+        for i, step in enumerate(self.steps):
+            pose = poses[-1] if poses else np.eye(4)
+            if step.previous_stamp_ns is not None and step.status in TRACKED:
+                previous = at[step.previous_stamp_ns]
+                way = float(np.linalg.norm(truth[i, :3, 3] - truth[previous, :3, 3]))
+                length = float(np.linalg.norm(step.motion[:3, 3]))
+                motion = step.motion.copy()
+                if length > 0 and np.isfinite(way):
+                    motion[:3, 3] *= way / length
+                pose = poses[previous] @ motion
+            poses.append(pose)
+            at[step.stamp_ns] = i
+        return np.array(poses)
+
+
+def _scale(source: Source, config: Config) -> ScaleSource:
+    """Make the scale source; for ground truth, that of the whole recording is read first."""
+    positions = None
+    if config.odometry.scale == 'ground_truth' and source.ground_truth_topic is not None:
+        truth = GroundTruth()
+        for message in source.messages({source.ground_truth_topic}):
+            truth.add(*pose_of(message.message))
+        stamps, poses = truth.known()
+        positions = stamps, poses[:, :3, 3]
+    return scale_source(config.odometry, positions)

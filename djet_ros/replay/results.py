@@ -1,0 +1,213 @@
+"""
+The results folder of a replay: everything is written as it comes, so that nothing is lost.
+
+* trajectory_tum.txt, trajectory_kitti.txt: one pose per processed frame, camera in the first
+  camera, along optical axes; the last known pose where the motion could not be told
+* frames.csv: one row per image
+* bag/: what a live node would have published
+* config.yaml: the parameters in force
+* summary.json: counts, errors, and whether the run came to its end
+* errors.csv (with ground truth) and trajectory.png, at the end
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+import shutil
+from types import TracebackType
+from typing import Any, Self
+
+from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.config.yaml_files import dump_yaml
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.odometry.tracker import Outgoing
+from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.recordings.bag_writers import ResultBag
+from djet_ros.recordings.text import LineFile
+from djet_ros.recordings.trajectories import KittiWriter, TumWriter
+from djet_ros.replay.pair_errors import Pair, PairErrors
+import numpy as np
+from numpy.typing import NDArray
+
+SUMMARY = 'summary.json'
+PLOT = 'trajectory.png'
+BAG = 'bag'
+_FILES = (SUMMARY, PLOT, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv', 'errors.csv',
+          'config.yaml')
+
+COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
+           'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_known',
+           'ms')
+
+
+class ResultsFolder:
+    """
+    Writes the results of one replay; use it in a ``with`` statement.
+
+    Until ``finish`` the summary says that the run is incomplete. DjetError where the folder
+    exists (unless it is empty, or an earlier results folder that may be overwritten) or can't be
+    written.
+    """
+
+    def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
+        """Make room, create the files, and write the parameters."""
+        self.path = path
+        try:
+            _make_room(path, overwrite)
+            (path / 'config.yaml').write_text(dump_yaml(config))
+            self._table = LineFile(path / 'frames.csv')
+        except OSError as error:
+            raise _blame(path, error) from error
+        self.finish({'complete': False, 'error': 'the run did not come to its end'})
+        self._rows = csv.writer(self._table, lineterminator='\n')
+        self._row(COLUMNS)
+        self._trajectories = [TumWriter(path / 'trajectory_tum.txt'),
+                              KittiWriter(path / 'trajectory_kitti.txt')]
+        self._bag = ResultBag(path / BAG)
+
+    def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
+        """Write what became of a processed image, and how long it took; counted from 0."""
+        for trajectory in self._trajectories:
+            trajectory.write(result.stamp_ns, result.pose)
+        self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
+                   f'{1e3 * seconds:.2f}'))
+
+    def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
+        """Write that an image was dropped or rejected, and why."""
+        self._row((image, stamp_ns, 'UNUSED', reason, *[''] * (len(COLUMNS) - 4)))
+
+    def publish(self, outgoing: Outgoing, stamp_ns: int) -> None:
+        """Write a message under the topic that the live node has for it."""
+        topic = outgoing.topic
+        self._bag.write(topic if topic.startswith('/') else f'/{NODE_NAME}/{topic}',
+                        outgoing.message, stamp_ns)
+
+    def add_errors(self, pairs: list[Pair], errors: PairErrors) -> None:
+        """Write the errors of all pairs, empty where there is none."""
+        try:
+            with (self.path / 'errors.csv').open('w', newline='') as file:
+                rows = csv.writer(file, lineterminator='\n')
+                rows.writerow(('previous_stamp_ns', 'stamp_ns', 'status', 'rotation_error_deg',
+                               'translation_error_deg'))
+                rows.writerows(
+                    (pair.previous_stamp_ns, pair.stamp_ns, pair.status.value, *values)
+                    for pair, *values in zip(pairs, _cells(errors.rotation_deg),
+                                             _cells(errors.translation_deg), strict=True))
+        except OSError as error:
+            raise _blame(self.path, error) from error
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Put a summary in the place of the one before, all or nothing."""
+        beside = self.path / f'.{SUMMARY}'
+        try:
+            beside.write_text(json.dumps(summary, indent=2) + '\n')
+            os.replace(beside, self.path / SUMMARY)
+        except OSError as error:
+            beside.unlink(missing_ok=True)
+            raise _blame(self.path, error) from error
+
+    def close(self) -> None:
+        """Complete the bag and close the files."""
+        try:
+            self._table.close()
+            for trajectory in self._trajectories:
+                trajectory.close()
+        except OSError as error:
+            raise _blame(self.path, error) from error
+        finally:
+            self._bag.close()
+
+    def __enter__(self) -> Self:
+        """Give the folder itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        """Complete the bag and close the files."""
+        self.close()
+
+    def _row(self, values: tuple[Any, ...]) -> None:
+        try:
+            self._rows.writerow(values)
+        except OSError as error:
+            raise _blame(self.path, error) from error
+
+
+def _details(result: OdometryResult) -> tuple[Any, ...]:
+    relative = result.relative
+    if relative is None:
+        return ('',) * (len(COLUMNS) - 5)
+    residuals = np.abs(relative.residuals[relative.inliers])
+    hamming = relative.hamming[np.isfinite(relative.hamming)]
+    return (result.previous_stamp_ns, len(relative.x), int(relative.inliers.sum()),
+            relative.culled, relative.iterations,
+            f'{np.median(residuals):.4f}' if residuals.size else '',
+            f'{hamming.mean():.3f}' if hamming.size else '',
+            repr(float(result.scale)), int(result.scale_known))
+
+
+def _cells(values: NDArray[np.float64]) -> list[str]:
+    return [f'{value:.6f}' if np.isfinite(value) else '' for value in values]
+
+
+def _make_room(path: Path, overwrite: bool) -> None:
+    """Make the folder; of an earlier one only what a replay wrote is removed."""
+    if path.exists():
+        if not path.is_dir():
+            raise DjetError(f'{path} exists and is no folder; choose another --output')
+        if any(path.iterdir()):
+            if not (path / SUMMARY).is_file() or not (path / 'config.yaml').is_file():
+                raise DjetError(f'{path} is not empty and holds no earlier results; choose '
+                                'another --output')
+            if not overwrite:
+                raise DjetError(f'{path} holds earlier results; choose another --output, or '
+                                'replace them with --overwrite')
+            for name in _FILES:
+                (path / name).unlink(missing_ok=True)
+            if (path / BAG).is_dir():
+                shutil.rmtree(path / BAG)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def _blame(path: Path, error: OSError) -> DjetError:
+    return DjetError(f'{path} could not be written: {error.strerror or error}; what it holds so '
+                     'far is readable')
+
+
+def _widen(axes: Any) -> None:
+    """Give a straight way some room at its sides, so that its deviations can be seen."""
+    limits = [np.array(axes.get_xlim()), np.array(axes.get_ylim())]
+    longest = max(float(np.ptp(limit)) for limit in limits)
+    for limit, widen in zip(limits, (axes.set_xlim, axes.set_ylim)):
+        half = max(float(np.ptp(limit)), longest / 2) / 2 * 1.1
+        widen(limit.mean() - half, limit.mean() + half)
+
+
+def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str,
+                    unit: str) -> None:
+    """
+    Draw the way seen from above: x to the right, z ahead, of positions (N, 3) in the first camera.
+
+    truth: (M, 3) or None; unit: of the axes.
+    """
+    # Here, because it takes half a second that only the end of a replay needs.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 7), layout='constrained')
+    axes = figure.add_subplot(aspect='equal')
+    if truth is not None:
+        axes.plot(truth[:, 0], truth[:, 2], color='0.55', linewidth=2.5, label='ground truth')
+    axes.plot(estimate[:, 0], estimate[:, 2], color='tab:blue', linewidth=1.2, label='estimate')
+    axes.plot(*estimate[0, [0, 2]], 'o', color='black', markersize=5, label='start')
+    axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
+    _widen(axes)
+    axes.grid(color='0.9')
+    axes.legend(loc='best')
+    try:
+        figure.savefig(path, dpi=120)
+    except OSError as error:
+        raise _blame(path, error) from error

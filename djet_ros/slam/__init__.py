@@ -1,1 +1,0 @@
-"""Offline SLAM: keyframes, loops between them, and a graph optimised by GTSAM."""
