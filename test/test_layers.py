@@ -66,7 +66,7 @@ def libraries(module: str) -> set[str]:
 
 
 def upward(imports: Imports) -> set[tuple[str, str]]:
-    """Imports from a room above the module's own, or beside it."""
+    """Find imports from a room above the module's own, or beside it."""
     return {(module, name) for module, names in imports.items() for name in names
             if name.startswith('djet_ros.') and room(name) != room(module)
             and FLOOR[room(name)] >= FLOOR[room(module)]
@@ -74,7 +74,7 @@ def upward(imports: Imports) -> set[tuple[str, str]]:
 
 
 def cycle(imports: Imports) -> list[str]:
-    """Modules that import one another in a ring, or none."""
+    """Find modules that import one another in a ring, or none."""
     def known(name: str) -> str | None:
         return name if name in imports else (
             name.rpartition('.')[0] if name.rpartition('.')[0] in imports else None)

@@ -1,1 +1,1 @@
-"""Images and matrices in, frozen results out: features, matches, surfaces, JET. No ROS, no files."""
+"""Images and matrices in, frozen results out. No ROS, no files, no clock but timings."""
