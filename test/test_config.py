@@ -25,7 +25,7 @@ def test_the_shipped_yaml_is_the_generated_one():
     expected = dump_yaml(Config(), preset_as_comments=True)
     assert SHIPPED.read_text() == expected, (
         "write config/vo.yaml anew: python -c 'from djet_ros.config.sections import *; "
-        "from djet_ros.config.yaml_files import *; print(dump_yaml(Config(), "
+        'from djet_ros.config.yaml_files import *; print(dump_yaml(Config(), '
         "preset_as_comments=True), end=str())' > config/vo.yaml")
 
 
