@@ -137,7 +137,7 @@ def camera_of(data: bytes) -> None:
         return
     for rectified in (False, True):
         with only_our_errors():
-            camera = Camera(info, rectified)
+            camera = Camera.from_info(info, rectified)
             assert np.isfinite(camera.K).all()
             assert camera.undistort(PICTURE).shape == PICTURE.shape
     one = tracker()

@@ -19,7 +19,7 @@ DISTORTIONS = {
 
 def reason(*args, **changes):
     with pytest.raises(BadMessage) as caught:
-        Camera(camera_info(K, SIZE, **changes), *(args or (False,)))
+        Camera.from_info(camera_info(K, SIZE, **changes), *(args or (False,)))
     return caught.value.reason
 
 
@@ -34,18 +34,18 @@ def test_the_parameter_or_the_topic_says_whether_images_are_rectified(parameter,
 
 
 def test_rectified_images_have_the_camera_p_and_stay_as_they_are():
-    camera = Camera(camera_info(K, SIZE, p=P.ravel(), d=DISTORTIONS['plumb_bob']), True)
+    camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel(), d=DISTORTIONS['plumb_bob']), True)
     gray = np.zeros(SIZE[::-1], np.uint8)
     assert np.array_equal(camera.K, P[:, :3])
     assert camera.undistort(gray) is gray
 
 
 def test_where_p_is_missing_rectified_images_have_the_camera_k():
-    assert np.array_equal(Camera(camera_info(K, SIZE, p=np.zeros(12)), True).K, K)
+    assert np.array_equal(Camera.from_info(camera_info(K, SIZE, p=np.zeros(12)), True).K, K)
 
 
 def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
-    camera = Camera(camera_info(K, SIZE, p=P.ravel()), False)
+    camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel()), False)
     gray = np.zeros(SIZE[::-1], np.uint8)
     assert np.array_equal(camera.K, K)
     assert camera.undistort(gray) is gray
@@ -54,7 +54,8 @@ def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
 @pytest.mark.parametrize('model', DISTORTIONS)
 def test_undistortion_brings_points_where_the_pinhole_camera_sees_them(model):
     D = DISTORTIONS[model]
-    camera = Camera(camera_info(K, SIZE, p=P.ravel(), d=D, distortion_model=model), False)
+    info = camera_info(K, SIZE, p=P.ravel(), d=D, distortion_model=model)
+    camera = Camera.from_info(info, False)
     assert np.array_equal(camera.K, P[:, :3])
     rays = np.array([[0.2, 0.1, 1], [-0.3, 0.2, 1], [0.1, -0.25, 1]])
     project = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
@@ -66,6 +67,23 @@ def test_undistortion_brings_points_where_the_pinhole_camera_sees_them(model):
     undistorted = camera.undistort(raw)
     for x, y in pinhole:
         assert np.allclose(blob_near(undistorted, x, y), (x, y), atol=0.15)
+
+
+@pytest.mark.parametrize('model', DISTORTIONS)
+@pytest.mark.parametrize('outwards', [1, -1])
+def test_a_camera_of_matrices_brings_nothing_black_in_from_the_rim(model, outwards):
+    camera = Camera(K, outwards * DISTORTIONS[model], SIZE, model)
+    bright = np.full(SIZE[::-1], 200, np.uint8)
+    assert np.array_equal(camera.K, K)
+    assert (camera.undistort(bright) == 200).all()
+
+
+def test_a_camera_of_matrices_undistorts_as_that_of_its_camera_info():
+    D = DISTORTIONS['plumb_bob']
+    raw = draw_blob(100, 30)
+    assert np.array_equal(
+        Camera(K, D, SIZE).undistort(raw),
+        Camera.from_info(camera_info(K, SIZE, d=D), False).undistort(raw))
 
 
 def draw_blob(x, y):
@@ -82,14 +100,14 @@ def blob_near(image, x, y, reach=8):
 
 def test_a_stereo_rectification_does_not_turn_the_camera():
     turned = cv2.Rodrigues(np.array([0, 0.05, 0]))[0].ravel()
-    camera = Camera(camera_info(K, SIZE, p=P.ravel(), r=turned,
-                                d=DISTORTIONS['plumb_bob']), False)
+    camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel(), r=turned,
+                                          d=DISTORTIONS['plumb_bob']), False)
     assert np.array_equal(camera.K, K)
 
 
 def test_roi_shifts_and_binning_divides():
     info = camera_info(K, SIZE, roi=roi(20, 10, 100, 80), binning_x=2, binning_y=4)
-    camera = Camera(info, False)
+    camera = Camera.from_info(info, False)
     assert camera.size == (50, 20)
     assert np.allclose(camera.K, [[65, 0, (80.5 - 20) / 2], [0, 131 / 4, (58 - 10) / 4],
                                   [0, 0, 1]])
@@ -97,12 +115,12 @@ def test_roi_shifts_and_binning_divides():
 
 def test_an_image_of_another_size_is_refused():
     with pytest.raises(BadMessage, match='image is 100x120') as caught:
-        Camera(camera_info(K, SIZE), False).undistort(np.zeros((120, 100), np.uint8))
+        Camera.from_info(camera_info(K, SIZE), False).undistort(np.zeros((120, 100), np.uint8))
     assert caught.value.reason == 'size_mismatch'
 
 
 def test_a_camera_info_without_a_size_takes_any_image():
-    camera = Camera(camera_info(K, (0, 0), d=DISTORTIONS['plumb_bob']), False)
+    camera = Camera.from_info(camera_info(K, (0, 0), d=DISTORTIONS['plumb_bob']), False)
     for shape in ((120, 100), (60, 50)):
         assert camera.undistort(np.zeros(shape, np.uint8)).shape == shape
 

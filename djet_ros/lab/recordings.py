@@ -59,7 +59,8 @@ def extract(source: BagSource, folder: Path) -> Path:
     truth = GroundTruth()
     for topic, _, message in source:
         if topic == source.info_topic:
-            camera = camera or Camera(message, means_rectified('auto', source.image_topic))
+            camera = camera or Camera.from_info(
+                message, means_rectified('auto', source.image_topic))
         elif topic == source.ground_truth_topic:
             truth.add(*pose_of(message))
         elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):

@@ -25,28 +25,43 @@ _MODELS = {'plumb_bob': _POLYNOMIAL, 'rational_polynomial': _POLYNOMIAL, 'equidi
 
 class Camera:
     """
-    The camera that a CameraInfo describes.
+    A camera, and what makes its images those of a pinhole.
 
     K: (3, 3) camera matrix of the images that ``undistort`` gives; size: (width, height) of the
-    images that it takes, or None where the CameraInfo leaves it open. Raises BadMessage.
+    images that it takes, or None where that is open.
     """
 
-    def __init__(self, info: Any, rectified: bool) -> None:
-        """Take what holds for rectified or for raw images out of a CameraInfo."""
-        K = _numbers(info, 'k', 9).reshape(3, 3)
-        projection = _numbers(info, 'p', 12).reshape(3, 4)[:, :3]
-        D = _numbers(info, 'd', None)
-        self.size = _image_size(info)
-        self._distortion = None if rectified or not D.any() else _distortion(info, D)
+    def __init__(self, K: Array, D: Array, size: tuple[int, int] | None,
+                 model: str = 'plumb_bob', pinhole: Array | None = None) -> None:
+        """
+        Take the camera matrix K (3, 3) of the images as they come, and their distortion.
+
+        D: as OpenCV has it for the model, zeros or none without distortion; pinhole: (3, 3)
+        camera matrix of the undistorted images, by default K. Raises BadMessage.
+        """
+        _check_camera(K)
+        self._raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
+        self._distortion = _distortion(model, D) if D.any() else None
         self._maps: tuple[Any, Any] | None = None
 
-        # Drivers without a calibration leave zeros; some rectifiers fill in P alone, or K alone.
-        wanted = projection if rectified and projection.any() else K
-        _check_camera(wanted)
-        self._raw_K = self.K = _of_image(wanted, info)
-        if self._distortion is not None and projection.any() and not _turned(info):
+    @classmethod
+    def from_info(cls, info: Any, rectified: bool) -> Camera:
+        """Make the camera that a CameraInfo describes; raises BadMessage."""
+        K = _numbers(info, 'k', 9).reshape(3, 3)
+        projection = _numbers(info, 'p', 12).reshape(3, 4)[:, :3]
+        D, size = _numbers(info, 'd', None), _image_size(info)
+        if rectified:
+            # Drivers without a calibration leave zeros; some rectifiers fill in P alone, or K.
+            K = projection if projection.any() else K
+        _check_camera(K)
+        if rectified or not D.any():
+            return cls(_of_image(K, info), np.empty(0), size)
+        pinhole = K
+        if projection.any() and not _turned(info):
             _check_camera(projection)
-            self.K = _of_image(projection, info)
+            pinhole = projection
+        return cls(_of_image(K, info), D, size, info.distortion_model or 'plumb_bob',
+                   _of_image(pinhole, info))
 
     def undistort(self, gray: Gray) -> Gray:
         """Image (H, W) without its distortion; BadMessage where its size is not the camera's."""
@@ -119,8 +134,7 @@ def _check_camera(K: Array) -> None:
                          f'{K[0, 0]:g} and {K[1, 1]:g}, last row {K[2].tolist()}')
 
 
-def _distortion(info: Any, D: Array) -> tuple[str, Array]:
-    model = info.distortion_model or 'plumb_bob'
+def _distortion(model: str, D: Array) -> tuple[str, Array]:
     counts: Sequence[int] = _MODELS.get(model, ())
     if len(D) not in counts:
         raise BadMessage('unknown_distortion', f"distortion model '{model:.40}' with {len(D)} "

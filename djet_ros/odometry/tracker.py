@@ -108,7 +108,7 @@ class Tracker:
             return []
         self._info = message
         try:
-            self._camera = Camera(message, means_rectified(
+            self._camera = Camera.from_info(message, means_rectified(
                 self.config.odometry.rectified, self._image_topic))
         except BadMessage as problem:
             self._camera = None

@@ -117,7 +117,7 @@ def frames_at(source: Source, config: Config, stamps_ns: NDArray[np.int64]) -> I
     camera: Camera | None = None
     for message in source.messages({source.image_topic, source.info_topic}):
         if message.topic == source.info_topic:
-            camera = Camera(message.message, rectified)
+            camera = Camera.from_info(message.message, rectified)
         elif message.topic == source.image_topic and camera is not None \
                 and stamp_ns(message.message.header) == stamp:
             gray = camera.undistort(gray_image(message.message))

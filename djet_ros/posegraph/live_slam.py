@@ -80,7 +80,7 @@ class LiveSlam:
         if self._info is None or not same_camera(self._info, message):
             self._info = message
             try:
-                self._camera, self.problem = Camera(message, self._rectified), None
+                self._camera, self.problem = Camera.from_info(message, self._rectified), None
             except BadMessage as problem:
                 self._camera = None
                 self._reject('camera_info', problem)
