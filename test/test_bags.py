@@ -226,7 +226,7 @@ def test_the_same_sequence_gives_the_same_bytes(small_kitti, tmp_path, storage):
 def test_an_existing_bag_is_replaced_only_on_demand(small_kitti, tmp_path):
     sequence = KittiSequence(small_kitti(frames=3))
     write_kitti_bag(sequence, tmp_path / 'out')
-    with pytest.raises(DjetError, match=r'out exists; choose another name or pass --overwrite'):
+    with pytest.raises(DjetError, match='out exists already; .* --overwrite'):
         write_kitti_bag(sequence, tmp_path / 'out')
     write_kitti_bag(KittiSequence(sequence.folder, end=2), tmp_path / 'out', overwrite=True)
     with BagSource(tmp_path / 'out') as source:

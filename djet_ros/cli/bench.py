@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_json_output, check_output, write_json
+from djet_ros.cli.outputs import add_json_output, write_json
 from djet_ros.errors import DjetError
 from djet_ros.lab.bench import bench, QUOTED_POINTS
+from djet_ros.recordings.outputs import check_file
 from rich.console import Console
 from rich.table import Table
 
@@ -28,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write and show the figures."""
-    check_output(args.output, args.overwrite)
+    check_file(args.output, args.overwrite)
     if args.pairs < 1:
         raise DjetError(f'--pairs is {args.pairs}; it must be at least 1')
     args.output.parent.mkdir(parents=True, exist_ok=True)

@@ -8,13 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.outputs import add_json_output, check_output, write_json
+from djet_ros.cli.outputs import add_json_output, write_json
 from djet_ros.cli.pair_runs import split
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.entrants import check_names, TITLES
 from djet_ros.lab.sources import plain_name, readable_frames
+from djet_ros.recordings.outputs import check_file
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -44,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate the triangles, write and show them."""
-    check_output(args.output, args.overwrite)
+    check_file(args.output, args.overwrite)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
     methods, name = split(args.methods), plain_name(args.source)

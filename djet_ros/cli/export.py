@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from djet_ros.cli.outputs import add_overwrite
 from djet_ros.posegraph.graph_files import FORMATS, write_graph
 from djet_ros.replay.graph_of_results import read_results
 
@@ -26,13 +27,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument('--format', choices=tuple(FORMATS), default='g2o',
                         help='default: %(default)s')
     parser.add_argument('--output', type=Path, required=True, metavar='FILE')
+    add_overwrite(parser)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
     graph = read_results(args.results)
-    write_graph(graph, args.output, args.format)
+    write_graph(graph, args.output, args.format, args.overwrite)
     kinds = Counter(edge.kind for edge in graph.edges)
     unscaled = sum(not edge.scale_known for edge in graph.edges)
     print(f'{args.output}: {len(graph.poses)} poses, {len(graph.edges)} edges ('

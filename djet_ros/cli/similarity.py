@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.outputs import add_overwrite
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -16,6 +16,7 @@ from djet_ros.lab.similarity import (
     read_image,
     self_similarity,
 )
+from djet_ros.recordings.outputs import check_file
 import numpy as np
 
 DESCRIPTION = """\
@@ -48,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
-    check_output(args.output, args.overwrite, '.png')
+    check_file(args.output, args.overwrite, '.png')
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
     points = None if args.points is None else np.array([_point(text) for text in args.points])

@@ -21,6 +21,7 @@ from djet_ros.lab.slam_report import FILES, PLOT, write_report
 from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.offline import run_slam
 from djet_ros.recordings.bags import is_bag
+from djet_ros.recordings.outputs import make_room
 from djet_ros.recordings.sources import open_source, pose_of, Source
 from djet_ros.replay.graph_of_results import read_results
 from djet_ros.replay.ground_truth import GroundTruth
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
                                    for field in fields(SlamConfig)})
     except ValueError as error:
         raise DjetError(str(error)) from None
-    _make_room(args.output, args.overwrite)
+    make_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
         if args.config or flag_values(args):
@@ -99,17 +100,6 @@ def run(args: argparse.Namespace) -> int:
     Console().print(_table(summary))
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
-
-
-def _make_room(folder: Path, overwrite: bool) -> None:
-    """Make the folder; of an earlier run only its own files are removed."""
-    present = [folder / name for name in FILES if (folder / name).exists()]
-    if present and not overwrite:
-        raise DjetError(f'{present[0]} exists already; choose another --output, or replace it '
-                        'with --overwrite')
-    for file in present:
-        file.unlink()
-    folder.mkdir(parents=True, exist_ok=True)
 
 
 def _replayed(args: argparse.Namespace) -> Path:

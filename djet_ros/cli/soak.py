@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_json_output, check_output, write_json
+from djet_ros.cli.outputs import add_json_output, write_json
 from djet_ros.lab.soak import SIZE, soak
+from djet_ros.recordings.outputs import check_file
 from rich.console import Console
 
 
@@ -28,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Soak, write and show the figures."""
-    check_output(args.output, args.overwrite)
+    check_file(args.output, args.overwrite)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     with Console(stderr=True).status('soaking ...') as status:
         figures = soak(args.frames, args.max_growth, lambda done: status.update(

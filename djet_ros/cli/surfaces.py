@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite, check_output
+from djet_ros.cli.outputs import add_overwrite
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
@@ -17,6 +17,7 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.similarity import read_image
 from djet_ros.lab.sources import pair_of_frames
 from djet_ros.lab.surface_steps import animate_course, draw_course, follow, telling_match
+from djet_ros.recordings.outputs import check_file
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
-    check_output(args.output, args.overwrite, '.png', '.gif')
+    check_file(args.output, args.overwrite, '.png', '.gif')
     draw = draw_course if args.output.suffix.lower() == '.png' else animate_course
     config = from_flat(flag_values(args)).estimator
     first, second, K = _images(args)

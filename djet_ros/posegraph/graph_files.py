@@ -11,11 +11,11 @@ Pose graphs as files that other programs read.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import os
 from pathlib import Path
 
 from djet_ros.errors import DjetError
 from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.recordings.outputs import check_file, write_whole
 from djet_ros.recordings.trajectories import (
     digits,
     KittiWriter,
@@ -32,20 +32,16 @@ _COLUMNS = ('source_stamp_ns', 'target_stamp_ns', 'kind', 'scale_known',
             *(f'cov_{_AXES[i]}_{_AXES[j]}' for i, j in zip(*_UPPER)))
 
 
-def write_graph(graph: PoseGraph, path: Path, kind: str) -> None:
+def write_graph(graph: PoseGraph, path: Path, kind: str, overwrite: bool = False) -> None:
     """
-    Write a graph as 'g2o', 'tum', 'kitti' or 'csv', all or nothing; the file must not exist.
+    Write a graph as 'g2o', 'tum', 'kitti' or 'csv', all or nothing.
 
     Raises DjetError, also for an edge whose covariance can't be inverted.
     """
-    if path.exists():
-        raise DjetError(f'{path} exists already; choose another file')
+    check_file(path, overwrite)
     lines = list(FORMATS[kind](graph))
-    beside = path.with_name(f'.{path.name}')
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text('\n'.join(lines) + '\n', 'ascii')
-        os.replace(beside, path)
+        write_whole(path, '\n'.join(lines) + '\n')
     except OSError as error:
         raise DjetError(f'{path} could not be written: {error.strerror}') from error
 

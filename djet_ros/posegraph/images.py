@@ -6,8 +6,7 @@ from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Features
@@ -16,6 +15,7 @@ from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.sources import Source
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ class Seen:
     features: Features
 
 
-class SeenFile(MutableMapping[int, Seen]):
+class SeenFile(MutableMapping[int, Seen], Closing):
     """
     Keyframes in a file without a name, so that thousands of them take no memory.
 
@@ -43,7 +43,7 @@ class SeenFile(MutableMapping[int, Seen]):
         self._kept: dict[int, _Kept] = {}
         self._features = [field.name for field in fields(Features)]
         try:
-            self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by __exit__)
+            self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by close)
         except OSError as error:
             raise DjetError(f'no temporary file could be made in {folder}: '
                             f'{error.strerror}') from error
@@ -88,12 +88,7 @@ class SeenFile(MutableMapping[int, Seen]):
         """Count the keyframes."""
         return len(self._kept)
 
-    def __enter__(self) -> Self:
-        """Give the file itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
+    def close(self) -> None:
         """Close the file, which is its end."""
         self._file.close()
 

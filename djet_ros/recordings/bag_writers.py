@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 import sqlite3
-from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.recordings.bags import is_bag
+from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, message_type
+from djet_ros.recordings.outputs import appearing
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from rosbags.interfaces import (
@@ -72,7 +72,7 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
-    with _appearing(out, overwrite) as folder:
+    with _left_whole(out), appearing(out, overwrite, is_bag, 'bag folder') as folder:
         writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
         with writer:
             for written, messages in enumerate(_frames(sequence), 1):
@@ -82,7 +82,7 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
                     progress(written)
 
 
-class ResultBag:
+class ResultBag(Closing):
     """
     An MCAP bag that grows message by message and stays readable if the process is killed.
 
@@ -111,15 +111,6 @@ class ResultBag:
         """Write the index and the metadata."""
         with self._blaming():
             self._writer.close()
-
-    def __enter__(self) -> Self:
-        """Give the bag itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Complete the bag."""
-        self.close()
 
     def _flush(self) -> None:
         # rosbags offers no flush; its MCAP storage keeps an open chunk in memory.
@@ -153,36 +144,14 @@ def _connect(writer: Writer, topic: str, msgtype: str) -> Connection:
 
 
 @contextmanager
-def _appearing(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Give a place beside ``out`` to write to; it takes the name on success and goes otherwise."""
-    if out.exists() and not overwrite:
-        raise DjetError(f'{out} exists; choose another name or pass --overwrite')
-    if out.exists() and not (out.is_dir() and is_bag(out)):
-        raise DjetError(f'{out} exists and is no bag folder; it is not overwritten')
+def _left_whole(out: Path) -> Iterator[None]:
+    """Name the bag in what the user is told."""
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=f'.{out.name}.', dir=out.parent) as beside:
-            # The bag's file is named after its folder, so the folder has the final name already.
-            folder = Path(beside) / out.name
-            yield folder
-            _exchange(folder, out, Path(beside) / 'replaced')
+        yield
     except (OSError, WriterError, sqlite3.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DjetError(f'{out} could not be written: {reason}; nothing was left '
                         'behind') from error
-
-
-def _exchange(new: Path, out: Path, aside: Path) -> None:
-    """Give a folder its final name; what has that name goes aside, and comes back on failure."""
-    replaced = out.exists()
-    if replaced:
-        out.rename(aside)
-    try:
-        new.rename(out)
-    except BaseException:
-        if replaced:
-            aside.rename(out)
-        raise
 
 
 def _frames(sequence: FrameSequence) -> Iterator[list[tuple[str, Any, int]]]:

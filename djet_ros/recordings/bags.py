@@ -12,11 +12,11 @@ from contextlib import contextmanager, ExitStack
 from pathlib import Path, PurePosixPath
 import re
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.errors import DjetError, one_line
+from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import Decoder, decoder
 from djet_ros.recordings.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.recordings.storages.compression import decompress_file, ZSTD_MAGIC
@@ -45,7 +45,7 @@ class BagMessage(NamedTuple):
     message: Any
 
 
-class Bag:
+class Bag(Closing):
     """
     A recording, read as a stream: only a few messages are in memory at any time.
 
@@ -87,15 +87,6 @@ class Bag:
         """Remove what was unpacked."""
         self._stack.close()
 
-    def __enter__(self) -> Self:
-        """Give the bag itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Remove what was unpacked."""
-        self.close()
-
     def _opened(self, file: Path) -> Storage:
         with _blaming(file):
             with file.open('rb') as stream:
@@ -106,7 +97,7 @@ class Bag:
             return open_storage(file)
 
 
-class BagSource:
+class BagSource(Closing):
     """
     The camera in a bag: its images, their CameraInfo, and the ground truth where there is one.
 
@@ -149,15 +140,6 @@ class BagSource:
     def close(self) -> None:
         """Close the bag."""
         self.bag.close()
-
-    def __enter__(self) -> Self:
-        """Give the source itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Close the bag."""
-        self.close()
 
     def _fitting(self, types: Collection[str]) -> list[Topic]:
         return [topic for topic in self._topics if topic.msgtype in types]

@@ -8,21 +8,20 @@ with all nine decimals, so that files are exact and equal poses give equal bytes
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.text import check_positions, LineFile, nanoseconds, stamped_rows
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 
-class TrajectoryWriter(ABC):
+class TrajectoryWriter(Closing):
     """One line per pose; the file must not exist yet."""
 
     def __init__(self, path: Path) -> None:
@@ -49,15 +48,6 @@ class TrajectoryWriter(ABC):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        """Give the writer itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Close the file."""
-        self.close()
 
 
 class TumWriter(TrajectoryWriter):

@@ -14,11 +14,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from pathlib import Path
-import shutil
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import dump_yaml
@@ -27,6 +24,8 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.recordings.bag_writers import ResultBag
+from djet_ros.recordings.closing import Closing
+from djet_ros.recordings.outputs import make_room, write_whole
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
 from djet_ros.replay.pair_errors import Pair, PairErrors
@@ -44,7 +43,7 @@ COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matche
            'ms')
 
 
-class ResultsFolder:
+class ResultsFolder(Closing):
     """
     Writes the results of one replay; use it in a ``with`` statement.
 
@@ -57,7 +56,7 @@ class ResultsFolder:
         """Make room, create the files, and write the parameters."""
         self.path = path
         try:
-            _make_room(path, overwrite)
+            make_room(path, (*_FILES, BAG), overwrite, marks=(SUMMARY, 'config.yaml'))
             (path / 'config.yaml').write_text(dump_yaml(config))
             self._table = LineFile(path / 'frames.csv')
         except OSError as error:
@@ -102,12 +101,9 @@ class ResultsFolder:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Put a summary in the place of the one before, all or nothing."""
-        beside = self.path / f'.{SUMMARY}'
         try:
-            beside.write_text(json.dumps(summary, indent=2) + '\n')
-            os.replace(beside, self.path / SUMMARY)
+            write_whole(self.path / SUMMARY, json.dumps(summary, indent=2) + '\n')
         except OSError as error:
-            beside.unlink(missing_ok=True)
             raise _blame(self.path, error) from error
 
     def close(self) -> None:
@@ -120,15 +116,6 @@ class ResultsFolder:
             raise _blame(self.path, error) from error
         finally:
             self._bag.close()
-
-    def __enter__(self) -> Self:
-        """Give the folder itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Complete the bag and close the files."""
-        self.close()
 
     def _row(self, values: tuple[Any, ...]) -> None:
         try:
@@ -152,25 +139,6 @@ def _details(result: OdometryResult) -> tuple[Any, ...]:
 
 def _cells(values: NDArray[np.float64]) -> list[str]:
     return [f'{value:.6f}' if np.isfinite(value) else '' for value in values]
-
-
-def _make_room(path: Path, overwrite: bool) -> None:
-    """Make the folder; of an earlier one only what a replay wrote is removed."""
-    if path.exists():
-        if not path.is_dir():
-            raise DjetError(f'{path} exists and is no folder; choose another --output')
-        if any(path.iterdir()):
-            if not (path / SUMMARY).is_file() or not (path / 'config.yaml').is_file():
-                raise DjetError(f'{path} is not empty and holds no earlier results; choose '
-                                'another --output')
-            if not overwrite:
-                raise DjetError(f'{path} holds earlier results; choose another --output, or '
-                                'replace them with --overwrite')
-            for name in _FILES:
-                (path / name).unlink(missing_ok=True)
-            if (path / BAG).is_dir():
-                shutil.rmtree(path / BAG)
-    path.mkdir(parents=True, exist_ok=True)
 
 
 def _blame(path: Path, error: OSError) -> DjetError:

@@ -1,0 +1,104 @@
+"""
+A place for output: what may lie there already, and how it appears there whole or not at all.
+
+Nothing is replaced unless that was asked for, and nothing that this package did not write is ever
+removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import shutil
+from tempfile import TemporaryDirectory
+
+from djet_ros.errors import DjetError
+
+
+def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
+    """Raise DjetError where something is in the way, or the name has none of the suffixes."""
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise DjetError(f"--output is '{path}'; its name must end in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise DjetError(f'{path} is a folder; give the name of a file')
+    _check_unused(path, overwrite)
+
+
+def make_room(folder: Path, ours: Collection[str], overwrite: bool,
+              marks: Collection[str] = ()) -> None:
+    """
+    Make a folder for output; of what an earlier run left there, remove only what is ours.
+
+    ours: names of the files and folders that a run writes; marks: files by which a folder that is
+    not empty is known to be an earlier run's (without any, others' files may lie beside ours).
+    Raises DjetError where the folder is somebody else's, or ours and not to be overwritten;
+    OSError where it can't be made.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DjetError(f'{folder} exists and is no folder; choose another --output')
+    if marks and folder.is_dir() and any(folder.iterdir()) \
+            and not all((folder / mark).is_file() for mark in marks):
+        raise DjetError(f'{folder} is not empty and holds no earlier results; choose another '
+                        '--output')
+    present = [folder / name for name in ours if os.path.lexists(folder / name)]
+    if present and not overwrite:
+        raise DjetError(f'{folder} holds earlier results; choose another --output, or replace '
+                        'them with --overwrite')
+    for path in present:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Put a text into a file, in the place of what it held: all or nothing. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f'.{path.name}')
+    try:
+        beside.write_text(text, 'utf-8')
+        os.replace(beside, path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def appearing(out: Path, overwrite: bool, is_ours: Callable[[Path], bool], what: str
+              ) -> Iterator[Path]:
+    """
+    Give a place beside ``out`` to write a folder to; it takes the name on success, else it goes.
+
+    What has the name already stays until then, and must be ours to be replaced; ``what`` it should
+    be is for the user. Raises DjetError, and OSError where there is no room.
+    """
+    _check_unused(out, overwrite)
+    if out.exists() and not (out.is_dir() and is_ours(out)):
+        raise DjetError(f'{out} exists and is no {what}; it is not overwritten')
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f'.{out.name}.', dir=out.parent) as beside:
+        # What lies in the folder may be named after it, so it has the final name already.
+        folder = Path(beside) / out.name
+        yield folder
+        _exchange(folder, out, Path(beside) / 'replaced')
+
+
+def _check_unused(path: Path, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise DjetError(f'{path} exists already; choose another name or pass --overwrite')
+
+
+def _exchange(new: Path, out: Path, aside: Path) -> None:
+    """Give a folder its final name; what has that name goes aside, and comes back on failure."""
+    replaced = out.exists()
+    if replaced:
+        out.rename(aside)
+    try:
+        new.rename(out)
+    except BaseException:
+        if replaced:
+            aside.rename(out)
+        raise
