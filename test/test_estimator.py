@@ -22,10 +22,10 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.hamming import dense_descriptors
-from djet_ros.core.starts import five_point, planar, Pose, several
+from djet_ros.core.starts import five_point, planar, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
-from djet_ros.core.types import RelativePose, Status
+from djet_ros.core.types import Pose, RelativePose, Status
 from djet_ros.lab.scenes import make_scene
 from djet_ros.recordings.kitti import KittiSequence
 from hypothesis import given, settings, strategies as st

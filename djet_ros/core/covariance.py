@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 # Matches in one cell of this side (pixels) are taken to err together: ORB finds one corner in
 # several octaves, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
-_CELL = 32
+CELL = 32
 
 # What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
 # once, as the normalised squared error on rendered streets; tests hold it on other scenes.
 _INFLATION = 1.6
+
+# The same where cells are summed without a jackknife: over the ground, and in the length of a
+# loop. It is what the pose's was before patches were warped, and has not been measured anew.
+CAUTIOUS_INFLATION = 4.0
 
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.
 _LEAST_SUPPORT = 1e-6
@@ -76,7 +80,7 @@ def _blocks(tangents: Array) -> Array:
 
 def _summed_by_cell(places: Array, *values: Array) -> list[Array]:
     """Sum values (..., N) over the C cells of the image that have matches; each (C, ...)."""
-    cells: NDArray[np.int64] = (places // _CELL).astype(np.int64)
+    cells: NDArray[np.int64] = (places // CELL).astype(np.int64)
     _, cell = np.unique(cells[:, 0] * 2**32 + cells[:, 1], return_inverse=True)
     order = np.argsort(cell, kind='stable')
     first = np.searchsorted(cell[order], np.arange(cell.max() + 1))

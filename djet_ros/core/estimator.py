@@ -20,7 +20,7 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.parallel import both
-from djet_ros.core.starts import five_point, Pose, starting_poses
+from djet_ros.core.starts import five_point, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorSurface,
     PhotometricSurface,
@@ -28,7 +28,7 @@ from djet_ros.core.surfaces import (
     ResidualSurface,
 )
 from djet_ros.core.tracking import hold, Track, track_jointly
-from djet_ros.core.types import Array, Features, RelativePose, Status, View
+from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
 

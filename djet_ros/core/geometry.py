@@ -100,7 +100,7 @@ def nearest_rotation(M: Array) -> Array:
 
 def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:
     """
-    Tell, (N,) bool, which points have positive depth in both cameras (chirality).
+    (N,) bool mask of the points with positive depth in both cameras (chirality).
 
     Only signs are taken, so that far points count like near ones: cv2.recoverPose ignores points
     beyond 50 baselines and then decides forward motion on a handful.
@@ -111,7 +111,7 @@ def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.boo
 
 def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
     """
-    Tell, (N,), how many times larger the surroundings of points are seen in B than in A.
+    (N,) how many times larger the surroundings of points are seen in B than in A.
 
     That is depth in A over depth in B, whatever the length and the sign of t: next to 1 for far
     points, negative where a point is in front of one camera alone, NaN where it is anywhere.
@@ -123,7 +123,7 @@ def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
 
 def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     """
-    Tell how patches that face camera A are seen in B: the derivatives dy/dx, (N, 2, 2).
+    (N, 2, 2) derivatives dy/dx: how patches that face camera A are seen in B.
 
     y: (N, 2) pixels in B; growth: (N,) see there. Depth is taken to be the same all over a patch,
     so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, the derivative is

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import math
 
 import cv2
+from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.geometry import homogeneous, rotation_exp, sphere_tangents
 from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
@@ -21,50 +22,61 @@ from scipy.ndimage import maximum_filter1d
 
 Image = NDArray[np.float32]
 
-# What is looked at, in heights of the camera over level ground: from so near, and to either side.
-# Roads bend up and down, so that only the nearest is flat: up to so far, or where the nearest that
-# is seen is far already, to so many times that, but not beyond the last.
-_NEAR, _ASIDE = 1.0, 1.5
-_FLAT, _TIMES, _FAR = 6.0, 1.5, 14.0
 
-# Fewer pixels than this see too little; more than this only cost time.
-_LEAST_PIXELS, _PIXELS = 400, 4000
+@dataclass(frozen=True)
+class GroundTuning:
+    """Constants of the ground, each with where it comes from ("chosen" was not searched)."""
 
-# Pixels of an image from which those are chosen.
-_CANDIDATES = 500_000
+    # What is looked at, in heights of the camera over level ground; chosen for a car's lane:
+    # from so near, and to either side
+    near: float = 1.0
+    aside: float = 1.5
+    # roads bend up and down, so that only the nearest is flat: up to so far, or where the nearest
+    # that is seen is far already, to so many times that, but not beyond the last
+    flat: float = 6.0
+    times: float = 1.5
+    far: float = 14.0
 
-# Ways between two views that are searched, in heights; in steps of a pixel or two.
-_WAYS, _STEP = (0.02, 4.0), 0.03
+    # Pixels. Chosen: fewer than this see too little; more than this only cost time
+    least_pixels: int = 400
+    pixels: int = 4000
+    # of an image, from which those are chosen; chosen: the size of a car's camera
+    candidates: int = 500_000
 
-# Correlation with which ground is seen again. Walls and cars that are taken for ground have less.
-_SEEN = 0.6
+    # The search. Ways between two views in heights; chosen, from a crawl to a jump of a car
+    ways: tuple[float, float] = (0.02, 4.0)
+    # of the logarithm of a way: makes steps of a pixel or two
+    step: float = 0.03
+    # correlation with which ground is seen again; chosen: walls and cars that are taken for
+    # ground have less
+    seen: float = 0.6
+    # chosen: correlation with which images about whose motion nothing is known are of one place
+    same: float = 0.95
+    # chosen: another way must correlate by so much less, if it is no neighbour by so many steps
+    clearly: float = 0.1
+    neighbours: int = 6
+    # pixels; chosen: ground that moves by less, while other things show that the camera moves,
+    # is none: something that moves with the camera hides it
+    least_shift: float = 1.0
 
-# Correlation with which images about whose motion nothing is known are of one place.
-_SAME = 0.95
+    # The texture. Gray levels at which contrast is noise, a camera's usual
+    noise: float = 2.0
+    # pixels over which contrast is evened out; chosen. Nearer than half of that to the rim of
+    # the image, what lies beyond would have to be invented
+    side: int = 25
+    rim: int = side // 2 + 2
 
-# Another way must correlate by so much less, if it is no neighbour by so many steps.
-_CLEARLY, _NEIGHBOURS = 0.1, 6
+    # The fit. Standard deviation in rad of the normals considered, about level ground's: the 2
+    # degrees to which the pitch is to be given, and a road's own on top
+    lean: float = math.radians(3.0)
+    # pixels that cells of flat ground are off at most, in the median; chosen: walls are off more
+    uneven: float = 0.6
+    # chosen: rounds of Gauss-Newton, and the share of the plane by which it moves at rest
+    rounds: int = 10
+    rests: float = 1e-3
 
-# Ground that moves by less than this many pixels, while other things show that the camera moves,
-# is none: something that moves with the camera hides it.
-_LEAST_SHIFT = 1.0
 
-# Gray levels at which contrast is noise, and the side in pixels over which it is evened out.
-# Nearer than half of that to the rim of the image, what lies beyond would have to be invented.
-_NOISE, _SIDE = 2.0, 25
-_RIM = _SIDE // 2 + 2
-
-# Normals that the fit of one pair considers, about that of level ground: standard deviation.
-_LEAN = np.radians(3.0)
-
-# Residuals in a cell of this side in pixels err together; and what correlation over longer
-# distances adds: as for the pose.
-_CELL, _INFLATION = 32, 4.0
-
-# Pixels that cells of flat ground are off at most, in the median.
-_UNEVEN = 0.6
-
-_ROUNDS, _RESTS = 10, 1e-3
+TUNING = GroundTuning()
 
 
 @dataclass(frozen=True)
@@ -93,27 +105,27 @@ class Ground:
         """Choose the pixels that see ground."""
         self._normal = np.array([0.0, np.cos(pitch), np.sin(pitch)])
         self._forward = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
-        self._reach = _FAR
+        self._reach = TUNING.far
         # Of large images every second row and column, and so on, are more than enough.
-        every = max(math.isqrt(shape[0] * shape[1] // _CANDIDATES), 1)
-        columns, rows = np.meshgrid(np.arange(_RIM, shape[1] - _RIM, every),
-                                    np.arange(_RIM, shape[0] - _RIM, every))
+        every = max(math.isqrt(shape[0] * shape[1] // TUNING.candidates), 1)
+        columns, rows = np.meshgrid(np.arange(TUNING.rim, shape[1] - TUNING.rim, every),
+                                    np.arange(TUNING.rim, shape[0] - TUNING.rim, every))
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
         rays = homogeneous(pixels) @ np.linalg.inv(K).T
         seen = self._sees(rays)
         if seen.any():
-            self._reach = max(_FLAT, _TIMES * float(self._ahead(rays[seen]).min()))
+            self._reach = max(TUNING.flat, TUNING.times * float(self._ahead(rays[seen]).min()))
         chosen = np.flatnonzero(self._sees(rays))
-        self.is_in_view = len(chosen) >= _LEAST_PIXELS
+        self.is_in_view = len(chosen) >= TUNING.least_pixels
         if not self.is_in_view:
             return
-        some = np.linspace(0, len(chosen) - 1, min(len(chosen), _PIXELS)).astype(np.int64)
+        some = np.linspace(0, len(chosen) - 1, min(len(chosen), TUNING.pixels)).astype(np.int64)
         self._pixels, self._rays = pixels[chosen[some]], rays[chosen[some]]
         # Above the ground nothing is looked at, but for what the filters reach.
-        self._top = max(int(self._pixels[:, 1].min()) - _SIDE, 0)
+        self._top = max(int(self._pixels[:, 1].min()) - TUNING.side, 0)
         self._K = K - [[0, 0, 0], [0, 0, self._top], [0, 0, 0]]
         self._pixels[:, 1] -= self._top
-        _, self._cells = np.unique((self._pixels // _CELL) @ [1, 1 << 16], return_inverse=True)
+        _, self._cells = np.unique((self._pixels // CELL) @ [1, 1 << 16], return_inverse=True)
 
     def _ahead(self, rays: Array) -> Array:
         """Give how far ahead, in heights, rays (N, 3) meet level ground; infinite above it."""
@@ -122,13 +134,14 @@ class Ground:
         return np.asarray(ahead / np.maximum(inverse, 1e-9))
 
     def _sees(self, rays: Array) -> NDArray[np.bool_]:
-        """Tell of rays (N, 3) whether they meet level ground that is looked at."""
+        """(N,) bool mask of the rays (N, 3) that meet level ground that is looked at."""
         ahead = self._ahead(rays)
         aside = np.abs(rays[:, 0]) / np.maximum(rays @ self._normal, 1e-9)
-        return np.asarray((ahead > _NEAR) & (ahead < min(self._reach, _FAR)) & (aside < _ASIDE))
+        return np.asarray((ahead > TUNING.near) & (ahead < min(self._reach, TUNING.far))
+                          & (aside < TUNING.aside))
 
     def motion(self, previous: View, current: View, relative: RelativePose,
-               ways: tuple[float, float] = _WAYS) -> GroundMotion | None:
+               ways: tuple[float, float] = TUNING.ways) -> GroundMotion | None:
         """
         Find how the ground moves between two views, from the motion between them.
 
@@ -143,17 +156,17 @@ class Ground:
             return self._standing(wanted, there, relative)
         start = self._search(wanted, there, relative, ways)
         if start is None:
-            start = self._search(wanted, there, relative, _WAYS)
+            start = self._search(wanted, there, relative, TUNING.ways)
         return None if start is None else self._fit(wanted, there, relative, start)
 
     def _texture(self, view: View) -> Image:
         """Image whose contrast is alike everywhere, from the highest row looked at."""
         gray = cv2.GaussianBlur(view.gray[self._top:], (0, 0), 1.0).astype(np.float32)
-        detail = gray - cv2.blur(gray, (_SIDE, _SIDE))
+        detail = gray - cv2.blur(gray, (TUNING.side, TUNING.side))
         # The running sums of a filter may end a little below zero.
-        power = np.maximum(cv2.blur(detail**2, (_SIDE, _SIDE)), 0.0)
-        inner, rim = np.full(gray.shape, np.nan, np.float32), _SIDE // 2
-        inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + _NOISE))[rim:-rim, rim:-rim]
+        power = np.maximum(cv2.blur(detail**2, (TUNING.side, TUNING.side)), 0.0)
+        inner, rim = np.full(gray.shape, np.nan, np.float32), TUNING.side // 2
+        inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + TUNING.noise))[rim:-rim, rim:-rim]
         return inner
 
     def _seen_again(self, R: Array, t: Array, m: Array) -> Array:
@@ -168,24 +181,24 @@ class Ground:
         R = relative.R if turned else np.eye(3)
         correlation = _correlation(
             wanted, _sampled(there, self._seen_again(R, np.zeros(3), self._normal)))
-        if correlation < (_SEEN if turned else _SAME):
+        if correlation < (TUNING.seen if turned else TUNING.same):
             return None
-        least = _LEAST_SHIFT / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
+        least = TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
         return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]), correlation)
 
     def _search(self, wanted: Array, there: Image, relative: RelativePose,
                 ways: tuple[float, float]) -> Array | None:
         """Plane (3,) of the way under which level ground correlates best, if one stands out."""
-        low, high = max(ways[0], _WAYS[0]), min(ways[1], _WAYS[1])
-        tried = np.exp(np.arange(np.log(low) - _STEP, np.log(max(low, high)) + 2 * _STEP, _STEP))
+        low, high, step = max(ways[0], TUNING.ways[0]), min(ways[1], TUNING.ways[1]), TUNING.step
+        tried = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
         found = np.array([_correlation(wanted, _sampled(there, self._seen_again(
             relative.R, relative.t, way * self._normal))) for way in tried])
         best = int(found.argmax())
-        if found[best] < _SEEN or best in (0, len(found) - 1):
+        if found[best] < TUNING.seen or best in (0, len(found) - 1):
             return None
         # Textures that repeat have several peaks; slow ground has one, but a broad one.
-        peaks = found == maximum_filter1d(found, 2 * _NEIGHBOURS + 1, mode='nearest')
-        if (peaks & (found > found[best] - _CLEARLY)).sum() > 1:
+        peaks = found == maximum_filter1d(found, 2 * TUNING.neighbours + 1, mode='nearest')
+        if (peaks & (found > found[best] - TUNING.clearly)).sum() > 1:
             return None
         return np.asarray(tried[best] * self._normal)
 
@@ -202,7 +215,7 @@ class Ground:
         tangents, theta = sphere_tangents(relative.t), np.zeros(5)
         gradients = [np.asarray(cv2.Scharr(there, -1, *axis, scale=1 / 32), np.float32)
                      for axis in ((1, 0), (0, 1))]
-        for _ in range(_ROUNDS):
+        for _ in range(TUNING.rounds):
             R = rotation_exp(theta[:3]) @ relative.R
             t = relative.t + tangents @ theta[3:]
             places = self._seen_again(R, t, m)
@@ -210,7 +223,7 @@ class Ground:
             r = found - wanted
             J = self._jacobian([_sampled(g, places) for g in gradients], R, t, m, tangents)
             inside = np.isfinite(r) & np.isfinite(J).all(axis=1)
-            if inside.sum() < _LEAST_PIXELS:
+            if inside.sum() < TUNING.least_pixels:
                 return None
             J, r = np.where(inside[:, None], J, 0.0), np.where(inside, r, 0.0)
             hessian, gradient, spread = self._normal_equations(J, r, inside)
@@ -226,13 +239,13 @@ class Ground:
             gradient[3:] += known[3:, 3:] @ theta
             step = -np.linalg.solve(total, gradient)
             m, theta = m + step[:3], theta + step[3:]
-            if np.linalg.norm(step[:3]) < _RESTS * np.linalg.norm(m):
+            if np.linalg.norm(step[:3]) < TUNING.rests * np.linalg.norm(m):
                 break
         shift = float(np.median(np.linalg.norm(
             places - self._seen_again(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
-        if correlation < _SEEN or shift < _LEAST_SHIFT or m @ self._normal <= 0 \
-                or not self._unevenness(r, J, R, t, m) <= _UNEVEN:
+        if correlation < TUNING.seen or shift < TUNING.least_shift or m @ self._normal <= 0 \
+                or not self._unevenness(r, J, R, t, m) <= TUNING.uneven:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
@@ -269,7 +282,7 @@ class Ground:
         scores = np.stack([np.bincount(self._cells, column)
                            for column in (J * (weights * r)[:, None]).T])
         parameters, cells = scores.shape
-        inflation = _INFLATION * cells / max(cells - parameters, 1)
+        inflation = CAUTIOUS_INFLATION * cells / max(cells - parameters, 1)
         return ((J * weights[:, None]).T @ J, scores.sum(axis=1),
                 inflation * scores @ scores.T)
 
@@ -285,7 +298,7 @@ def _sampled(image: Image, pixels: Array) -> Array:
 def _correlation(a: Array, b: Array) -> float:
     """Correlation of two samples (N,) where the second is there; 0 if that is too little."""
     there = np.isfinite(b)
-    if there.sum() < max(_LEAST_PIXELS, len(b) / 4):
+    if there.sum() < max(TUNING.least_pixels, len(b) / 4):
         return 0.0
     a, b = a[there], b[there]
     power = float(a @ a) * float(b @ b)
@@ -294,11 +307,11 @@ def _correlation(a: Array, b: Array) -> float:
 
 def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
     """
-    Tell how a plane leans against level ground, in deviations of _LEAN.
+    Tell how a plane leans against level ground, in its usual deviations.
 
     Gives the derivative (2, 3) by the plane, and the lean (2,) itself.
     """
-    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _LEAN
+    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / TUNING.lean
     length = float(np.linalg.norm(m))
     n = m / length
     return across @ (np.eye(3) - np.outer(n, n)) / length, across @ n

@@ -41,7 +41,7 @@ def smooth(gray: Image) -> Image:
 
 
 def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0) -> NDArray[np.bool_]:
-    """Tell, (N,) bool, where a descriptor can be had at every pixel within `radius`."""
+    """(N,) bool mask of the points with a descriptor at every pixel within `radius`."""
     margin = REACH + radius
     height, width = shape[:2]
     return np.asarray((points[:, 0] >= margin) & (points[:, 0] < width - margin)

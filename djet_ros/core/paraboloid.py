@@ -72,7 +72,7 @@ def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Par
 
 
 def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
-    """Tell, (N,) bool, which paraboloids have no minimum."""
+    """(N,) bool mask of the paraboloids that have no minimum."""
     A = paraboloids.A
     determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1]**2
     return np.asarray((determinant <= 0) | (A[:, 0, 0] + A[:, 1, 1] <= 0))

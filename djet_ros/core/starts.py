@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 from djet_ros.core.geometry import in_front, nearest_rotation, rays, unit
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,14 +13,6 @@ FORWARD = np.array([0.0, 0.0, -1.0])
 
 # As many matches tell a motion from the false ones; all of them are for the optimisation.
 _RANSAC_MATCHES = 600
-
-
-@dataclass(frozen=True)
-class Pose:
-    """A relative pose: R (3, 3), and t (3,) of unit length."""
-
-    R: Array
-    t: Array
 
 
 def five_point(K: Array, x: Array, y: Array, threshold: float,

@@ -92,7 +92,7 @@ class DescriptorSurface:
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
     def _see_through(self, warp: Array) -> NDArray[np.bool_]:
-        """Sample reference descriptors through a warp; tells, (N,) bool, where it mattered."""
+        """Sample reference descriptors through a warp; (N,) bool mask of those that it changed."""
         anew: NDArray[np.bool_] = self._has_reference & (
             np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP)
         self._reference[:, anew] = self._distances.reference(

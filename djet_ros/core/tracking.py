@@ -25,42 +25,46 @@ from djet_ros.core.jet import (
     Solution,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.starts import Pose, thinned
+from djet_ros.core.starts import thinned
 from djet_ros.core.surfaces import ResidualSurface, with_minimum
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
-# Residuals of perfect data must not shrink the loss to nothing, in pixels.
-_LEAST_SCALE = 0.02
 
-# Next to the epipole the direction of a line is noise: within about so many pixels a match that
-# fits by chance would hold the epipole where it is, and make it look far surer than it is.
-_EPIPOLE_BLUR = 5.0
+@dataclass(frozen=True)
+class TrackTuning:
+    """Constants of the optimisation, each with where it comes from ("chosen" was not searched)."""
 
-# Basins are told apart under a loss that bends already at this many standard deviations: a second
-# motion in the scene fits many matches loosely, the camera's own fits most of them closely.
-_TIGHT = 1.0
+    # pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
+    least_scale: float = 0.02
+    # pixels; chosen, about a window: so near to the epipole the direction of a line is noise, and
+    # a match that fits by chance would hold the epipole and make it look far surer than it is
+    epipole_blur: float = 5.0
+    # robust standard deviations; chosen: a second motion in the scene fits many matches loosely,
+    # the camera's own fits most of them closely, so a loss that bends here tells basins apart
+    tight: float = 1.0
+    # chosen: where a start lies says little of its basin, so all make a few steps on some matches
+    steps_to_sketch: int = 4
+    matches_to_sketch: int = 800
+    # chosen: it costs little to refine all starts on so few, and there basins lie closer
+    few_matches: int = 400
+    # chosen: the cheapest two that lie in different basins are refined
+    refined_starts: int = 2
+    # rad; chosen: poses nearer than this lie in one basin
+    same_basin: float = 0.02
+    # chosen: steps on all matches before costs are compared
+    steps_to_compare: int = 7
+    # variances of a residual; from a rendered dive, where few matches leave a choice between a
+    # plane's own motion and its twin: matches of one neighbourhood err alike
+    undecided: float = 10.0
+    # chosen: a patch that would be stretched or shrunk by more is a false match
+    most_stretch: float = 2.0
+    # robust standard deviations; the usual three, within which a match agrees with a pose
+    inlier: float = 3.0
 
-# All starts make a few steps on some of the matches, the most promising of them some more on all:
-# where a start lies says little of its basin.
-_STEPS_TO_SKETCH = 4
-_MATCHES_TO_SKETCH = 800
-_FEW_MATCHES = 400  # all starts are refined on so few: it costs little, and basins lie closer
-_REFINED_STARTS = 2
-_SAME_BASIN = 0.02  # rad
-_STEPS_TO_COMPARE = 7
 
-# Costs that differ by less, in variances of a residual, tell nothing: matches of one neighbourhood
-# err alike. A plane seen by few matches leaves such a choice, between its own motion and its twin.
-_UNDECIDED = 10.0
-
-# A patch that would be stretched or shrunk by more than this, or seen by one camera from behind,
-# is a false match.
-_MOST_STRETCH = 2.0
-
-# A match agrees with a pose within this many robust standard deviations.
-_INLIER = 3.0
+TUNING = TrackTuning()
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,8 @@ class Track:
         return _scale(self.residuals)
 
     def inliers(self) -> NDArray[np.bool_]:
-        """Tell, (N,) bool, which matches voted and agree with the pose."""
-        agree = np.abs(self.residuals.r) < _INLIER * self.scale()
+        """(N,) bool mask of the matches that voted and agree with the pose."""
+        agree = np.abs(self.residuals.r) < TUNING.inlier * self.scale()
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers
@@ -119,7 +123,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         if voting.sum() < config.min_matches:
             return None
         # Step 2: global pose optimisation.
-        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting), _EPIPOLE_BLUR)
+        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting),
+                              TUNING.epipole_blur)
         solution, loss = _cheapest(problem, poses, config, prior)
         pose = _pose(solution)
         # Keypoints go towards their optimum on the epipolar line of the new pose.
@@ -149,15 +154,16 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
               prior: Pose | None) -> tuple[Solution, Loss]:
     """Refine the most promising starts, and the cheapest of them to the end."""
-    some = problem.subset(thinned(len(problem.blur), _MATCHES_TO_SKETCH))
+    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
     scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
-    tight = Loss(config.loss, min(config.loss_scale, _TIGHT) * scale)
-    if len(starts) > 1 and len(problem.blur) > _FEW_MATCHES:
-        starts = _promising([minimise(some, s.R, s.t, tight, _STEPS_TO_SKETCH) for s in starts])
-    refined = [minimise(problem, s.R, s.t, tight, _STEPS_TO_COMPARE) for s in starts]
+    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+    if len(starts) > 1 and len(problem.blur) > TUNING.few_matches:
+        starts = _promising([minimise(some, s.R, s.t, tight, TUNING.steps_to_sketch)
+                             for s in starts])
+    refined = [minimise(problem, s.R, s.t, tight, TUNING.steps_to_compare) for s in starts]
     best = min(refined, key=lambda solution: solution.cost)
     if prior is not None:
-        undecided = best.cost + _UNDECIDED * _scale(best.residuals)**2
+        undecided = best.cost + TUNING.undecided * _scale(best.residuals)**2
         best = min((solution for solution in refined if solution.cost < undecided),
                    key=lambda solution: _apart(prior, _pose(solution)))
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
@@ -169,9 +175,9 @@ def _promising(sketched: list[Solution]) -> list[Pose]:
     chosen: list[Pose] = []
     for solution in sorted(sketched, key=lambda solution: solution.cost):
         pose = _pose(solution)
-        if all(_apart(other, pose) > _SAME_BASIN for other in chosen):
+        if all(_apart(other, pose) > TUNING.same_basin for other in chosen):
             chosen.append(pose)
-    return chosen[:_REFINED_STARTS]
+    return chosen[:TUNING.refined_starts]
 
 
 def _pose(solution: Solution) -> Pose:
@@ -179,11 +185,11 @@ def _pose(solution: Solution) -> Pose:
 
 
 def _scale(residuals: Residuals) -> float:
-    return max(robust_scale(residuals.r), _LEAST_SCALE)
+    return max(robust_scale(residuals.r), TUNING.least_scale)
 
 
 def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:
-    """Believe only minima inside the sampled window, (N,) bool: the rest is extrapolation."""
+    """(N,) bool mask of the minima inside the sampled window: the rest is extrapolation."""
     reach = np.abs(paraboloids.minima() - paraboloids.centres).max(1)
     return np.asarray(reach <= config.window // 2)
 
@@ -213,7 +219,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     seen = np.where(np.isnan(seen), 1.0, seen)  # without any parallax, or on the epipole
     warp = patch_warp(K, pose.R, y, seen)
     least, most = stretches(warp)
-    plausible = (seen > 0) & (least > 1 / _MOST_STRETCH) & (most < _MOST_STRETCH)
+    plausible = (seen > 0) & (least > 1 / TUNING.most_stretch) & (most < TUNING.most_stretch)
     return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
 
 

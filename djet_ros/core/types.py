@@ -1,4 +1,4 @@
-"""The values that travel through the core: camera, features, and the relative pose."""
+"""The values that travel through the core: features, views, poses, and what vouches for them."""
 
 from __future__ import annotations
 
@@ -57,6 +57,14 @@ class View:
     K: Array
     features: Features
     smoothed: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A relative pose: R (3, 3), and t (3,) of unit length."""
+
+    R: Array
+    t: Array
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 
+from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rays, unit
@@ -29,10 +30,6 @@ _SEARCH_RADIUS = 0.4
 
 # Points that two pairs of views must share, for the one to tell the other its length.
 _LEAST_SHARED = 20
-
-# Points in a cell of this side in pixels err together; and what correlation over longer distances
-# adds to the variance of a length: both as for the pose.
-_CELL, _INFLATION = 32, 4.0
 
 # Parallax in rad below which a depth is noise (about a pixel of a car's camera).
 _LEAST_PARALLAX = 1.5e-3
@@ -141,8 +138,7 @@ class EdgeFinder:
     def _view(self, keyframe: int) -> View:
         seen = self._seen[keyframe]
         frame = seen.frame
-        # A copy of the features: what they cache of themselves is large.
-        return View(frame.gray, frame.K, replace(seen.features), smooth(frame.gray))
+        return View(frame.gray, frame.K, seen.features, smooth(frame.gray))
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
@@ -164,10 +160,10 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
     ratio = float(np.median(ratios))
     if ratio <= 0:
         return unknown(length.value)
-    # Standard deviation of a median, if places apart err independently: as for the pose.
+    # Standard deviation of a median, if places apart err independently, and more than that.
     spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    places = len(np.unique(step.x[step.inliers][here][told] // _CELL, axis=0))
-    sigma = 1.2533 * spread * np.sqrt(_INFLATION / places)
+    places = len(np.unique(step.x[step.inliers][here][told] // CELL, axis=0))
+    sigma = 1.2533 * spread * np.sqrt(CAUTIOUS_INFLATION / places)
     return Length(length.value * ratio,
                   float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
 
