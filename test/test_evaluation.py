@@ -19,13 +19,13 @@ from time import monotonic, sleep
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.types import Status
-from djet_ros.lab.entrants import default_methods, Entrant, TITLES
 from djet_ros.lab.evo import trajectory_metrics
-from djet_ros.lab.pairs import Chunk, evaluate_chunk, has_failed, PairRecord
+from djet_ros.lab.integration import estimated_trajectory, true_trajectory
+from djet_ros.lab.methods import default_methods, Method, TITLES
+from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
 from djet_ros.lab.scenes import render_sequence
-from djet_ros.lab.sources import open_sources, Selection, Source
+from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.summary import table_rows
-from djet_ros.lab.trajectories import estimated_trajectory, true_trajectory
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
@@ -152,7 +152,7 @@ def test_trajectories_stand_beside_the_ground_truth(road, evaluated):
 
 
 def test_perfect_motions_make_the_true_trajectory(road, tmp_path):
-    source, = open_sources([road], Selection(), tmp_path)
+    source, = open_datasets([road], Selection(), tmp_path)
     truth = KittiSequence(road).poses
     records = [record(pair=i, rotation=tuple(cv2.Rodrigues(motion[:3, :3])[0].ravel()),
                       translation=tuple(motion[:3, 3] / np.linalg.norm(motion[:3, 3])))
@@ -203,11 +203,11 @@ def test_a_failure_is_what_it_is_said_to_be(rotation, translation, way, failed):
 
 
 def test_pairs_without_ground_truth_are_left_out(road, tmp_path):
-    source, = open_sources([road], Selection(), tmp_path)
-    entrant = Entrant('five_point', 'best', EstimatorConfig(method='five_point'))
-    assert len(evaluate_chunk(Chunk(source, 0, 2), [entrant])) == 2
-    other = Source('torn', '', torn_truth(road, tmp_path), range(4), '')
-    assert [found.pair for found in evaluate_chunk(Chunk(other, 0, 3), [entrant])] == [1]
+    source, = open_datasets([road], Selection(), tmp_path)
+    method = Method('five_point', 'best', EstimatorConfig(method='five_point'))
+    assert len(evaluate_chunk(PairChunk(source, 0, 2), [method])) == 2
+    other = Dataset('torn', '', torn_truth(road, tmp_path), range(4), '')
+    assert [found.pair for found in evaluate_chunk(PairChunk(other, 0, 3), [method])] == [1]
 
 
 def torn_truth(road: Path, folder: Path) -> Path:
@@ -238,7 +238,7 @@ def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path
 
 
 def test_frames_are_chosen_by_start_end_and_stride(road, tmp_path):
-    source, = open_sources([road], Selection(1, 8, 3), tmp_path)
+    source, = open_datasets([road], Selection(1, 8, 3), tmp_path)
     assert list(source.frames) == [1, 4, 7]
 
 
@@ -247,7 +247,7 @@ def test_a_folder_of_sequences_is_all_of_them_with_names_of_their_own(road, tmp_
         shutil.copytree(road, tmp_path / 'sequences' / name)
         (tmp_path / 'poses').mkdir(exist_ok=True)
         shutil.copy(road.parent.parent / 'poses' / '00.txt', tmp_path / 'poses' / f'{name}.txt')
-    sources = open_sources([tmp_path], Selection(), tmp_path)
+    sources = open_datasets([tmp_path], Selection(), tmp_path)
     assert [source.name for source in sources] == ['road', 'road-2']
 
 
@@ -461,11 +461,11 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
 
 
 def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):
-    source, = open_sources([road], Selection(), tmp_path)
+    source, = open_datasets([road], Selection(), tmp_path)
     config = preset('paper', method='rpe')
-    records = evaluate_chunk(Chunk(source, 0, 5), [
-        Entrant('rpe', 'paper', config),
-        Entrant('rpe', 'paper', replace(config, starts='several'), good_start=True)])
+    records = evaluate_chunk(PairChunk(source, 0, 5), [
+        Method('rpe', 'paper', config),
+        Method('rpe', 'paper', replace(config, starts='several'), good_start=True)])
     without, with_it = records[::2], records[1::2]
     assert all(a.matches > b.matches for a, b in zip(without, with_it))
     assert (np.mean([found.rotation_error_deg for found in with_it])

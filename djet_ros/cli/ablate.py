@@ -13,7 +13,7 @@ from djet_ros.cli.pair_runs import (
     split,
 )
 from djet_ros.errors import DjetError
-from djet_ros.lab.ablation import ablation_entrants, PARTS
+from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.ablation_report import write_ablation
 from rich.console import Console
 
@@ -41,10 +41,10 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run all variants, and print the tables."""
-    competing = ablation_entrants(split(args.presets), split(args.parts), _windows(args.windows),
-                                  shared_values(args), good_start=args.good_start)
-    with evaluated(args, competing) as (sources, records):
-        tables = write_ablation(args.output, sources, competing, records)
+    competing = ablation_methods(split(args.presets), split(args.parts), _windows(args.windows),
+                                 shared_values(args), good_start=args.good_start)
+    with evaluated(args, competing) as (datasets, records):
+        tables = write_ablation(args.output, datasets, competing, records)
     console = Console()
     for table in tables:
         print_table(console, table)

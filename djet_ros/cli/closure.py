@@ -13,8 +13,8 @@ from djet_ros.cli.pair_runs import split
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
 from djet_ros.lab.closure import closures, summary, Triangle
-from djet_ros.lab.entrants import check_names, TITLES
-from djet_ros.lab.sources import plain_name, readable_frames
+from djet_ros.lab.methods import check_names, TITLES
+from djet_ros.lab.sequences import plain_name, readable_frames
 from djet_ros.recordings.outputs import check_file
 import numpy as np
 from rich.console import Console

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.names import Names
     names = Names(args.node, args.remap)
-    view = View(names.full_node.strip('/'))
+    view = Monitor(names.full_node.strip('/'))
     with Graph() as graph:
         graph.listen(names.resolve('~/odometry'), 'nav_msgs/msg/Odometry',
                      view.odometry if args.diagnostics else _print_pose)
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 @dataclass
-class View:
+class Monitor:
     """What is known of the odometry, from its messages so far."""
 
     node: str
@@ -121,7 +121,7 @@ def _print_pose(message: Any) -> None:
           f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}', flush=True)
 
 
-def _show(view: View, graph: Any, stop: Event) -> None:
+def _show(view: Monitor, graph: Any, stop: Event) -> None:
     """Keep a terminal up to date, or print a line for each diagnostics message."""
     console = Console()
     if console.is_terminal:

@@ -12,8 +12,8 @@ from djet_ros.cli.pair_runs import (
     shared_values,
     split,
 )
-from djet_ros.lab.entrants import default_methods, entrants, TITLES
 from djet_ros.lab.evo import find_tool
+from djet_ros.lab.methods import default_methods, make_methods, TITLES
 from djet_ros.lab.report import write_report
 from rich.console import Console
 
@@ -37,11 +37,11 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, and print the tables."""
     methods = default_methods() if args.methods is None else split(args.methods)
-    competing = entrants(methods, split(args.presets), shared_values(args))
+    competing = make_methods(methods, split(args.presets), shared_values(args))
     if args.evo:
         find_tool('evo_ape')
-    with evaluated(args, competing) as (sources, records):
-        tables = write_report(args.output, sources, competing, records, with_evo=args.evo)
+    with evaluated(args, competing) as (datasets, records):
+        tables = write_report(args.output, datasets, competing, records, with_evo=args.evo)
     console = Console()
     for table in tables:
         print_table(console, table)

@@ -15,10 +15,10 @@ from typing import Any
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.core.estimator_config import PRESETS
 from djet_ros.errors import DjetError
-from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.runner import dask_workers, local_workers, run
-from djet_ros.lab.sources import open_sources, Selection, Source
+from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
 from rich.box import SIMPLE_HEAD
@@ -69,21 +69,21 @@ def shared_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 @contextmanager
-def evaluated(args: argparse.Namespace, competing: Sequence[Entrant]
-              ) -> Iterator[tuple[list[Source], list[PairRecord]]]:
-    """Run all pairs with a progress bar; sources and records are good within the context."""
+def evaluated(args: argparse.Namespace, competing: Sequence[Method]
+              ) -> Iterator[tuple[list[Dataset], list[PairRecord]]]:
+    """Run all pairs with a progress bar; datasets and records are good within the context."""
     if args.workers is not None and args.workers < 1:
         raise DjetError(f'workers is {args.workers}; at least one is needed')
     selection = Selection(args.start, args.end, args.stride)
     # Frames of bags are kept beside the results, where workers on other machines see them too.
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()
     try:
-        sources = open_sources(args.sources, selection, workspace)
+        datasets = open_datasets(args.sources, selection, workspace)
         args.output.mkdir(parents=True, exist_ok=True)
-        with RecordStore(args.output, sources, competing, overwrite=args.overwrite) as store:
+        with RecordStore(args.output, datasets, competing, overwrite=args.overwrite) as store:
             with _workers(args) as executor, _progress() as progress:
-                records = run(executor, sources, competing, store, progress)
-        yield sources, records
+                records = run(executor, datasets, competing, store, progress)
+        yield datasets, records
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
 

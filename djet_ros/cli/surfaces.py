@@ -14,8 +14,8 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import PRESETS
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.lab.sequences import pair_of_frames
 from djet_ros.lab.similarity import read_image
-from djet_ros.lab.sources import pair_of_frames
 from djet_ros.lab.surface_steps import animate_course, draw_course, follow, telling_match
 from djet_ros.recordings.outputs import check_file
 import numpy as np

@@ -8,7 +8,7 @@ from typing import Any
 
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
 from djet_ros.errors import DjetError
-from djet_ros.lab.entrants import check_names, configured, Entrant
+from djet_ros.lab.methods import check_names, configured, Method
 
 # Parameters that re-projection error has as well: a change of these is tried on both.
 _OF_BOTH = {'starts', 'loss', 'search_radius'}
@@ -67,13 +67,13 @@ def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
 PARTS = tuple(changes(()))
 
 
-def ablation_entrants(presets: Sequence[str], parts: Sequence[str], windows: Sequence[int],
-                      values: Mapping[str, Any], *, good_start: bool = False) -> list[Entrant]:
+def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequence[int],
+                     values: Mapping[str, Any], *, good_start: bool = False) -> list[Method]:
     """
     Let D-JET start with each preset and with each single change of it.
 
     Beside them start RP-E, with the changes that it knows too, and the 5-point method.
-    good_start: see Entrant; presets with the 5-point start take it among several then. Raises
+    good_start: see Method; presets with the 5-point start take it among several then. Raises
     DjetError on unknown names and on windows that can't be.
     """
     check_names('preset', presets, PRESETS)
@@ -81,10 +81,10 @@ def ablation_entrants(presets: Sequence[str], parts: Sequence[str], windows: Seq
     chosen = changes(windows)
     if good_start:
         values = {**values, 'starts': 'several'}
-    competing: list[Entrant] = []
+    competing: list[Method] = []
     for name in presets:
-        base = {method: Entrant(method, name, configured(method, name, values),
-                                good_start=good_start)
+        base = {method: Method(method, name, configured(method, name, values),
+                               good_start=good_start)
                 for method in ('djet', 'rpe', 'five_point')}
         competing += base.values()
         for change in (change for part in parts for change in chosen[part]):
@@ -96,9 +96,9 @@ def ablation_entrants(presets: Sequence[str], parts: Sequence[str], windows: Seq
     return competing
 
 
-def _changed(entrant: Entrant, change: Change) -> Entrant:
+def _changed(method: Method, change: Change) -> Method:
     try:
-        return replace(entrant, config=replace(entrant.config, **change.values),
+        return replace(method, config=replace(method.config, **change.values),
                        change=change.text)
     except ValueError as error:
         raise DjetError(str(error)) from None

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.core.estimator_config import PRESETS
-from djet_ros.lab.entrants import Entrant, TITLES
+from djet_ros.lab.methods import Method, TITLES
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.published import TABLE_2
 from djet_ros.lab.report import CAPTION, Picture, write, write_page
-from djet_ros.lab.sources import Source
+from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.lab.summary import table_rows, TableRow
 from djet_ros.lab.tables import (
@@ -35,22 +35,22 @@ _MARKERS = {'djet': 'o', 'rpe': 'D', 'five_point': 's'}
 _LINE = 0.24
 
 
-def write_ablation(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant],
+def write_ablation(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method],
                    records: Sequence[PairRecord]) -> list[Table]:
     """Write everything but the records' store into the folder; gives the readable tables."""
     rows = table_rows(records)
-    caption = f'{_CAPTION} {_GOOD_START}' if entrants[0].good_start else _CAPTION
+    caption = f'{_CAPTION} {_GOOD_START}' if methods[0].good_start else _CAPTION
     tables = [ablation_table(caption, rows), published_table(_PUBLISHED, TABLE_2)]
     write(folder / 'ablation.csv', rows_csv(rows, with_change=True))
     write(folder / 'ablation.md', '\n'.join(markdown(table) for table in tables))
     write(folder / 'pairs.csv', pairs_csv(records, with_change=True))
     write(folder / 'timings.csv', timings_csv(records, with_change=True))
     pictures = {}
-    for source in sources:
-        path = folder / 'plots' / f'{source.name}_ablation.png'
-        plot_ablation(path, source.name, [row for row in rows if row.sequence == source.name])
-        pictures[source.name] = [Picture(path, 'mean and median error of each variant')]
-    write_page(folder, 'D-JET: what each part contributes', tables, pictures, entrants,
+    for dataset in datasets:
+        path = folder / 'plots' / f'{dataset.name}_ablation.png'
+        plot_ablation(path, dataset.name, [row for row in rows if row.sequence == dataset.name])
+        pictures[dataset.name] = [Picture(path, 'mean and median error of each variant')]
+    write_page(folder, 'D-JET: what each part contributes', tables, pictures, methods,
                ['ablation.csv', 'ablation.md', 'pairs.csv', 'timings.csv'])
     return tables
 

@@ -1,4 +1,4 @@
-"""The unit of work: some consecutive pairs of one sequence, estimated by every entrant."""
+"""The unit of work: some consecutive pairs of one sequence, estimated by every method."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.lab import peers
-from djet_ros.lab.entrants import Entrant
-from djet_ros.lab.sources import opened, Source
+from djet_ros.lab.methods import Method
+from djet_ros.lab.sequences import Dataset, opened
 from djet_ros.replay.pair_errors import has_direction, motion_errors
 import numpy as np
 from numpy.typing import NDArray
@@ -27,23 +27,23 @@ FAILURE = (f'no pose, rotation off by more than {GROSS_ROTATION:g} deg, or direc
 
 
 @dataclass(frozen=True)
-class Chunk:
-    """Pairs first, first + 1, … (count of them) of a source."""
+class PairChunk:
+    """Pairs first, first + 1, … (count of them) of a dataset."""
 
-    source: Source
+    dataset: Dataset
     first: int
     count: int
 
     @property
     def name(self) -> str:
         """Name that is the same in every run."""
-        return f'{self.source.name}:{self.first}+{self.count}'
+        return f'{self.dataset.name}:{self.first}+{self.count}'
 
 
 @dataclass(frozen=True)
 class PairRecord:
     """
-    What one entrant made of one pair of frames.
+    What one method made of one pair of frames.
 
     previous, current: indices of the frames in their sequence; errors in degrees, NaN where the
     estimate or the truth does not tell; failed: see FAILURE; hamming_mean: bits, over the
@@ -70,17 +70,17 @@ class PairRecord:
     milliseconds: float
 
 
-def evaluate_chunk(chunk: Chunk, entrants: Sequence[Entrant]) -> list[PairRecord]:
+def evaluate_chunk(chunk: PairChunk, methods: Sequence[Method]) -> list[PairRecord]:
     """
-    Estimate the pairs of a chunk by every entrant; pairs without ground truth are left out.
+    Estimate the pairs of a chunk by every method; pairs without ground truth are left out.
 
     Each pair is estimated on its own, without the motion before it as a start, so that the
     records do not depend on how pairs are spread over workers.
     """
     # Workers are as many as cores: threads of their own would only be in each other's way.
     cv2.setNumThreads(1)
-    sequence, frames = opened(chunk.source), chunk.source.frames
-    assert sequence.poses is not None  # sources without poses are refused at the start
+    sequence, frames = opened(chunk.dataset), chunk.dataset.frames
+    assert sequence.poses is not None  # datasets without poses are refused at the start
     records: list[PairRecord] = []
     current: _Image | None = None
     for pair in range(chunk.first, chunk.first + chunk.count):
@@ -90,15 +90,15 @@ def evaluate_chunk(chunk: Chunk, entrants: Sequence[Entrant]) -> list[PairRecord
                        @ sequence.poses[frames[pair + 1]])
         if np.isfinite(true_motion).all():
             shared = _SharedWork(previous, current)
-            records += [_record(chunk.source, pair, entrant, shared, true_motion)
-                        for entrant in entrants]
+            records += [_record(chunk.dataset, pair, method, shared, true_motion)
+                        for method in methods]
     return records
 
 
 @dataclass(frozen=True)
 class Given:
     """
-    What an entrant is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
+    What a method is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
 
     seconds: what the features of one view and the matches took.
     """
@@ -110,11 +110,11 @@ class Given:
     seconds: float
 
 
-def estimate(entrant: Entrant, given: Given) -> RelativePose:
-    """Estimate a pair by the entrant's method."""
-    config = entrant.config
-    if entrant.method in peers.ESTIMATORS:
-        return peers.estimate(entrant.method, *given.views, given.x, given.y,
+def estimate(method: Method, given: Given) -> RelativePose:
+    """Estimate a pair by a method."""
+    config = method.config
+    if method.name in peers.ESTIMATORS:
+        return peers.estimate(method.name, *given.views, given.x, given.y,
                               config.ransac_threshold, config.min_matches)
     return TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
 
@@ -126,32 +126,32 @@ class _Image:
         self._gray, self._K = gray, K
         self._views: dict[Any, tuple[View, float]] = {}
 
-    def view(self, entrant: Entrant) -> tuple[View, float]:
+    def view(self, method: Method) -> tuple[View, float]:
         """Give the view with its features, and the seconds that they took."""
-        key = (entrant.config.max_features, entrant.config.fast_threshold)
+        key = (method.config.max_features, method.config.fast_threshold)
         if key not in self._views:
             start = perf_counter()
-            view = TwoViewEstimator(entrant.config).view(self._gray, self._K)
+            view = TwoViewEstimator(method.config).view(self._gray, self._K)
             self._views[key] = view, perf_counter() - start
         return self._views[key]
 
 
 class _SharedWork:
-    """What all entrants with the same settings share in a pair: two views and their matches."""
+    """What all methods with the same settings share in a pair: two views and their matches."""
 
     def __init__(self, previous: _Image, current: _Image) -> None:
         self._images = previous, current
         self._given: dict[Any, Given] = {}
 
-    def given(self, entrant: Entrant) -> Given:
-        """Give what the entrant starts from."""
-        (previous, _), (current, seconds) = (image.view(entrant) for image in self._images)
-        key = (id(previous), entrant.config.search_radius, entrant.good_start)
+    def given(self, method: Method) -> Given:
+        """Give what the method starts from."""
+        (previous, _), (current, seconds) = (image.view(method) for image in self._images)
+        key = (id(previous), method.config.search_radius, method.good_start)
         if key not in self._given:
             start = perf_counter()
-            x, y = TwoViewEstimator(entrant.config).match(previous, current)
+            x, y = TwoViewEstimator(method.config).match(previous, current)
             given = Given((previous, current), x, y, None, seconds + perf_counter() - start)
-            self._given[key] = _with_good_start(given) if entrant.good_start else given
+            self._given[key] = _with_good_start(given) if method.good_start else given
         return self._given[key]
 
 
@@ -164,20 +164,20 @@ def _with_good_start(given: Given) -> Given:
     return replace(given, x=robust.x[robust.inliers], y=robust.y[robust.inliers], start=robust)
 
 
-def _record(source: Source, pair: int, entrant: Entrant, shared: _SharedWork,
+def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
             true_motion: Array) -> PairRecord:
-    given = shared.given(entrant)
+    given = shared.given(method)
     start = perf_counter()
-    result = estimate(entrant, given)
+    result = estimate(method, given)
     seconds = given.seconds + perf_counter() - start
     motion = camera_motion(result)
     rotation_error, translation_error = motion_errors(result.status, motion, true_motion)
     hamming = result.hamming[result.inliers] if len(result.hamming) else result.hamming
     hamming = hamming[np.isfinite(hamming)]
     return PairRecord(
-        sequence=source.name, pair=pair, previous=source.frames[pair],
-        current=source.frames[pair + 1], method=entrant.method, preset=entrant.preset,
-        change=entrant.change, status=result.status.value, matches=len(given.x),
+        sequence=dataset.name, pair=pair, previous=dataset.frames[pair],
+        current=dataset.frames[pair + 1], method=method.name, preset=method.preset,
+        change=method.change, status=result.status.value, matches=len(given.x),
         inliers=int(result.inliers.sum()),
         failed=has_failed(rotation_error, translation_error, true_motion),
         rotation_error_deg=rotation_error, translation_error_deg=translation_error,

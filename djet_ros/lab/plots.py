@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from djet_ros.lab.entrants import TITLES
+from djet_ros.lab.integration import StampedTrajectory
+from djet_ros.lab.methods import TITLES
 from djet_ros.lab.pairs import GROSS_ROTATION, GROSS_TRANSLATION, PairRecord
 from djet_ros.lab.style import COLOURS, DASHES, figure
-from djet_ros.lab.trajectories import Trajectory
 from matplotlib.axes import Axes
 import numpy as np
 
@@ -76,8 +76,8 @@ def plot_boxes(path: Path, title: str, groups: Groups) -> None:
             share_y=True, legend=False)
 
 
-def plot_trajectories(path: Path, title: str, truth: Trajectory,
-                      estimates: dict[str, dict[str, Trajectory]]) -> None:
+def plot_trajectories(path: Path, title: str, truth: StampedTrajectory,
+                      estimates: dict[str, dict[str, StampedTrajectory]]) -> None:
     """Draw trajectories from above, by preset and method; lengths are those of the truth."""
     with figure(path, 5.2 * len(estimates), 5.2) as drawing:
         drawing.suptitle(f'{title}: seen from above, lengths from the ground truth')

@@ -12,11 +12,16 @@ from urllib.parse import quote
 
 from djet_ros import __version__
 from djet_ros.lab import plots
-from djet_ros.lab.entrants import Entrant, TITLES
 from djet_ros.lab.evo import trajectory_metrics
+from djet_ros.lab.integration import (
+    estimated_trajectory,
+    StampedTrajectory,
+    true_trajectory,
+)
+from djet_ros.lab.methods import Method, TITLES
 from djet_ros.lab.pairs import FAILURE, PairRecord
 from djet_ros.lab.published import TABLE_1
-from djet_ros.lab.sources import Source
+from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.summary import table_rows
 from djet_ros.lab.tables import (
     html_table,
@@ -30,11 +35,6 @@ from djet_ros.lab.tables import (
     Table,
     table_csv,
     timings_csv,
-)
-from djet_ros.lab.trajectories import (
-    estimated_trajectory,
-    Trajectory,
-    true_trajectory,
 )
 
 CAPTION = ('Errors of relative poses against the ground truth in degrees, of rotation (rot.) and '
@@ -66,7 +66,7 @@ class Picture:
     text: str
 
 
-def write_report(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant],
+def write_report(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method],
                  records: Sequence[PairRecord], *, with_evo: bool = False) -> list[Table]:
     """
     Write everything but the records' store into the folder; gives the readable tables.
@@ -74,8 +74,8 @@ def write_report(folder: Path, sources: Sequence[Source], entrants: Sequence[Ent
     with_evo adds evo's metrics of the trajectories.
     """
     rows = table_rows(records)
-    printed = {source.name: TABLE_1[source.benchmark] for source in sources
-               if source.benchmark in TABLE_1}
+    printed = {dataset.name: TABLE_1[dataset.benchmark] for dataset in datasets
+               if dataset.benchmark in TABLE_1}
     tables = [results_table(CAPTION + PUBLISHED_NOTE if printed else CAPTION, rows, printed)]
     write(folder / 'table1.csv', rows_csv(rows, with_change=False))
     write(folder / 'table1.md', markdown(tables[0]))
@@ -83,12 +83,12 @@ def write_report(folder: Path, sources: Sequence[Source], entrants: Sequence[Ent
     write(folder / 'pairs.csv', pairs_csv(records, with_change=False))
     write(folder / 'timings.csv', timings_csv(records, with_change=False))
     files = ['table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv']
-    pictures = {source.name: list(_pictures(folder, source, records)) for source in sources}
+    pictures = {dataset.name: list(_pictures(folder, dataset, records)) for dataset in datasets}
     if with_evo:
-        tables.append(_evo_table(folder, sources, entrants))
+        tables.append(_evo_table(folder, datasets, methods))
         write(folder / 'evo.csv', table_csv(tables[1]))
         files.append('evo.csv')
-    write_page(folder, 'Relative pose of two frames: evaluation', tables, pictures, entrants,
+    write_page(folder, 'Relative pose of two frames: evaluation', tables, pictures, methods,
                files)
     return tables
 
@@ -110,40 +110,40 @@ def truth_file(folder: Path, sequence: str) -> Path:
     return folder / 'trajectories' / sequence / 'ground_truth.tum'
 
 
-def _pictures(folder: Path, source: Source, records: Sequence[PairRecord]) -> Iterator[Picture]:
-    groups = plots.grouped([record for record in records if record.sequence == source.name])
-    place, title = folder / 'plots', source.name
+def _pictures(folder: Path, dataset: Dataset, records: Sequence[PairRecord]) -> Iterator[Picture]:
+    groups = plots.grouped([record for record in records if record.sequence == dataset.name])
+    place, title = folder / 'plots', dataset.name
     for kind, draw, text in (
             ('errors', plots.plot_errors_by_frame, 'error of each pair along the sequence'),
             ('cumulative', plots.plot_cumulative, 'share of pairs whose error is below a limit'),
             ('boxes', plots.plot_boxes, 'distribution of the errors by method')):
-        path = place / f'{source.name}_{kind}.png'
+        path = place / f'{dataset.name}_{kind}.png'
         draw(path, title, groups)
         yield Picture(path, text)
-    truth, estimates = _trajectories(folder, source, groups)
-    path = place / f'{source.name}_trajectory.png'
+    truth, estimates = _trajectories(folder, dataset, groups)
+    path = place / f'{dataset.name}_trajectory.png'
     plots.plot_trajectories(path, title, truth, estimates)
     yield Picture(path, 'trajectories from above')
 
 
-def _trajectories(folder: Path, source: Source, groups: plots.Groups
-                  ) -> tuple[Trajectory, dict[str, dict[str, Trajectory]]]:
+def _trajectories(folder: Path, dataset: Dataset, groups: plots.Groups
+                  ) -> tuple[StampedTrajectory, dict[str, dict[str, StampedTrajectory]]]:
     """Integrate the motions of every method, and write them beside the ground truth."""
-    estimates: dict[str, dict[str, Trajectory]] = {}
+    estimates: dict[str, dict[str, StampedTrajectory]] = {}
     for preset, methods in groups.items():
         for method, records in methods.items():
-            trajectory = estimated_trajectory(source, records)
-            trajectory.write_tum(trajectory_file(folder, source.name, preset, method))
+            trajectory = estimated_trajectory(dataset, records)
+            trajectory.write_tum(trajectory_file(folder, dataset.name, preset, method))
             estimates.setdefault(preset, {})[method] = trajectory
-            truth = true_trajectory(source, records)
-    truth.write_tum(truth_file(folder, source.name))
+            truth = true_trajectory(dataset, records)
+    truth.write_tum(truth_file(folder, dataset.name))
     return truth, estimates
 
 
-def _evo_table(folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant]) -> Table:
+def _evo_table(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method]) -> Table:
     """Let evo compare every trajectory with the ground truth, several at a time."""
-    keys = [(source.name, entrant.preset, entrant.method)
-            for source in sources for entrant in entrants]
+    keys = [(dataset.name, method.preset, method.name)
+            for dataset in datasets for method in methods]
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         metrics = list(threads.map(lambda key: trajectory_metrics(
             truth_file(folder, key[0]), trajectory_file(folder, *key)), keys))
@@ -157,7 +157,7 @@ def _evo_table(folder: Path, sources: Sequence[Source], entrants: Sequence[Entra
 
 
 def write_page(folder: Path, title: str, tables: Iterable[Table],
-               pictures: dict[str, list[Picture]], entrants: Sequence[Entrant],
+               pictures: dict[str, list[Picture]], methods: Sequence[Method],
                files: Sequence[str]) -> None:
     """Write index.html: tables, plots by section, parameters, and links to the files."""
     parts = [f'<h1>{html.escape(title)}</h1>',
@@ -166,7 +166,7 @@ def write_page(folder: Path, title: str, tables: Iterable[Table],
     for section, shown in pictures.items():
         parts.append(f'<h2>{html.escape(section)}</h2>')
         parts += [_image(picture, folder, section) for picture in shown]
-    parts.append(_parameters(entrants))
+    parts.append(_parameters(methods))
     body = '\n'.join(parts)
     write(folder / 'index.html',
           '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -185,12 +185,12 @@ def _image(picture: Picture, folder: Path, section: str) -> str:
     return f'<img src="{source}" alt="{text}" loading="lazy">'
 
 
-def _parameters(entrants: Sequence[Entrant]) -> str:
+def _parameters(methods: Sequence[Method]) -> str:
     """Parameters of each preset and change, folded away; methods share them."""
     blocks = {}
-    for entrant in entrants:
-        head = f'{entrant.preset}, {entrant.change}' if entrant.change else entrant.preset
-        values = ''.join(f'{name}: {value}\n' for name, value in asdict(entrant.config).items()
+    for method in methods:
+        head = f'{method.preset}, {method.change}' if method.change else method.preset
+        values = ''.join(f'{name}: {value}\n' for name, value in asdict(method.config).items()
                          if name != 'method')
         blocks[head] = (f'<details><summary>{html.escape(head)}</summary>'
                         f'<pre>{html.escape(values)}</pre></details>')

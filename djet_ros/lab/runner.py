@@ -11,9 +11,9 @@ import signal
 from threading import Thread
 
 from djet_ros.errors import DjetError
-from djet_ros.lab.entrants import Entrant
-from djet_ros.lab.pairs import Chunk, evaluate_chunk, PairRecord
-from djet_ros.lab.sources import Source
+from djet_ros.lab.methods import Method
+from djet_ros.lab.pairs import evaluate_chunk, PairChunk, PairRecord
+from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import in_order, RecordStore
 
 # Few enough that a broken run loses little, enough that features of the first frame don't count.
@@ -22,13 +22,13 @@ PAIRS_PER_CHUNK = 5
 _THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
-def chunks_of(sources: Sequence[Source]) -> list[Chunk]:
-    """Cut the pairs of all sources into chunks."""
-    return [Chunk(source, first, min(PAIRS_PER_CHUNK, source.pairs - first))
-            for source in sources for first in range(0, source.pairs, PAIRS_PER_CHUNK)]
+def chunks_of(datasets: Sequence[Dataset]) -> list[PairChunk]:
+    """Cut the pairs of all datasets into chunks."""
+    return [PairChunk(dataset, first, min(PAIRS_PER_CHUNK, dataset.pairs - first))
+            for dataset in datasets for first in range(0, dataset.pairs, PAIRS_PER_CHUNK)]
 
 
-def run(executor: Executor, sources: Sequence[Source], entrants: Sequence[Entrant],
+def run(executor: Executor, datasets: Sequence[Dataset], methods: Sequence[Method],
         store: RecordStore, progress: Callable[[int, int], None]) -> list[PairRecord]:
     """
     Evaluate all pairs that the store does not have yet; gives all records in a fixed order.
@@ -36,12 +36,12 @@ def run(executor: Executor, sources: Sequence[Source], entrants: Sequence[Entran
     progress is called with (pairs done, pairs in all). Raises DjetError where a worker died;
     what was done until then is in the store.
     """
-    chunks = chunks_of(sources)
+    chunks = chunks_of(datasets)
     total = sum(chunk.count for chunk in chunks)
     missing = [chunk for chunk in chunks if chunk.name not in store.chunks]
     done = total - sum(chunk.count for chunk in missing)
     progress(done, total)
-    futures = {executor.submit(evaluate_chunk, chunk, list(entrants)): chunk
+    futures = {executor.submit(evaluate_chunk, chunk, list(methods)): chunk
                for chunk in missing}
     try:
         for future in as_completed(futures):
@@ -63,7 +63,7 @@ def _cancel(futures: Iterable[Future[list[PairRecord]]]) -> None:
         future.cancel()
 
 
-def _keep_finished(futures: dict[Future[list[PairRecord]], Chunk], store: RecordStore) -> None:
+def _keep_finished(futures: dict[Future[list[PairRecord]], PairChunk], store: RecordStore) -> None:
     for future, chunk in futures.items():
         if chunk.name not in store.chunks and future.done() and not future.cancelled() \
                 and future.exception() is None:

@@ -18,9 +18,9 @@ from typing import Any, Self
 import cv2
 from djet_ros import __version__
 from djet_ros.errors import DjetError
-from djet_ros.lab.entrants import Entrant
+from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import PairRecord
-from djet_ros.lab.sources import Source
+from djet_ros.lab.sequences import Dataset
 import numpy as np
 
 FILE_NAME = 'records.jsonl'
@@ -33,11 +33,11 @@ class RecordStore:
     Raises DjetError where the file is of a run with other settings, unless overwrite is set.
     """
 
-    def __init__(self, folder: Path, sources: Sequence[Source], entrants: Sequence[Entrant], *,
+    def __init__(self, folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method], *,
                  overwrite: bool = False) -> None:
         self.path = folder / FILE_NAME
         self.chunks: dict[str, list[PairRecord]] = {}
-        settings = _settings(sources, entrants)
+        settings = _settings(datasets, methods)
         if self.path.exists() and not overwrite:
             self._read(settings)
             self._file = self.path.open('a', encoding='ascii')
@@ -75,12 +75,12 @@ class RecordStore:
             self.chunks[content['chunk']] = [_record(values) for values in content['records']]
 
 
-def _settings(sources: Sequence[Source], entrants: Sequence[Entrant]) -> dict[str, Any]:
+def _settings(datasets: Sequence[Dataset], methods: Sequence[Method]) -> dict[str, Any]:
     return {
         'djet_ros': __version__,
         'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__},
-        'sequences': [source.settings() for source in sources],
-        'methods': [entrant.settings() for entrant in entrants]}
+        'sequences': [dataset.settings() for dataset in datasets],
+        'methods': [method.settings() for method in methods]}
 
 
 def _whole_lines(path: Path) -> list[str]:

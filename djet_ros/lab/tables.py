@@ -10,7 +10,7 @@ import io
 import math
 from typing import Any
 
-from djet_ros.lab.entrants import TITLES
+from djet_ros.lab.methods import TITLES
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.published import PublishedRow
 from djet_ros.lab.summary import TableRow

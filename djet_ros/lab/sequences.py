@@ -12,7 +12,7 @@ from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.lab.recordings import extract, ExtractedSequence, is_extracted
+from djet_ros.lab.bag_frames import extract, ExtractedSequence, is_extracted
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.recordings.bags import BagSource
 from djet_ros.recordings.datasets import open_sequence
@@ -31,7 +31,7 @@ class Selection:
 
 
 @dataclass(frozen=True)
-class Source:
+class Dataset:
     """
     A sequence that takes part.
 
@@ -57,31 +57,31 @@ class Source:
         return {'name': self.name, 'frames': frames, 'content': self.content}
 
 
-def open_sources(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Source]:
+def open_datasets(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Dataset]:
     """
     Open datasets, those in a folder of KITTI sequences one by one, and check that all can be used.
 
     The frames of bags are written into the workspace, because pairs must be had in any order.
     Raises DjetError on what is no dataset, has no ground truth, or has not enough frames.
     """
-    sources: list[Source] = []
+    datasets: list[Dataset] = []
     for path in chain.from_iterable(map(_sequences, paths)):
-        name = _unused(plain_name(path), {source.name for source in sources})
-        sources.append(_source(path, name, selection, workspace))
-    return sources
+        name = _unused(plain_name(path), {dataset.name for dataset in datasets})
+        datasets.append(_dataset(path, name, selection, workspace))
+    return datasets
 
 
 @lru_cache(maxsize=2)
-def opened(source: Source) -> FrameSequence:
-    """Open the frames of a source, once in each process as long as its chunks follow another."""
-    return _frames_in(source.folder)
+def opened(dataset: Dataset) -> FrameSequence:
+    """Open the frames of a dataset, once in each process as long as its chunks follow another."""
+    return _frames_in(dataset.folder)
 
 
 def _frames_in(folder: Path) -> FrameSequence:
     if is_extracted(folder):
         return ExtractedSequence(folder)
     sequence = open_sequence(folder)
-    assert not isinstance(sequence, BagSource)  # bags are extracted when sources are opened
+    assert not isinstance(sequence, BagSource)  # bags are extracted when datasets are opened
     return sequence
 
 
@@ -108,7 +108,7 @@ def _readable(path: Path, place: Path) -> Path:
         return extract(sequence, place)
 
 
-def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Source:
+def _dataset(path: Path, name: str, selection: Selection, workspace: Path) -> Dataset:
     folder = _readable(path, workspace / name)
     sequence = _frames_in(folder)
     frames = _selected(path, sequence, selection)
@@ -118,7 +118,7 @@ def _source(path: Path, name: str, selection: Selection, workspace: Path) -> Sou
                         'with ground_truth in its name)')
     # Rendered sequences have KITTI's layout and numbers, but nothing was published about them.
     benchmark = '' if rendered_scene(folder) else sequence.name
-    return Source(name, benchmark, folder, frames, _digest(sequence, frames))
+    return Dataset(name, benchmark, folder, frames, _digest(sequence, frames))
 
 
 def _sequences(path: Path) -> Iterator[Path]:

@@ -20,17 +20,17 @@ TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-P',
 
 
 @dataclass(frozen=True)
-class Entrant:
+class Method:
     """
     A method with all of its parameters.
 
-    preset: where the parameters come from; change: what differs from it, in words, empty if
-    nothing does; good_start: whether the pose of RP-E, preset best, is given as one more start,
-    and only the matches that agree with it. Peers take their matches and their RANSAC threshold
-    from config.
+    name: one of TITLES; preset: where the parameters come from; change: what differs from it, in
+    words, empty if nothing does; good_start: whether the pose of RP-E, preset best, is given as
+    one more start, and only the matches that agree with it. Peers take their matches and their
+    RANSAC threshold from config.
     """
 
-    method: str
+    name: str
     preset: str
     config: EstimatorConfig
     change: str = ''
@@ -38,7 +38,8 @@ class Entrant:
 
     def settings(self) -> dict[str, Any]:
         """Everything that decides the results, as plain values."""
-        return asdict(self)
+        values = asdict(self)
+        return {'method': values.pop('name'), **values}
 
 
 def default_methods() -> tuple[str, ...]:
@@ -46,17 +47,17 @@ def default_methods() -> tuple[str, ...]:
     return tuple(name for name in TITLES if name not in PEERS or find_spec(PEERS[name]))
 
 
-def entrants(methods: Sequence[str], presets: Sequence[str],
-             values: Mapping[str, Any]) -> list[Entrant]:
+def make_methods(names: Sequence[str], presets: Sequence[str],
+                 values: Mapping[str, Any]) -> list[Method]:
     """
     Let every method start with every preset, with some values of both changed.
 
     Raises DjetError on unknown names and on peers that are not installed.
     """
-    check_methods(methods)
+    check_methods(names)
     check_names('preset', presets, PRESETS)
-    return [Entrant(method, name, configured(method, name, values))
-            for name in presets for method in methods]
+    return [Method(name, preset_name, configured(name, preset_name, values))
+            for preset_name in presets for name in names]
 
 
 def configured(method: str, preset_name: str, values: Mapping[str, Any]) -> EstimatorConfig:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.lab.pairs import PairRecord
-from djet_ros.lab.sources import opened, Source
+from djet_ros.lab.sequences import Dataset, opened
 from djet_ros.recordings.trajectories import TumWriter
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class StampedTrajectory:
     """Poses (N, 4, 4) of the camera in its first frame, in metres, at stamps (N,) in ns."""
 
     stamps_ns: NDArray[np.int64]
@@ -32,27 +32,27 @@ class Trajectory:
                 writer.write(stamp, pose)
 
 
-def true_trajectory(source: Source, records: Sequence[PairRecord]) -> Trajectory:
-    """Ground truth over the longest run of pairs among the records of one entrant."""
-    sequence, frames = opened(source), _frames(_longest_run(records))
-    assert sequence.poses is not None  # sources without poses are refused at the start
+def true_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> StampedTrajectory:
+    """Ground truth over the longest run of pairs among the records of one method."""
+    sequence, frames = opened(dataset), _frames(_longest_run(records))
+    assert sequence.poses is not None  # datasets without poses are refused at the start
     poses = sequence.poses[frames]
-    return Trajectory(sequence.stamps_ns[frames], np.linalg.inv(poses[0]) @ poses)
+    return StampedTrajectory(sequence.stamps_ns[frames], np.linalg.inv(poses[0]) @ poses)
 
 
-def estimated_trajectory(source: Source, records: Sequence[PairRecord]) -> Trajectory:
+def estimated_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> StampedTrajectory:
     """
-    Integrate the motions of one entrant over the longest run of pairs.
+    Integrate the motions of one method over the longest run of pairs.
 
     Each unit translation gets its true length, which one camera cannot know. Where no pose was
     told the camera stands still.
     """
-    truth = true_trajectory(source, records)
+    truth = true_trajectory(dataset, records)
     lengths = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
     poses = [np.eye(4)]
     for record, length in zip(_longest_run(records), lengths.tolist()):
         poses.append(poses[-1] @ _camera_motion(record, length))
-    return Trajectory(truth.stamps_ns, np.array(poses))
+    return StampedTrajectory(truth.stamps_ns, np.array(poses))
 
 
 def _camera_motion(record: PairRecord, length: float) -> Array:
