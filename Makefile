@@ -12,10 +12,6 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 	$$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
 	2>/dev/null && echo $$python && break; done)
 
-# one thread a process: small matrices gain nothing by more, and tests run side by side
-export OMP_NUM_THREADS ?= 1
-export OPENBLAS_NUM_THREADS ?= 1
-
 .PHONY: demo test lint lowest fuzz audit clean
 
 demo: $(VENV)/.installed

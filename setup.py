@@ -9,7 +9,6 @@ package_name = 'djet_ros'
 
 setup(
     name=package_name,
-    version='0.1.0',
     description='Visual odometry by D-JET: pose optimisation on descriptor surfaces',
     maintainer='The djet_ros maintainers',
     maintainer_email='maintainers@djet-ros.invalid',

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
 
 def one_blas_thread() -> None:
     """
@@ -12,5 +14,5 @@ def one_blas_thread() -> None:
     The matrices of an odometry are small: on a busy machine further threads cost many times what
     they gain, because each product waits for the slowest of them.
     """
-    for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+    for variable in VARIABLES:
         os.environ.setdefault(variable, '1')

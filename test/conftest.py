@@ -4,11 +4,15 @@ from collections.abc import Callable
 import os
 from pathlib import Path
 
-import cv2
-import numpy as np
+from djet_ros.threads import one_blas_thread
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_configure() -> None:
+    """Take one thread a process, before anything imports NumPy: tests run side by side."""
+    one_blas_thread()
 
 
 @pytest.fixture(scope='session')
@@ -30,6 +34,8 @@ def small_kitti(tmp_path: Path) -> Callable[..., Path]:
 def write_small_kitti(dataset: Path, frames: int = 6, size: tuple[int, int] = (64, 48),
                       name: str = '07') -> Path:
     """Write a KITTI sequence with ground truth: half a metre ahead and 0.02 rad to a frame."""
+    import cv2
+    import numpy as np
     folder = dataset / 'sequences' / name
     (folder / 'image_0').mkdir(parents=True)
     (dataset / 'poses').mkdir(exist_ok=True)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 from djet_ros.core.hamming import (
-    dense_descriptors,
     describable,
     descriptor_bits,
     hamming_surfaces,
@@ -17,7 +16,7 @@ from djet_ros.core.hamming import (
 from djet_ros.core.orb_pattern import REACH, TESTS
 import numpy as np
 import pytest
-from two_view import textured
+from two_view import dense_descriptors, textured
 
 SIZE = (160, 120)
 

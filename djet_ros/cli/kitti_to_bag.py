@@ -36,7 +36,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                         help='frame after the last one (default: all)')
     parser.add_argument('--overwrite', action='store_true',
                         help='replace an existing bag once the new one is complete')
-    parser.set_defaults(run=run)
     return parser
 
 

@@ -32,7 +32,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                         help='pixels of a picture (default: 1241x376, as KITTI has, and 960x540 '
                              'under water)')
     parser.add_argument('--overwrite', action='store_true', help='replace an earlier rendering')
-    parser.set_defaults(run=run)
     return parser
 
 

@@ -10,6 +10,7 @@ import os
 import signal
 from threading import Thread
 
+from djet_ros import threads
 from djet_ros.errors import DjetError
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairChunk, PairRecord
@@ -18,8 +19,6 @@ from djet_ros.lab.store import in_order, RecordStore
 
 # Few enough that a broken run loses little, enough that features of the first frame don't count.
 PAIRS_PER_CHUNK = 5
-
-_THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
 def chunks_of(datasets: Sequence[Dataset]) -> list[PairChunk]:
@@ -74,7 +73,7 @@ def _keep_finished(futures: dict[Future[list[PairRecord]], PairChunk], store: Re
 def local_workers(count: int | None = None) -> Iterator[Executor]:
     """Give an executor of processes on this machine, by default one per core, one thread each."""
     # Set before the workers import NumPy; equal thread counts also keep its sums equal.
-    os.environ.update(dict.fromkeys(_THREADS, '1'))
+    os.environ.update(dict.fromkeys(threads.VARIABLES, '1'))
     with ProcessPoolExecutor(count, get_context('spawn'), _follow_parent) as executor:
         yield executor
 
