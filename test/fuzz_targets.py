@@ -26,6 +26,7 @@ from djet_ros.config.yaml_files import dump_yaml, load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag, BagSource
@@ -33,7 +34,6 @@ from djet_ros.recordings.datasets import euroc, tum_rgbd
 from djet_ros.recordings.decoding import decoder, jazzy, message_type
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
 from djet_ros.recordings.sequence import FrameSequence
-from djet_ros.recordings.sources import pose_of
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
 from djet_ros.recordings.varos import VarosSequence

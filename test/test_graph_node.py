@@ -12,8 +12,7 @@ from time import sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
-from djet_ros.odometry.messages import stamp_ns
-from djet_ros.recordings.sources import pose_of
+from djet_ros.odometry.messages import pose_of, stamp_ns
 import numpy as np
 import pytest
 from ros_graph import ENVIRONMENT, NodeProcess, Peer

@@ -12,7 +12,7 @@ from djet_ros.core.types import Status
 from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.messages import Messages, pose_of
 from djet_ros.odometry.scale import GroundTruthScale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
@@ -20,7 +20,7 @@ from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.steps import Steps
-from djet_ros.recordings.sources import open_source, pose_of
+from djet_ros.recordings.sources import open_source
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type

@@ -15,10 +15,11 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import pose_of
 from djet_ros.recordings.bag_writers import IMAGE_TOPIC, INFO_TOPIC, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
-from djet_ros.recordings.sources import open_source, pose_of
+from djet_ros.recordings.sources import open_source
 from djet_ros.recordings.trajectories import read_tum, TumWriter
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import Pair, pair_errors, statistics

@@ -18,11 +18,12 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.parameter import describe
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
+from djet_ros.odometry.messages import pose_of
 from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.offline import run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import make_room
-from djet_ros.recordings.sources import open_source, pose_of, Source
+from djet_ros.recordings.sources import open_source, Source
 from djet_ros.replay.graph_of_results import read_results
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.replay import Replay

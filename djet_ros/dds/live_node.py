@@ -23,6 +23,7 @@ from djet_ros.live.topics import (
     odometry_outputs,
     SPEED_TYPES,
 )
+from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.recordings.decoding import message_type
 
@@ -86,7 +87,7 @@ class LiveNode:
             if topic == '/diagnostics':
                 now = time_ns() if self._clock is None else self._clock
                 stamp = message.header.stamp
-                stamp.sec, stamp.nanosec = divmod(now, 10**9)
+                stamp.sec, stamp.nanosec = seconds_and_rest(now)
             if not self._outputs[topic].publish(message):
                 self.log('warning', f'a message on {topic} was not sent: a subscription does not '
                                     'keep up')
@@ -94,8 +95,8 @@ class LiveNode:
     def log(self, level: str, text: str) -> None:
         """Log a line, in the form of ROS's log."""
         name = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}[level]
-        now = time_ns()
-        print(f'[{name}] [{now // 10**9}.{now % 10**9:09d}] [{self._names.node}]: {text}',
+        seconds, rest = seconds_and_rest(time_ns())
+        print(f'[{name}] [{seconds}.{rest:09d}] [{self._names.node}]: {text}',
               file=sys.stderr, flush=True)
 
     def count_publishers(self, topic: str) -> int:
@@ -130,7 +131,7 @@ class LiveNode:
         return inputs
 
     def _take_clock(self, message: Any) -> None:
-        self._clock = message.clock.sec * 10**9 + message.clock.nanosec
+        self._clock = ns_of_time(message.clock)
 
     def _lose_garbage(self, reason: str) -> None:
         """Count an image that can't be read as one that never came."""

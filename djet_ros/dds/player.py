@@ -9,7 +9,7 @@ from time import monotonic
 from djet_ros.dds.graph import Graph, Profile, Publisher
 from djet_ros.dds.names import Names
 from djet_ros.recordings.bags import BagMessage
-from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.decoding import MAKE, message_type
 from djet_ros.recordings.sources import Source
 
 # All that is sent waits for reliable subscriptions; best-effort ones take what they get.
@@ -91,9 +91,8 @@ class Player:
 
     def _send(self, one: BagMessage, stop: Event) -> None:
         if self._clock is not None:
-            seconds, rest = divmod(one.stamp_ns, 10**9)
-            time = message_type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest)
-            self._clock.publish(message_type('rosgraph_msgs/msg/Clock')(clock=time))
+            self._clock.publish(message_type('rosgraph_msgs/msg/Clock')(
+                clock=MAKE.time(one.stamp_ns)))
         while not self._publishers[one.topic].publish(one.message):
             if stop.wait(0.005):
                 return

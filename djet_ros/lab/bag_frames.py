@@ -9,10 +9,9 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.images import gray_image
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.bags import BagSource
 from djet_ros.recordings.sequence import ImageFiles
-from djet_ros.recordings.sources import pose_of
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 from numpy.typing import NDArray

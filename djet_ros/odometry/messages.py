@@ -1,5 +1,5 @@
 """
-Results to ROS messages: the one place where poses change their frame and their form.
+Results to ROS messages and back: the one place where poses change their frame and their form.
 
 The classes are asked for by type name, so that rclpy's and rosbags' messages come out alike.
 rclpy's setters insist on plain float, int and str, on covariances as a float64 array of 36, and on
@@ -31,14 +31,49 @@ LEAST_COVARIANCE = np.eye(6) * 1e-9
 # The seconds of a stamp are an int32.
 _LATEST_NS = 2**31 * 10**9 - 1
 
+# Metres: beyond everything on Earth, and far below where squares lose what drives it.
+FARTHEST = 1e9
+
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
-def stamp_ns(header: Any) -> int:
-    """Nanoseconds of a header's stamp; at most what a header can hold again."""
+def ns_of_time(time: Any) -> int:
+    """Nanoseconds of a Time; at most what a Time can hold again."""
     # A sender's nanoseconds may exceed a second, and so lead beyond the last one.
-    return min(int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec), _LATEST_NS)
+    return min(int(time.sec) * 10**9 + int(time.nanosec), _LATEST_NS)
+
+
+def stamp_ns(header: Any) -> int:
+    """Nanoseconds of a header's stamp; see ``ns_of_time``."""
+    return ns_of_time(header.stamp)
+
+
+def seconds_and_rest(stamp: int) -> tuple[int, int]:
+    """Whole seconds of a stamp in nanoseconds, and the nanoseconds beyond them, as in a Time."""
+    return divmod(int(stamp), 10**9)
+
+
+def pose_of(message: Any) -> tuple[int, Array]:
+    """
+    Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.
+
+    The pose is NaN where the message holds none: no unit quaternion, or a place beyond FARTHEST.
+    """
+    if hasattr(message, 'transform'):
+        position, orientation = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose.pose if hasattr(message.pose, 'pose') else message.pose
+        position, orientation = pose.position, pose.orientation
+    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+    result = np.full((4, 4), np.nan)
+    place = np.abs([position.x, position.y, position.z])
+    if (place <= FARTHEST).all() and (np.abs(quaternion) < 2.0).all() \
+            and 0.5 < np.linalg.norm(quaternion) < 2.0:
+        result[:] = np.eye(4)
+        result[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        result[:3, 3] = position.x, position.y, position.z
+    return stamp_ns(message.header), result
 
 
 def in_convention(result: OdometryResult, convention: str) -> OdometryResult:
@@ -70,22 +105,97 @@ def camera_frame(config: OdometryConfig, image_frame: str) -> str:
     return body if body != image_frame else f'{image_frame}_body'
 
 
-class Messages:
-    """Makes the messages of results; message_type gives the class for a type name."""
+class MessageFactory:
+    """Makes messages of arrays; message_type gives the class for a type name."""
 
     # What the diagnostics are of.
     component = 'djet_ros: visual odometry'
 
-    def __init__(self, message_type: MessageType, config: OdometryConfig) -> None:
+    def __init__(self, message_type: MessageType) -> None:
         self._type = message_type
-        self._config = config
+
+    def time(self, stamp: int) -> Any:
+        """Make a Time of nanoseconds."""
+        seconds, rest = seconds_and_rest(stamp)
+        return self._type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest)
 
     def header(self, stamp: int, frame_id: str) -> Any:
         """Make a Header with a stamp in nanoseconds."""
-        seconds, rest = divmod(int(stamp), 10**9)
-        return self._type('std_msgs/msg/Header')(
-            stamp=self._type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest),
-            frame_id=frame_id)
+        return self._type('std_msgs/msg/Header')(stamp=self.time(stamp), frame_id=frame_id)
+
+    def pose_in(self, stamp: int, frame: str, pose: Array) -> Any:
+        """Make the PoseStamped of a pose (4, 4) in a frame."""
+        return self._type('geometry_msgs/msg/PoseStamped')(
+            header=self.header(stamp, frame), pose=self._pose(pose))
+
+    def path(self, poses: Sequence[Any]) -> Any:
+        """Make the Path of at least one PoseStamped."""
+        return self._type('nav_msgs/msg/Path')(header=poses[-1].header, poses=list(poses))
+
+    def frame(self, stamp: int, parent: str, child: str, pose: Array) -> Any:
+        """Make the TFMessage of one frame in another, pose (4, 4)."""
+        return self._type('tf2_msgs/msg/TFMessage')(transforms=[
+            self._type('geometry_msgs/msg/TransformStamped')(
+                header=self.header(stamp, parent), child_frame_id=child,
+                transform=self._type('geometry_msgs/msg/Transform')(
+                    translation=self._vector(pose[:3, 3]),
+                    rotation=self._pose(pose).orientation))])
+
+    def camera_info(self, stamp: int, frame_id: str, K: Array, size: tuple[int, int],
+                    D: Array | None = None, model: str = 'plumb_bob') -> Any:
+        """Make the CameraInfo of images (width, height), with K (3, 3) before and after D (N,)."""
+        roi = self._type('sensor_msgs/msg/RegionOfInterest')(
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return self._type('sensor_msgs/msg/CameraInfo')(
+            header=self.header(stamp, frame_id), height=size[1], width=size[0],
+            distortion_model=model, d=np.zeros(5) if D is None else D, k=K.ravel(),
+            r=np.eye(3).ravel(), p=np.hstack([K, np.zeros((3, 1))]).ravel(),
+            binning_x=0, binning_y=0, roi=roi)
+
+    def picture(self, stamp: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
+        """Make the Image of an array (H, W), mono8, or (H, W, 3), bgr8."""
+        image_type = self._type('sensor_msgs/msg/Image')
+        height, width = pixels.shape[:2]
+        data: Any = np.ascontiguousarray(pixels).ravel()
+        if hasattr(image_type, 'get_fields_and_field_types'):
+            # rclpy would check an array byte by byte, but takes this one as it is.
+            data = array('B', data.tobytes())
+        return image_type(
+            header=self.header(stamp, frame_id), height=height, width=width,
+            encoding='mono8' if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
+            step=pixels.size // height, data=data)
+
+    def diagnostics(self, stamp: int, level: str, summary: str,
+                    values: dict[str, str]) -> Any:
+        """Make the DiagnosticArray of one status; level is 'OK', 'WARN' or 'ERROR'."""
+        status_type = self._type('diagnostic_msgs/msg/DiagnosticStatus')
+        pair = self._type('diagnostic_msgs/msg/KeyValue')
+        # The class's own constant is of the type that its field wants: bytes or int.
+        status = status_type(
+            level=getattr(status_type, level), name=self.component, message=summary,
+            hardware_id='', values=[pair(key=key, value=value) for key, value in values.items()])
+        return self._type('diagnostic_msgs/msg/DiagnosticArray')(
+            header=self.header(stamp, ''), status=[status])
+
+    def _pose(self, pose: Array) -> Any:
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
+        position = _plain(pose[:3, 3])
+        return self._type('geometry_msgs/msg/Pose')(
+            position=self._type('geometry_msgs/msg/Point')(
+                x=position[0], y=position[1], z=position[2]),
+            orientation=self._type('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w))
+
+    def _vector(self, values: Array) -> Any:
+        x, y, z = _plain(values)
+        return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
+
+
+class Messages(MessageFactory):
+    """Makes the messages of results, too."""
+
+    def __init__(self, message_type: MessageType, config: OdometryConfig) -> None:
+        super().__init__(message_type)
+        self._config = config
 
     def relative_pose(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the current camera in the previous camera's frame."""
@@ -121,52 +231,10 @@ class Messages:
         turned, _ = self._turned(result)
         return self.pose_in(result.stamp_ns, self._config.odom_frame, turned.pose)
 
-    def pose_in(self, stamp: int, frame: str, pose: Array) -> Any:
-        """Make the PoseStamped of a pose (4, 4) in a frame."""
-        return self._type('geometry_msgs/msg/PoseStamped')(
-            header=self.header(stamp, frame), pose=self._pose(pose))
-
-    def path(self, poses: Sequence[Any]) -> Any:
-        """Make the Path of at least one PoseStamped."""
-        return self._type('nav_msgs/msg/Path')(header=poses[-1].header, poses=list(poses))
-
     def transform(self, result: OdometryResult) -> Any:
         """Make the TFMessage from the odom frame to the camera."""
         turned, frame = self._turned(result)
         return self.frame(result.stamp_ns, self._config.odom_frame, frame, turned.pose)
-
-    def frame(self, stamp: int, parent: str, child: str, pose: Array) -> Any:
-        """Make the TFMessage of one frame in another, pose (4, 4)."""
-        return self._type('tf2_msgs/msg/TFMessage')(transforms=[
-            self._type('geometry_msgs/msg/TransformStamped')(
-                header=self.header(stamp, parent), child_frame_id=child,
-                transform=self._type('geometry_msgs/msg/Transform')(
-                    translation=self._vector(pose[:3, 3]),
-                    rotation=self._pose(pose).orientation))])
-
-    def diagnostics(self, stamp: int, level: str, summary: str,
-                    values: dict[str, str]) -> Any:
-        """Make the DiagnosticArray of one status; level is 'OK', 'WARN' or 'ERROR'."""
-        status_type = self._type('diagnostic_msgs/msg/DiagnosticStatus')
-        pair = self._type('diagnostic_msgs/msg/KeyValue')
-        # The class's own constant is of the type that its field wants: bytes or int.
-        status = status_type(
-            level=getattr(status_type, level), name=self.component, message=summary,
-            hardware_id='', values=[pair(key=key, value=value) for key, value in values.items()])
-        return self._type('diagnostic_msgs/msg/DiagnosticArray')(
-            header=self.header(stamp, ''), status=[status])
-
-    def picture(self, stamp: int, frame_id: str, bgr: NDArray[np.uint8]) -> Any:
-        """Make the Image (bgr8) of an array (H, W, 3)."""
-        image_type = self._type('sensor_msgs/msg/Image')
-        height, width = bgr.shape[:2]
-        data: Any = np.ascontiguousarray(bgr).ravel()
-        if hasattr(image_type, 'get_fields_and_field_types'):
-            # rclpy would check an array byte by byte, but takes this one as it is.
-            data = array('B', data.tobytes())
-        return image_type(
-            header=self.header(stamp, frame_id), height=height, width=width, encoding='bgr8',
-            is_bigendian=0, step=3 * width, data=data)
 
     def _turned(self, result: OdometryResult) -> tuple[OdometryResult, str]:
         return (in_convention(result, self._config.frame_convention),
@@ -175,18 +243,6 @@ class Messages:
     def _pose_with_covariance(self, pose: Array, covariance: Array) -> Any:
         return self._type('geometry_msgs/msg/PoseWithCovariance')(
             pose=self._pose(pose), covariance=(covariance + LEAST_COVARIANCE).ravel())
-
-    def _pose(self, pose: Array) -> Any:
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
-        position = _plain(pose[:3, 3])
-        return self._type('geometry_msgs/msg/Pose')(
-            position=self._type('geometry_msgs/msg/Point')(
-                x=position[0], y=position[1], z=position[2]),
-            orientation=self._type('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w))
-
-    def _vector(self, values: Array) -> Any:
-        x, y, z = _plain(values)
-        return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
 
 
 def twist(result: OdometryResult) -> tuple[Array, Array]:

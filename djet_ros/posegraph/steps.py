@@ -13,11 +13,10 @@ from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import begins_anew, OPTICAL_TO_BODY
+from djet_ros.odometry.messages import begins_anew, OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import rotated, UNKNOWN_MOTION
 from djet_ros.posegraph.graph import Edge, PoseGraph
-from djet_ros.recordings.sources import pose_of
 import numpy as np
 
 # Messages of one topic that may wait for their like on the other.

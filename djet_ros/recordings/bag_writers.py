@@ -13,11 +13,11 @@ from pathlib import Path
 import sqlite3
 from typing import Any
 
-from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import OPTICAL_TO_BODY
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.decoding import jazzy, message_type
+from djet_ros.recordings.decoding import jazzy, MAKE
 from djet_ros.recordings.outputs import appearing
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
@@ -31,7 +31,6 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from scipy.spatial.transform import Rotation
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
@@ -41,8 +40,9 @@ GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 CAMERA_FRAME = 'camera'
 WORLD_FRAME = 'camera_first'
 
-# From map (x forward, y left, z up) to an optical frame (z forward, x right, y down): REP 103.
-OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+# An optical frame in the map (x forward, y left, z up).
+_OPTICAL = np.eye(4)
+_OPTICAL[:3, :3] = OPTICAL_TO_BODY
 
 FOREVER = QosTime(9223372036, 854775807)
 
@@ -163,55 +163,12 @@ def _frames(sequence: FrameSequence) -> Iterator[list[tuple[str, Any, int]]]:
     for index, stamp in enumerate(sequence.stamps_ns.tolist()):
         messages = []
         if index == 0:
-            messages.append(('/tf_static', _map_transform(stamp), stamp))
+            messages.append(('/tf_static', MAKE.frame(stamp, 'map', WORLD_FRAME, _OPTICAL), stamp))
         if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
-            pose = pose_stamped(sequence.poses[index], _header(stamp, WORLD_FRAME))
+            pose = MAKE.pose_in(stamp, WORLD_FRAME, sequence.poses[index])
             messages.append((GROUND_TRUTH_TOPIC, pose, stamp))
-        header = _header(stamp, CAMERA_FRAME)
-        messages.append((INFO_TOPIC, camera_info(sequence.K, sequence.size, header), stamp))
-        messages.append((IMAGE_TOPIC, mono8(sequence.image(index), header), stamp))
+        info = MAKE.camera_info(stamp, CAMERA_FRAME, sequence.K, sequence.size)
+        messages.append((INFO_TOPIC, info, stamp))
+        image = MAKE.picture(stamp, CAMERA_FRAME, sequence.image(index))
+        messages.append((IMAGE_TOPIC, image, stamp))
         yield messages
-
-
-def camera_info(K: Array, size: tuple[int, int], header: Any) -> Any:
-    """Make the CameraInfo of rectified images (width, height) with camera matrix K (3, 3)."""
-    roi = message_type('sensor_msgs/msg/RegionOfInterest')(
-        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    return message_type('sensor_msgs/msg/CameraInfo')(
-        header=header, height=size[1], width=size[0], distortion_model='plumb_bob',
-        d=np.zeros(5), k=K.ravel(), r=np.eye(3).ravel(),
-        p=np.hstack([K, np.zeros((3, 1))]).ravel(), binning_x=0, binning_y=0, roi=roi)
-
-
-def mono8(image: np.ndarray, header: Any) -> Any:
-    """Make the Image of a (H, W) uint8 array."""
-    height, width = image.shape
-    return message_type('sensor_msgs/msg/Image')(
-        header=header, height=height, width=width, encoding='mono8', is_bigendian=0, step=width,
-        data=np.ascontiguousarray(image).ravel())
-
-
-def pose_stamped(pose: Array, header: Any) -> Any:
-    """Make the PoseStamped of a pose (4, 4)."""
-    x, y, z = pose[:3, 3].tolist()
-    rotation = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
-    return message_type('geometry_msgs/msg/PoseStamped')(
-        header=header, pose=message_type('geometry_msgs/msg/Pose')(
-            position=message_type('geometry_msgs/msg/Point')(x=x, y=y, z=z),
-            orientation=message_type('geometry_msgs/msg/Quaternion')(*rotation)))
-
-
-def _map_transform(stamp_ns: int) -> Any:
-    transform = message_type('geometry_msgs/msg/Transform')(
-        translation=message_type('geometry_msgs/msg/Vector3')(x=0.0, y=0.0, z=0.0),
-        rotation=message_type('geometry_msgs/msg/Quaternion')(*OPTICAL))
-    return message_type('tf2_msgs/msg/TFMessage')(transforms=[
-        message_type('geometry_msgs/msg/TransformStamped')(
-            header=_header(stamp_ns, 'map'), child_frame_id=WORLD_FRAME, transform=transform)])
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, rest = divmod(stamp_ns, 10**9)
-    return message_type('std_msgs/msg/Header')(
-        stamp=message_type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest),
-        frame_id=frame_id)

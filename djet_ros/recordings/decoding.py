@@ -13,6 +13,7 @@ from functools import cache, partial
 from typing import Any, TypeAlias
 
 from djet_ros.errors import one_line
+from djet_ros.odometry.messages import MessageFactory
 from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE
 from djet_ros.recordings.storages.compression import decompress_message, ZSTD_MAGIC
 import numpy as np
@@ -50,6 +51,10 @@ def jazzy() -> Typestore:
 def message_type(name: str) -> type:
     """Class of a message type of Jazzy, such as 'sensor_msgs/msg/Image'."""
     return jazzy().types[name]
+
+
+# Messages of Jazzy's own classes.
+MAKE = MessageFactory(message_type)
 
 
 def decoder(connection: Connection) -> Decoder:

@@ -9,30 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, cast, Protocol
+from typing import cast, Protocol
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import (
     CAMERA_FRAME,
-    camera_info,
     GROUND_TRUTH_TOPIC,
     IMAGE_TOPIC,
     INFO_TOPIC,
-    mono8,
-    pose_stamped,
     WORLD_FRAME,
 )
 from djet_ros.recordings.bags import BagMessage, BagSource, is_bag
 from djet_ros.recordings.datasets import open_sequence
-from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.kitti import KittiSequence, read_poses
 from djet_ros.recordings.sequence import FrameSequence
-from djet_ros.recordings.text import FARTHEST, lines
+from djet_ros.recordings.text import lines
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 SPEED_TYPES = ('geometry_msgs/msg/TwistStamped', 'nav_msgs/msg/Odometry')
 
@@ -79,9 +76,10 @@ class SequenceSource:
             if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
                 yield _ground_truth(stamp, sequence.poses[index])
             if topics is None or IMAGE_TOPIC in topics:
-                header = _header(stamp, CAMERA_FRAME)
-                yield BagMessage(INFO_TOPIC, stamp, camera_info(sequence.K, sequence.size, header))
-                yield BagMessage(IMAGE_TOPIC, stamp, mono8(sequence.image(index), header))
+                yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
+                    stamp, CAMERA_FRAME, sequence.K, sequence.size))
+                yield BagMessage(IMAGE_TOPIC, stamp, MAKE.picture(
+                    stamp, CAMERA_FRAME, sequence.image(index)))
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -131,8 +129,7 @@ class RecordedSource:
         rows = iter(poses)
         for message in self._source.bag.messages(wanted | {self.image_topic}):
             if message.topic == self.image_topic and (pose := next(rows, None)) is not None:
-                header = message.message.header
-                yield _ground_truth(header.stamp.sec * 10**9 + header.stamp.nanosec, pose)
+                yield _ground_truth(stamp_ns(message.message.header), pose)
             if message.topic in wanted:
                 yield message
 
@@ -170,29 +167,6 @@ def open_source(path: Path, image_topic: str | None = None, info_topic: str | No
     return SequenceSource(cast(FrameSequence, open_sequence(path)))
 
 
-def pose_of(message: Any) -> tuple[int, Array]:
-    """
-    Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.
-
-    The pose is NaN where the message holds none: no unit quaternion, or a place beyond FARTHEST.
-    """
-    if hasattr(message, 'transform'):
-        position, orientation = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose.pose if hasattr(message.pose, 'pose') else message.pose
-        position, orientation = pose.position, pose.orientation
-    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
-    result = np.full((4, 4), np.nan)
-    place = np.abs([position.x, position.y, position.z])
-    if (place <= FARTHEST).all() and (np.abs(quaternion) < 2.0).all() \
-            and 0.5 < np.linalg.norm(quaternion) < 2.0:
-        result[:] = np.eye(4)
-        result[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-        result[:3, 3] = position.x, position.y, position.z
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec), result
-
-
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
     """Poses of a TUM file with their stamps, or of a KITTI file, which must have one per image."""
     first = next((text for _, text in lines(path)), '')
@@ -206,11 +180,4 @@ def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Arra
 
 
 def _ground_truth(stamp: int, pose: Array) -> BagMessage:
-    return BagMessage(GROUND_TRUTH_TOPIC, stamp, pose_stamped(pose, _header(stamp, WORLD_FRAME)))
-
-
-def _header(stamp: int, frame_id: str) -> Any:
-    seconds, rest = divmod(stamp, 10**9)
-    return message_type('std_msgs/msg/Header')(
-        stamp=message_type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest),
-        frame_id=frame_id)
+    return BagMessage(GROUND_TRUTH_TOPIC, stamp, MAKE.pose_in(stamp, WORLD_FRAME, pose))

@@ -11,11 +11,10 @@ from pathlib import Path
 from djet_ros.config.safe_files import read_text
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import FARTHEST
 import numpy as np
 from numpy.typing import NDArray
 
-# Metres: beyond everything on Earth, and far below where squares lose what drives it.
-FARTHEST = 1e9
 # Stamps are written into messages as int32 seconds.
 LATEST_SECOND = 2**31 - 2000
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import seconds_and_rest
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.text import check_positions, LineFile, nanoseconds, stamped_rows
 import numpy as np
@@ -56,7 +57,7 @@ class TumWriter(TrajectoryWriter):
     @staticmethod
     def line(stamp_ns: int, pose: Array) -> str:
         """Text of one pose (4, 4)."""
-        seconds, rest = divmod(stamp_ns, 10**9)
+        seconds, rest = seconds_and_rest(stamp_ns)
         return f'{seconds}.{rest:09d} {digits(position_and_quaternion(pose))}'
 
 

@@ -13,12 +13,11 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import OPTICAL_TO_BODY
+from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.uncertainty import rotated, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.recordings.bags import Bag
-from djet_ros.recordings.sources import pose_of
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.results import BAG
 import numpy as np

@@ -14,13 +14,13 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.diagnostics import Counts
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.scale import scale_source, ScaleSource
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.odometry.visual_odometry import TRACKED
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
-from djet_ros.recordings.sources import pose_of, Source
+from djet_ros.recordings.sources import Source
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
