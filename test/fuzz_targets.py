@@ -29,10 +29,11 @@ from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
-from djet_ros.recordings.bags import Bag, BagSource
+from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.datasets import euroc, tum_rgbd
 from djet_ros.recordings.decoding import decoder, jazzy, message_type
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
+from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.sequence import FrameSequence
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
@@ -251,9 +252,9 @@ def bag_of(name: str, data: bytes) -> None:
         with only_our_errors(), Bag(path) as bag:
             for item in islice(bag.messages(), MESSAGES_READ):
                 assert item.topic is not None
-        with only_our_errors(), BagSource(path) as source:
+        with only_our_errors(), BagRecording(path) as source:
             assert len(source) >= 0
-            for _ in islice(source, MESSAGES_READ):
+            for _ in islice(source.messages(), MESSAGES_READ):
                 pass
 
 

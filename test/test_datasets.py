@@ -2,10 +2,14 @@
 
 import cv2
 from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.bag_writers import write_kitti_bag
-from djet_ros.recordings.bags import BagSource
-from djet_ros.recordings.datasets import euroc, interpolate, open_sequence, tum_rgbd
+from djet_ros.recordings.datasets import euroc, LONGEST_GAP_NS, open_sequence, tum_rgbd
 from djet_ros.recordings.kitti import KittiSequence
+from djet_ros.recordings.recording import BagRecording, open_recording
+from djet_ros.recordings.sequence import from_first
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -91,6 +95,39 @@ def test_euroc_images_are_rectified(asl):
     assert np.abs(found - [110 * -0.6 + 80, 109 * 0.45 + 60]).max() < 0.2
 
 
+PINCUSHION = [0.3, 0.1, 0.001, 0.002]
+
+
+def pincushion(folder, gray):
+    """Make the images of an EuRoC folder those of a lens that leaves the undistorted corners."""
+    camera = folder / 'mav0' / 'cam0'
+    (camera / 'sensor.yaml').write_text(SENSOR.replace(str(DISTORTION), str(PINCUSHION)))
+    for stamp in STAMPS:
+        cv2.imwrite(str(camera / 'data' / f'{stamp}.png'), gray)
+
+
+def test_no_black_rim_moves_with_the_camera(asl):
+    """What a lens did not see is no edge in the rectified image."""
+    texture = np.random.default_rng(0).integers(100, 256, SIZE[::-1], np.uint8)
+    pincushion(asl, texture)
+    rectified = euroc(asl).image(2)
+    assert rectified.min() >= 100
+    assert not np.array_equal(rectified, texture)
+
+
+def test_a_distorted_sequence_is_replayed_as_its_raw_images_with_their_distortion(asl):
+    texture = np.random.default_rng(0).integers(100, 256, SIZE[::-1], np.uint8)
+    pincushion(asl, texture)
+    recording = open_recording(asl)
+    info, image = [message for _, _, message in recording.messages(
+        {recording.info_topic, recording.image_topic})][:2]
+    assert info.d.tolist() == [*PINCUSHION, 0]
+    assert np.array_equal(gray_image(image), texture)
+    camera = Camera.from_info(info, means_rectified('auto', recording.image_topic))
+    assert camera.K.tolist() == K.tolist()
+    assert np.array_equal(camera.undistort(texture), euroc(asl).image(2))
+
+
 def test_euroc_ground_truth_is_the_cameras_and_starts_where_it_is_known(asl):
     poses = euroc(asl).poses
     assert np.isnan(poses[0]).all()
@@ -114,10 +151,13 @@ def test_tum_ground_truth_is_interpolated_to_the_images(tum):
 def test_a_gap_in_the_ground_truth_is_not_bridged():
     known = np.tile(np.eye(4), (4, 1, 1))
     stamps = np.array([0, 50, 300, 350]) * 1_000_000
-    poses = interpolate(stamps, known, np.array([-1, 25, 200, 325, 351]) * 1_000_000)
+    poses = poses_at(stamps, known, np.array([-1, 25, 200, 325, 351]) * 1_000_000, LONGEST_GAP_NS)
     assert np.isnan(poses[:, 0, 0]).tolist() == [True, False, True, False, True]
-    assert interpolate(stamps[:1], known[:1], stamps) is None
-    assert interpolate(stamps, known, np.array([10**12])) is None
+    alone = poses_at(stamps[:1], known[:1], stamps, LONGEST_GAP_NS)
+    assert np.isnan(alone[:, 0, 0]).tolist() == [False, True, True, True]
+    nowhere = poses_at(stamps, known, np.array([10**12]), LONGEST_GAP_NS)
+    assert np.isnan(nowhere).all()
+    assert from_first(nowhere) is None
 
 
 def test_a_calibration_file_goes_before_the_folders_name(tum):
@@ -139,8 +179,8 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
     assert open_sequence(tum).name == 'rgbd_dataset_freiburg3_desk'
     assert open_sequence(folder).name == 'KITTI 07'
     for path in (tmp_path / 'bag', tmp_path / 'bag' / 'bag.mcap'):
-        with open_sequence(path) as source:
-            assert isinstance(source, BagSource)
+        with open_recording(path) as recording:
+            assert isinstance(recording, BagRecording)
     with pytest.raises(DjetError, match='is neither a bag nor a folder of KITTI'):
         open_sequence(asl / 'mav0' / 'cam0')
     with pytest.raises(DjetError, match='it holds sequences/07: give one of these'):

@@ -20,7 +20,7 @@ from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.steps import Steps
-from djet_ros.recordings.sources import open_source
+from djet_ros.recordings.recording import open_recording
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -506,7 +506,7 @@ def test_on_a_block_driven_twice_the_error_shrinks_by_a_factor(live, tmp_path):
     folder = render_sequence('loop', tmp_path, size=(310, 94))
     config = from_flat({'odometry.scale': 'ground_truth', 'odometry.scale_uncertainty': 0.01,
                         'estimator.max_features': 800})
-    source = open_source(folder)
+    source = open_recording(folder)
     truth = dict(pose_of(one.message)
                  for one in source.messages({source.ground_truth_topic}))
     lengths = GroundTruthScale(np.array([*truth]),

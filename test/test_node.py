@@ -16,7 +16,8 @@ from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
-from djet_ros.recordings.bags import Bag, BagSource
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
 from ros_graph import ENVIRONMENT, NODE, NodeProcess, Peer
@@ -167,12 +168,12 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
 
     node('-r', 'image:=/camera/image_rect', '--params-file', str(parameters),
          **{'ros.queue_policy': 'every'})
-    with BagSource(tmp_path / 'bag') as source:
+    with BagRecording(tmp_path / 'bag') as source:
         publisher.advertise(source.info_topic, INFO_TYPE)
         publisher.advertise(source.image_topic, IMAGE_TYPE)
         # Until the node knows both publishers, as they know the node.
         sleep(0.5)
-        for message in source:
+        for message in source.messages():
             publisher.send(message.topic, message.message)
     subscriber.wait('the last pair', paired(len(drive) - 1))
     subscriber.wait('all odometry', lambda heard: len(heard[poses[2]]) == len(drive))

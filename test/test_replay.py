@@ -16,10 +16,10 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import pose_of
-from djet_ros.recordings.bag_writers import IMAGE_TOPIC, INFO_TOPIC, write_kitti_bag
+from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
-from djet_ros.recordings.sources import open_source
+from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
@@ -363,7 +363,7 @@ def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
         for stamp, true_pose in zip(sequence.stamps_ns.tolist(), sequence.poses, strict=True):
             writer.write(stamp, true_pose)
     for poses in (None, kitti, tum):
-        source = open_source(bag, poses=poses)
+        source = open_recording(bag, poses=poses)
         found = [pose_of(m.message) for m in source.messages()
                  if m.topic == source.ground_truth_topic]
         source.close()
@@ -410,7 +410,7 @@ def test_a_speed_topic_gives_metres(tmp_path):
 
 def test_topics_are_for_bags(folder):
     with pytest.raises(DjetError, match='for bags'):
-        open_source(folder, image_topic='/camera')
+        open_recording(folder, image_topic='/camera')
 
 
 # Errors

@@ -10,7 +10,7 @@ from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
 from djet_ros.errors import DjetError
-from djet_ros.recordings.sources import open_source
+from djet_ros.recordings.recording import open_recording
 
 DESCRIPTION = f"""\
 Publish the images of a recording, their CameraInfo and the ground truth, at the pace of the
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.names import Names
     from djet_ros.dds.player import Player
     names = Names('player', args.remap)
-    source = open_source(args.source, args.image_topic, args.info_topic)
+    source = open_recording(args.source, args.image_topic, args.info_topic)
     try:
         with Graph() as graph:
             player = Player(graph, source, names, args.rate, args.clock)

@@ -12,7 +12,7 @@ from djet_ros.config.flat import with_values
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
-from djet_ros.recordings.sources import open_source
+from djet_ros.recordings.recording import open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import PLOT, ResultsFolder
 from rich.console import Console
@@ -65,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
     """Replay with a progress bar on stderr, and show what came of it on stdout."""
     config = load_yaml(args.config) if args.config else Config()
     config = with_values(config, flag_values(args))
-    source = open_source(args.source, args.image_topic, args.info_topic, args.poses,
-                         speed=config.odometry.scale == 'speed', speed_topic=args.speed_topic)
+    source = open_recording(args.source, args.image_topic, args.info_topic, args.poses,
+                            speed=config.odometry.scale == 'speed',
+                            speed_topic=args.speed_topic)
     try:
         with ResultsFolder(args.output, config, args.overwrite) as folder:
             outcome = _with_progress(Replay(source, config, folder, str(args.source)),

@@ -18,12 +18,11 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.parameter import describe
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
-from djet_ros.odometry.messages import pose_of
 from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.offline import run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import make_room
-from djet_ros.recordings.sources import open_source, Source
+from djet_ros.recordings.recording import open_recording, Recording
 from djet_ros.replay.graph_of_results import read_results
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.replay import Replay
@@ -94,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         config, frames = load_yaml(results / 'config.yaml'), read_results(results)
         with _bar('keyframes') as progress:
             slam = run_slam(frames, source, config, parameters, progress, args.output)
-        truth = _truth(source).at(slam.frames.stamps_ns)
+        truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
     finally:
         source.close()
     summary = write_report(args.output, slam, truth, name, config, parameters)
@@ -106,8 +105,9 @@ def run(args: argparse.Namespace) -> int:
 def _replayed(args: argparse.Namespace) -> Path:
     """Replay the recording into the output folder, and give the folder of the results."""
     config = with_values(load_yaml(args.config) if args.config else Config(), flag_values(args))
-    source = open_source(args.input, args.image_topic, args.info_topic, args.poses,
-                         speed=config.odometry.scale == 'speed', speed_topic=args.speed_topic)
+    source = open_recording(args.input, args.image_topic, args.info_topic, args.poses,
+                            speed=config.odometry.scale == 'speed',
+                            speed_topic=args.speed_topic)
     path: Path = args.output / 'replay'
     try:
         with ResultsFolder(path, config, args.overwrite) as folder, _bar('replay') as progress:
@@ -121,7 +121,7 @@ def _replayed(args: argparse.Namespace) -> Path:
     return path
 
 
-def _source(results: Path, args: argparse.Namespace) -> tuple[Source, str]:
+def _source(results: Path, args: argparse.Namespace) -> tuple[Recording, str]:
     """Open the recording that results are of, and give its name too."""
     summary = read_yaml(results / REPLAY_SUMMARY)
     if not isinstance(summary, dict) or not isinstance(summary.get('source'), str):
@@ -130,9 +130,8 @@ def _source(results: Path, args: argparse.Namespace) -> tuple[Source, str]:
     if not path.exists():
         raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
                         '--source where it is')
-    recorded = path.is_file() or is_bag(path)
-    topic = args.image_topic or (str(summary.get('image_topic')) if recorded else None)
-    return open_source(path, topic, args.info_topic, args.poses), summary['source']
+    topic = args.image_topic or (str(summary.get('image_topic')) if is_bag(path) else None)
+    return open_recording(path, topic, args.info_topic, args.poses), summary['source']
 
 
 @contextmanager
@@ -142,14 +141,6 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
                   TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _truth(source: Source) -> GroundTruth:
-    truth = GroundTruth()
-    if source.ground_truth_topic is not None:
-        for message in source.messages({source.ground_truth_topic}):
-            truth.add(*pose_of(message.message))
-    return truth
 
 
 def _table(summary: dict[str, Any]) -> Table:

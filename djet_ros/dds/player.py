@@ -10,7 +10,7 @@ from djet_ros.dds.graph import Graph, Profile, Publisher
 from djet_ros.dds.names import Names
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import MAKE, message_type
-from djet_ros.recordings.sources import Source
+from djet_ros.recordings.recording import Recording
 
 # All that is sent waits for reliable subscriptions; best-effort ones take what they get.
 _STREAM = Profile(depth=None)
@@ -31,13 +31,13 @@ class Played:
 
 
 class Player:
-    """Publishes the messages of a source, at rate times their recorded pace."""
+    """Publishes the messages of a recording, at rate times their recorded pace."""
 
-    def __init__(self, graph: Graph, source: Source, names: Names, rate: float = 1.0,
+    def __init__(self, graph: Graph, recording: Recording, names: Names, rate: float = 1.0,
                  clock: bool = False) -> None:
         """Advertise the images at once; other topics once they have a message."""
         self._graph = graph
-        self._source = source
+        self._recording = recording
         self._names = names
         self._rate = rate
         self._publishers: dict[str, Publisher] = {}
@@ -47,25 +47,26 @@ class Player:
 
     def _advertise(self) -> None:
         """Advertise all topics before the first message, so that none is lost."""
-        source = self._source
-        missing = {source.image_topic, source.info_topic, source.ground_truth_topic} - {None}
-        for one in source.messages():
+        recording = self._recording
+        missing = {recording.image_topic, recording.info_topic,
+                   recording.ground_truth_topic} - {None}
+        for one in recording.messages():
             if one.topic in missing:
                 missing.discard(one.topic)
                 self._publishers[one.topic] = self._graph.advertise(
                     self._names.resolve(one.topic), one.message.__msgtype__,
-                    _LATCHED if one.topic == source.info_topic else _STREAM)
+                    _LATCHED if one.topic == recording.info_topic else _STREAM)
             if not missing:
                 return
 
     @property
     def image_topic(self) -> str:
         """Resolved name of the topic of the images."""
-        return self._names.resolve(self._source.image_topic)
+        return self._names.resolve(self._recording.image_topic)
 
     def wait_for_listener(self, stop: Event) -> None:
         """Wait until somebody subscribes to the images."""
-        images = self._publishers[self._source.image_topic]
+        images = self._publishers[self._recording.image_topic]
         while not images.listeners:
             if stop.wait(0.05):
                 return
@@ -75,7 +76,7 @@ class Player:
         """Play once, and wait until reliable subscriptions have everything."""
         start: float | None = None
         first = 0
-        for one in self._source.messages():
+        for one in self._recording.messages():
             if one.topic not in self._publishers:
                 continue
             if start is None:
@@ -97,4 +98,4 @@ class Player:
             if stop.wait(0.005):
                 return
         self.played.messages += 1
-        self.played.images += one.topic == self._source.image_topic
+        self.played.images += one.topic == self._recording.image_topic

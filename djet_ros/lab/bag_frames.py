@@ -10,8 +10,8 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import pose_of, stamp_ns
-from djet_ros.recordings.bags import BagSource
-from djet_ros.recordings.sequence import ImageFiles
+from djet_ros.recordings.recording import BagRecording
+from djet_ros.recordings.sequence import FrameSequence, ImageFiles
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 from numpy.typing import NDArray
@@ -19,26 +19,15 @@ from numpy.typing import NDArray
 _INDEX = 'frames.npz'
 
 
-class ExtractedSequence:
-    """A FrameSequence of images that were rectified when they were taken out of a bag."""
+class ExtractedSequence(FrameSequence):
+    """Images that were rectified when they were taken out of a bag."""
 
     def __init__(self, folder: Path) -> None:
+        images = ImageFiles(sorted(folder.glob('*.png')))
         with np.load(folder / _INDEX, allow_pickle=False) as index:
-            self.K: Array = index['K']
-            self.stamps_ns: NDArray[np.int64] = index['stamps_ns']
             poses: Array = index['poses']
-        self.name = folder.name
-        self.poses = poses if len(poses) else None
-        self._images = ImageFiles(sorted(folder.glob('*.png')))
-        self.size = self._images.size
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        return len(self.stamps_ns)
-
-    def image(self, index: int) -> NDArray[np.uint8]:
-        """Give a frame in gray, (H, W) uint8."""
-        return self._images.gray(index)
+            super().__init__(folder.name, images, index['K'], index['stamps_ns'],
+                             poses if len(poses) else None)
 
 
 def is_extracted(folder: Path) -> bool:
@@ -46,7 +35,7 @@ def is_extracted(folder: Path) -> bool:
     return (folder / _INDEX).exists()
 
 
-def extract(source: BagSource, folder: Path) -> Path:
+def extract(recording: BagRecording, folder: Path) -> Path:
     """
     Write the frames of a bag into a new folder, rectified, and the truth at their stamps.
 
@@ -56,18 +45,18 @@ def extract(source: BagSource, folder: Path) -> Path:
     camera: Camera | None = None
     stamps: list[int] = []
     truth = GroundTruth()
-    for topic, _, message in source:
-        if topic == source.info_topic:
+    for topic, _, message in recording.messages():
+        if topic == recording.info_topic:
             camera = camera or Camera.from_info(
-                message, means_rectified('auto', source.image_topic))
-        elif topic == source.ground_truth_topic:
+                message, means_rectified('auto', recording.image_topic))
+        elif topic == recording.ground_truth_topic:
             truth.add(*pose_of(message))
         elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):
             image = camera.undistort(gray_image(message))
             (folder / f'{len(stamps):06d}.png').write_bytes(_png(image))
             stamps.append(stamp_ns(message.header))
     if camera is None or not stamps:
-        raise DjetError(f'{source.bag.path} has no image after its first CameraInfo')
+        raise DjetError(f'{recording.bag.path} has no image after its first CameraInfo')
     stamps_ns = np.array(stamps, np.int64)
     poses = truth.at(stamps_ns) if len(truth) else np.empty((0, 4, 4))
     np.savez(folder / _INDEX, K=camera.K, stamps_ns=stamps_ns, poses=poses)

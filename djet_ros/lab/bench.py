@@ -19,7 +19,7 @@ from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
-from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
@@ -200,9 +200,9 @@ def _fastest(action: Callable[[], None]) -> float:
 
 
 def _open(source: Path) -> FrameSequence:
-    sequence = open_sequence(source)
-    if isinstance(sequence, BagSource):
+    if is_bag(source):
         raise DjetError(f'{source} is a bag; the bench reads image files, give a sequence folder')
+    sequence = open_sequence(source)
     if len(sequence) < 2:
         raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
     return sequence

@@ -14,8 +14,9 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.bag_frames import extract, ExtractedSequence, is_extracted
 from djet_ros.lab.scenes.sequence import rendered_scene
-from djet_ros.recordings.bags import BagSource
+from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +81,7 @@ def opened(dataset: Dataset) -> FrameSequence:
 def _frames_in(folder: Path) -> FrameSequence:
     if is_extracted(folder):
         return ExtractedSequence(folder)
-    sequence = open_sequence(folder)
-    assert not isinstance(sequence, BagSource)  # bags are extracted when datasets are opened
-    return sequence
+    return open_sequence(folder)
 
 
 def pair_of_frames(path: Path, index: int, workspace: Path
@@ -101,11 +100,10 @@ def readable_frames(path: Path, workspace: Path) -> FrameSequence:
 
 def _readable(path: Path, place: Path) -> Path:
     """Folder in which frames can be had in any order: a bag's are written to a place for it."""
-    sequence = open_sequence(path)
-    if not isinstance(sequence, BagSource):
+    if not is_bag(path):
         return path.resolve()
-    with sequence:
-        return extract(sequence, place)
+    with BagRecording(path) as recording:
+        return extract(recording, place)
 
 
 def _dataset(path: Path, name: str, selection: Selection, workspace: Path) -> Dataset:

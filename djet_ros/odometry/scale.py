@@ -15,6 +15,7 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.ground import Ground, GroundMotion
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
+from djet_ros.odometry.interpolation import positions_at
 import numpy as np
 from numpy.typing import NDArray
 
@@ -228,25 +229,15 @@ class GroundTruthScale:
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Give the distance, unknown outside the stretch and wherever a gap is too wide."""
-        if not (self._covers(start_ns) and self._covers(end_ns)):
+        start, end = positions_at(self._stamps, self._positions, np.array([start_ns, end_ns]),
+                                  _LONGEST_HOLD_NS)
+        metres = float(np.linalg.norm(end - start))
+        if not np.isfinite(metres):
             return unknown(1.0)
-        metres = float(np.linalg.norm(self._at(end_ns) - self._at(start_ns)))
         return Length(metres, max(metres * self._uncertainty, 1e-3), True)
 
     def reset(self) -> None:
         """Keep the ground truth: it is given, not measured on the way."""
-
-    def _covers(self, stamp_ns: int) -> bool:
-        after = int(np.searchsorted(self._stamps, stamp_ns))
-        if after < len(self._stamps) and self._stamps[after] == stamp_ns:
-            return True
-        inside = 0 < after < len(self._stamps)
-        return inside and bool(
-            self._stamps[after] - self._stamps[after - 1] <= _LONGEST_HOLD_NS)
-
-    def _at(self, stamp_ns: int) -> Array:
-        seconds = (self._stamps - stamp_ns) * 1e-9
-        return np.array([np.interp(0.0, seconds, axis) for axis in self._positions.T])
 
 
 def unknown(guess: float) -> Length:

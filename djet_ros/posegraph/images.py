@@ -16,7 +16,7 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.sources import Source
+from djet_ros.recordings.recording import Recording
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,20 +100,21 @@ class _Kept(NamedTuple):
     frame: Frame
 
 
-def frames_at(source: Source, config: Config, stamps_ns: NDArray[np.int64]) -> Iterator[Frame]:
+def frames_at(recording: Recording, config: Config, stamps_ns: NDArray[np.int64]
+              ) -> Iterator[Frame]:
     """
     Yield the frames of some stamps (N,), in the order of recording, as the odometry had them.
 
     DjetError where the recording does not hold them all.
     """
-    rectified = means_rectified(config.odometry.rectified, source.image_topic)
+    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
     wanted = iter(stamps_ns.tolist())
     stamp = next(wanted, None)
     camera: Camera | None = None
-    for message in source.messages({source.image_topic, source.info_topic}):
-        if message.topic == source.info_topic:
+    for message in recording.messages({recording.image_topic, recording.info_topic}):
+        if message.topic == recording.info_topic:
             camera = Camera.from_info(message.message, rectified)
-        elif message.topic == source.image_topic and camera is not None \
+        elif message.topic == recording.image_topic and camera is not None \
                 and stamp_ns(message.message.header) == stamp:
             gray = camera.undistort(gray_image(message.message))
             yield Frame(gray, camera.K, stamp, message.message.header.frame_id)

@@ -14,7 +14,7 @@ from djet_ros.posegraph.graph import PoseGraph
 from djet_ros.posegraph.images import frames_at, SeenFile
 from djet_ros.posegraph.keyframes import choose_keyframes, Keyframes, without_common_length
 from djet_ros.posegraph.loops import EdgeFinder
-from djet_ros.recordings.sources import Source
+from djet_ros.recordings.recording import Recording
 import numpy as np
 
 
@@ -50,7 +50,7 @@ class Slam:
                    for edge, trust in zip(self.solution.graph.edges, self.solution.trust))
 
 
-def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig,
+def run_slam(frames: PoseGraph, recording: Recording, config: Config, slam: SlamConfig,
              progress: Callable[[int, int], None] | None = None,
              scratch: Path | None = None) -> Slam:
     """
@@ -66,7 +66,7 @@ def run_slam(frames: PoseGraph, source: Source, config: Config, slam: SlamConfig
         frames, config.odometry.scale_uncertainty, slam.length_noise), slam)
     graph = keyframes.graph
     edges = [*graph.edges]
-    images = frames_at(source, config, graph.stamps_ns)
+    images = frames_at(recording, config, graph.stamps_ns)
     with SeenFile(scratch) as seen:
         finder = EdgeFinder(config.estimator, slam, seen)
         for number, (frame, before) in enumerate(zip(images, (None, *graph.edges))):

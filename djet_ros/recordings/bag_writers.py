@@ -19,6 +19,7 @@ from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, MAKE
 from djet_ros.recordings.outputs import appearing
+from djet_ros.recordings.recording import SequenceRecording, WORLD_FRAME
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from rosbags.interfaces import (
@@ -33,16 +34,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-
-IMAGE_TOPIC = '/camera/image_rect'
-INFO_TOPIC = '/camera/camera_info'
-GROUND_TRUTH_TOPIC = '/ground_truth/pose'
-CAMERA_FRAME = 'camera'
-WORLD_FRAME = 'camera_first'
-
-# An optical frame in the map (x forward, y left, z up).
-_OPTICAL = np.eye(4)
-_OPTICAL[:3, :3] = OPTICAL_TO_BODY
 
 FOREVER = QosTime(9223372036, 854775807)
 
@@ -63,8 +54,9 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     """
     Write a sequence as a rosbag2 folder.
 
-    Topics: /camera/image_rect (mono8), /camera/camera_info, /ground_truth/pose (camera in the
-    first camera, where the sequence knows it) and /tf_static (map to camera_first, REP 103).
+    Topics: /camera/image_rect (mono8; image_raw where it is distorted), /camera/camera_info,
+    /ground_truth/pose (camera in the first camera, where the sequence knows it) and /tf_static
+    (map to camera_first, REP 103).
     ``progress`` is called with the number of frames written so far. The bag appears under its
     name when it is complete; a failure or an interrupt leaves nothing (a kill a hidden folder
     beside it), and with ``overwrite`` leaves the old bag. Raises DjetError where ``out`` exists
@@ -72,13 +64,16 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
+    recording = SequenceRecording(sequence)
     with _left_whole(out), appearing(out, overwrite, is_bag, 'bag folder') as folder:
         writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
         with writer:
-            for written, messages in enumerate(_frames(sequence), 1):
-                for topic, message, stamp in messages:
-                    _write(writer, topic, message, stamp)
-                if progress is not None:
+            _write_map_frame(writer, int(sequence.stamps_ns[0]))
+            written = 0
+            for topic, stamp, message in recording.messages():
+                _write(writer, topic, message, stamp)
+                written += topic == recording.image_topic
+                if progress is not None and topic == recording.image_topic:
                     progress(written)
 
 
@@ -137,6 +132,13 @@ def _write(writer: Writer, topic: str, message: Any, stamp_ns: int) -> None:
     writer.write(connection, stamp_ns, jazzy().serialize_cdr(message, msgtype))
 
 
+def _write_map_frame(writer: Writer, stamp_ns: int) -> None:
+    """Write where the first camera is in the map (x forward, y left, z up)."""
+    pose = np.eye(4)
+    pose[:3, :3] = OPTICAL_TO_BODY
+    _write(writer, '/tf_static', MAKE.frame(stamp_ns, 'map', WORLD_FRAME, pose), stamp_ns)
+
+
 def _connect(writer: Writer, topic: str, msgtype: str) -> Connection:
     offered = LATCHED if topic == '/tf_static' else VOLATILE
     return writer.add_connection(topic, msgtype, typestore=jazzy(),
@@ -152,23 +154,3 @@ def _left_whole(out: Path) -> Iterator[None]:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DjetError(f'{out} could not be written: {reason}; nothing was left '
                         'behind') from error
-
-
-def _frames(sequence: FrameSequence) -> Iterator[list[tuple[str, Any, int]]]:
-    """
-    Yield the messages (topic, message, stamp) of one frame after the other.
-
-    The image comes last: whoever acts on it then has everything of the same stamp.
-    """
-    for index, stamp in enumerate(sequence.stamps_ns.tolist()):
-        messages = []
-        if index == 0:
-            messages.append(('/tf_static', MAKE.frame(stamp, 'map', WORLD_FRAME, _OPTICAL), stamp))
-        if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
-            pose = MAKE.pose_in(stamp, WORLD_FRAME, sequence.poses[index])
-            messages.append((GROUND_TRUTH_TOPIC, pose, stamp))
-        info = MAKE.camera_info(stamp, CAMERA_FRAME, sequence.K, sequence.size)
-        messages.append((INFO_TOPIC, info, stamp))
-        image = MAKE.picture(stamp, CAMERA_FRAME, sequence.image(index))
-        messages.append((IMAGE_TOPIC, image, stamp))
-        yield messages

@@ -1,8 +1,4 @@
-"""
-Reading recordings: rosbag2 folders and files, and ROS 1 bags, as one stream of messages.
-
-``Bag`` gives any topics; ``BagSource`` finds the camera and the ground truth in a bag.
-"""
+"""Reading bags: rosbag2 folders and files, and ROS 1 bags, as one stream of messages."""
 
 from __future__ import annotations
 
@@ -20,11 +16,6 @@ from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import Decoder, decoder
 from djet_ros.recordings.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.recordings.storages.compression import decompress_file, ZSTD_MAGIC
-
-IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)
-POSE_TYPES = ('geometry_msgs/msg/PoseStamped', 'nav_msgs/msg/Odometry',
-              'geometry_msgs/msg/TransformStamped')
 
 STORAGE_NAMES = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
 
@@ -97,97 +88,10 @@ class Bag(Closing):
             return open_storage(file)
 
 
-class BagSource(Closing):
-    """
-    The camera in a bag: its images, their CameraInfo, and the ground truth where there is one.
-
-    Iterating yields BagMessage in the order of recording; which is which tell the attributes
-    ``image_topic``, ``info_topic`` and ``ground_truth_topic`` (None where there is none).
-    ``len()`` is the number of images. Topics that aren't named are found; DjetError lists the
-    choices where that is not possible.
-    """
-
-    def __init__(self, path: Path, image_topic: str | None = None,
-                 info_topic: str | None = None, ground_truth_topic: str | None = None) -> None:
-        """Open the bag and choose the topics."""
-        self.bag = Bag(path)
-        try:
-            self._topics = [topic for topic in self.bag.topics if topic.message_count]
-            if not self._topics:
-                # If a break is the reason, this tells it.
-                next(self.bag.messages(), None)
-                raise DjetError(f'{path} holds no message; record it again')
-            image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
-            self.image_topic = image.name
-            self.info_topic = self._info_topic(info_topic)
-            self.ground_truth_topic = self._ground_truth_topic(ground_truth_topic)
-            self._count = image.message_count
-        except BaseException:
-            self.bag.close()
-            raise
-
-    def __len__(self) -> int:
-        """Count the images (in a damaged bag, those that can be counted)."""
-        return self._count
-
-    def __iter__(self) -> Iterator[BagMessage]:
-        """Yield the messages of the chosen topics."""
-        topics = {self.image_topic, self.info_topic}
-        if self.ground_truth_topic is not None:
-            topics.add(self.ground_truth_topic)
-        return self.bag.messages(topics)
-
-    def close(self) -> None:
-        """Close the bag."""
-        self.bag.close()
-
-    def _fitting(self, types: Collection[str]) -> list[Topic]:
-        return [topic for topic in self._topics if topic.msgtype in types]
-
-    def _choose(self, what: str, option: str, types: Collection[str], name: str | None) -> Topic:
-        """Topic of some types by its name or, without one, because there is only one."""
-        fitting = self._fitting(types)
-        chosen = [topic for topic in fitting if name in (None, topic.name)]
-        if len(chosen) == 1:
-            return chosen[0]
-        if not fitting:
-            others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
-            raise DjetError(f'{self.bag.path} has no {what} topic, but {one_line(others)}; '
-                            'record it too')
-        choices = one_line(', '.join(
-            f'{topic.name} ({topic.message_count})' for topic in fitting))
-        if name is not None:
-            raise DjetError(f"{self.bag.path} has no {what} topic '{name}'; choose from {choices}")
-        raise DjetError(f'{self.bag.path} has {len(chosen)} {what} topics: {choices}; '
-                        f'choose one with {option}')
-
-    def _info_topic(self, name: str | None) -> str:
-        """Topic beside the images (image_transport's rule), or the only one of an only camera."""
-        if name is None:
-            have = self._fitting(CAMERA_INFO_TYPES)
-            # .../image_raw/compressed belongs to .../camera_info, as .../image_raw does.
-            for folder in list(PurePosixPath(self.image_topic).parents)[:2]:
-                if (beside := str(folder / 'camera_info')) in {topic.name for topic in have}:
-                    return beside
-            if len(have) == 1 and len(self._fitting(IMAGE_TYPES)) > 1:
-                raise DjetError(f'{self.bag.path} has no CameraInfo beside {self.image_topic}; '
-                                f'if {have[0].name} is meant, say so with --info-topic')
-        return self._choose('CameraInfo', '--info-topic', CAMERA_INFO_TYPES, name).name
-
-    def _ground_truth_topic(self, name: str | None) -> str | None:
-        """Topic given, or the only one that calls itself ground truth."""
-        if name is not None:
-            return self._choose('pose', '--ground-truth-topic', POSE_TYPES, name).name
-        fitting = [topic.name for topic in self._fitting(POSE_TYPES)
-                   if re.search('ground_?truth', topic.name)]
-        return fitting[0] if len(fitting) == 1 else None
-
-
 def is_bag(path: Path) -> bool:
-    """Tell whether a path looks like a recording, by its name and not by its content."""
-    if path.is_dir():
-        return (path / 'metadata.yaml').exists() or bool(_storage_files(path))
-    return bool(STORAGE_NAMES.fullmatch(path.name)) or path.name.endswith(('.bag', '.bag.active'))
+    """Tell whether a path can only be a bag: any file, or a folder that holds what a bag does."""
+    return path.is_file() or (path.is_dir() and (
+        (path / 'metadata.yaml').exists() or bool(_storage_files(path))))
 
 
 @contextmanager

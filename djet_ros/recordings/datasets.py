@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 import re
 
-import cv2
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
-from djet_ros.recordings.bags import BagSource, is_bag
+from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.kitti import check_rigid, KittiSequence
 from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import (
@@ -26,7 +25,6 @@ from djet_ros.recordings.trajectories import poses_from_quaternions, read_tum
 from djet_ros.recordings.varos import varos_camera, VarosSequence
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 # A gap in the ground truth wider than this is not bridged by interpolation.
 LONGEST_GAP_NS = 100_000_000
@@ -40,34 +38,7 @@ TUM_CAMERAS = {
 }
 
 
-class UndistortedSequence:
-    """A FrameSequence whose files are distorted: each image is rectified as it is read."""
-
-    def __init__(self, name: str, images: ImageFiles, K: Array, distortion: Array,
-                 stamps_ns: NDArray[np.int64], poses: Array | None) -> None:
-        """Take the parts; K (3, 3) holds before and after, distortion is OpenCV's vector."""
-        self.name = name
-        self.K = K
-        self.size = images.size
-        self.stamps_ns = stamps_ns
-        self.poses = poses
-        self._images = images
-        self._maps = cv2.initUndistortRectifyMap(
-            K, distortion, np.eye(3), K, images.size, cv2.CV_16SC2) if distortion.any() else None
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        return len(self.stamps_ns)
-
-    def image(self, index: int) -> NDArray[np.uint8]:
-        """Rectified gray pixels (H, W) of a frame."""
-        image = self._images.gray(index)
-        if self._maps is None:
-            return image
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
-
-
-def tum_rgbd(folder: Path) -> UndistortedSequence:
+def tum_rgbd(folder: Path) -> FrameSequence:
     """
     Open a TUM RGB-D folder: rgb.txt, rgb/*.png and perhaps groundtruth.txt.
 
@@ -79,12 +50,11 @@ def tum_rgbd(folder: Path) -> UndistortedSequence:
     poses = None
     if (truth := folder / 'groundtruth.txt').exists():
         known, known_poses = read_tum(truth)
-        poses = interpolate(increasing(known, truth), known_poses, stamps)
-    return UndistortedSequence(folder.resolve().name, ImageFiles(paths), K, distortion, stamps,
-                               poses)
+        poses = from_first(poses_at(increasing(known, truth), known_poses, stamps, LONGEST_GAP_NS))
+    return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, poses, distortion)
 
 
-def euroc(folder: Path) -> UndistortedSequence:
+def euroc(folder: Path) -> FrameSequence:
     """
     Open an EuRoC (ASL) folder: mav0/cam0 and perhaps mav0/state_groundtruth_estimate0.
 
@@ -96,15 +66,12 @@ def euroc(folder: Path) -> UndistortedSequence:
     K, distortion, camera_in_body = _asl_camera(camera / 'sensor.yaml')
     poses = None
     if (truth := mav / 'state_groundtruth_estimate0' / 'data.csv').exists():
-        poses = interpolate(*_asl_states(truth, camera_in_body), stamps)
-    return UndistortedSequence(folder.resolve().name, ImageFiles(paths), K, distortion, stamps,
-                               poses)
+        poses = from_first(poses_at(*_asl_states(truth, camera_in_body), stamps, LONGEST_GAP_NS))
+    return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, poses, distortion)
 
 
-def open_sequence(path: Path) -> FrameSequence | BagSource:
-    """Open a bag or a folder of KITTI, TUM RGB-D, EuRoC or VAROS, whichever it is."""
-    if path.is_file() or (path.is_dir() and is_bag(path)):
-        return BagSource(path)
+def open_sequence(path: Path) -> FrameSequence:
+    """Open a folder of KITTI, TUM RGB-D, EuRoC or VAROS, whichever it is."""
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
     if varos_camera(path) is not None:
@@ -116,33 +83,6 @@ def open_sequence(path: Path) -> FrameSequence | BagSource:
         raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0), TUM RGB-D '
                         '(rgb.txt), EuRoC (mav0) or VAROS (vehicle0)')
     return KittiSequence(path)
-
-
-def interpolate(known_ns: NDArray[np.int64], known: Array, stamps_ns: NDArray[np.int64]
-                ) -> Array | None:
-    """
-    Poses (N, 4, 4) at stamps (N,) between those known (M, 4, 4) at increasing stamps (M,).
-
-    They are relative to the first one found; rows are NaN outside the known stretch and in gaps
-    of more than 0.1 s. None where nothing is found.
-    """
-    if len(known_ns) < 2:
-        return None
-    after = np.clip(np.searchsorted(known_ns, stamps_ns), 1, len(known_ns) - 1)
-    inside = ((known_ns[0] <= stamps_ns) & (stamps_ns <= known_ns[-1])
-              & (known_ns[after] - known_ns[after - 1] <= LONGEST_GAP_NS))
-    if not inside.any():
-        return None
-    # Seconds from the first known stamp: absolute ones would lose digits.
-    seconds = (known_ns - known_ns[0]) / 1e9
-    wanted = (stamps_ns[inside] - known_ns[0]) / 1e9
-    found = np.tile(np.eye(4), (len(wanted), 1, 1))
-    found[:, :3, :3] = Slerp(seconds, Rotation.from_matrix(known[:, :3, :3]))(wanted).as_matrix()
-    for axis in range(3):
-        found[:, axis, 3] = np.interp(wanted, seconds, known[:, axis, 3])
-    poses = np.full((len(stamps_ns), 4, 4), np.nan)
-    poses[inside] = from_first(found)
-    return poses
 
 
 def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
@@ -166,7 +106,7 @@ def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
     return increasing(np.array(stamps, dtype=np.int64), path), paths
 
 
-def _tum_camera(folder: Path) -> tuple[Array, Array]:
+def _tum_camera(folder: Path) -> tuple[Array, Sequence[float]]:
     file = folder / 'calibration.txt'
     if file.exists():
         _, text = next(lines(file), (0, ''))
@@ -183,7 +123,7 @@ def _tum_camera(folder: Path) -> tuple[Array, Array]:
     return _camera(values[:4], values[4:], file)
 
 
-def _asl_camera(path: Path) -> tuple[Array, Array, Array]:
+def _asl_camera(path: Path) -> tuple[Array, Sequence[float], Array]:
     sensor = read_yaml(path)
     try:
         model = sensor.get('distortion_model', 'radial-tangential')
@@ -201,11 +141,11 @@ def _asl_camera(path: Path) -> tuple[Array, Array, Array]:
 
 
 def _camera(intrinsics: Sequence[float], distortion: Sequence[float], path: Path
-            ) -> tuple[Array, Array]:
+            ) -> tuple[Array, Sequence[float]]:
     fx, fy, cx, cy = intrinsics
     if not (fx > 0 and fy > 0 and np.isfinite([*intrinsics, *distortion]).all()):
         raise DjetError(f'{path}: fx fy cx cy = {fx:g} {fy:g} {cx:g} {cy:g} is no camera')
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(distortion, np.float64)
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), distortion
 
 
 def _asl_states(path: Path, camera_in_body: Array) -> tuple[NDArray[np.int64], Array]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.recordings.sequence import from_first, ImageFiles
+from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import (
     check_positions,
     increasing,
@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 STAMP_OFFSET_NS = 1000 * 10**9
 
 
-class KittiSequence:
+class KittiSequence(FrameSequence):
     """
     A folder ``.../sequences/NN`` with ``image_0/*.png``, ``calib.txt`` and ``times.txt``.
 
-    A FrameSequence of the left gray camera (already rectified). Stamps are those of times.txt
+    The left gray camera (already rectified). Stamps are those of times.txt
     plus STAMP_OFFSET_NS. Ground truth is taken from ``poses`` or, where it exists, from
     ``../../poses/NN.txt``, and expressed in the first camera of the range start <= i < end.
     Raises DjetError where the folder does not keep to the layout.
@@ -39,25 +39,15 @@ class KittiSequence:
                  end: int | None = None) -> None:
         """Read everything but the images, and check that it belongs together."""
         self.folder = folder.resolve()
-        self.name = f'KITTI {self.folder.name}'
         paths = _image_paths(self.folder)
         chosen = _frame_range(len(paths), start, end, self.folder)
-        self.K = read_camera(self.folder / 'calib.txt')
-        self.stamps_ns = _stamps(self.folder / 'times.txt', len(paths))[chosen]
-        self._images = ImageFiles(paths[chosen])
-        self.frame_paths = self._images.paths
-        self.size = self._images.size
-        self.poses: Array | None = None
+        K = read_camera(self.folder / 'calib.txt')
+        stamps = _stamps(self.folder / 'times.txt', len(paths))[chosen]
+        images = ImageFiles(paths[chosen])
+        truth = None
         if (file := _poses_file(self.folder, poses)) is not None:
-            self.poses = from_first(_poses(file, len(paths))[chosen])
-
-    def __len__(self) -> int:
-        """Count the frames in the chosen range."""
-        return len(self.frame_paths)
-
-    def image(self, index: int) -> NDArray[np.uint8]:
-        """Gray pixels (H, W) of a frame of the chosen range."""
-        return self._images.gray(index)
+            truth = from_first(_poses(file, len(paths))[chosen])
+        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth)
 
 
 def read_camera(path: Path) -> Array:

@@ -1,49 +1,67 @@
-"""What every recorded image sequence offers, and the image files beneath most of them."""
+"""Recorded image sequences, and the image files beneath them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 import struct
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START, whole_png
 import numpy as np
 from numpy.typing import NDArray
 
 
-class FrameSequence(Protocol):
+class FrameSequence:
     """
-    Images of one moving camera, rectified, with stamps and perhaps ground truth.
+    Images of one moving camera in files, with stamps and perhaps ground truth.
 
-    name: for people; K: (3, 3) camera matrix in pixels, pixel centres at integers;
-    size: (width, height); stamps_ns: (N,) int64, strictly increasing, never 0;
-    poses: (N, 4, 4), camera in the first camera's frame, rows of NaN where the ground truth
-    does not reach, or None where there is none.
+    name: for people; K: (3, 3) camera matrix in pixels, pixel centres at integers; distortion:
+    (5,) OpenCV's k1, k2, p1, p2 and k3, zeros where the images are rectified;
+    size: (width, height); frame_paths: the files; stamps_ns: (N,) int64, strictly increasing,
+    never 0; poses: (N, 4, 4), camera in the first known one's frame, rows of NaN where the ground
+    truth does not reach, or None where there is none.
     """
 
-    name: str
-    K: Array
-    size: tuple[int, int]
-    stamps_ns: NDArray[np.int64]
-    poses: Array | None
+    def __init__(self, name: str, images: ImageFiles, K: Array, stamps_ns: NDArray[np.int64],
+                 poses: Array | None, distortion: Sequence[float] = ()) -> None:
+        self.name = name
+        self.K = K
+        self.distortion = np.array([*distortion, *[0.0] * 5][:5])
+        self.size, self.frame_paths = images.size, images.paths
+        self.stamps_ns = stamps_ns
+        self.poses = poses
+        self._images = images
+        self._camera = Camera(K, self.distortion, images.size)
 
     def __len__(self) -> int:
         """Count the frames."""
+        return len(self.stamps_ns)
+
+    def raw(self, index: int) -> NDArray[np.uint8]:
+        """Gray pixels (H, W) of a frame as its file has them."""
+        return self._images.gray(index)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Gray pixels (H, W) of a frame."""
+        """Gray pixels (H, W) of a frame without its distortion."""
+        return self._camera.undistort(self.raw(index))
 
 
-def from_first(poses: Array) -> Array:
-    """Express poses (N, 4, 4) in the frame of the first; an identity there changes no bit."""
-    first = poses[0]
-    if np.array_equal(first, np.eye(4)):
-        return poses
-    return np.asarray(np.linalg.inv(first) @ poses)
+def from_first(poses: Array) -> Array | None:
+    """
+    Express poses (N, 4, 4) in the frame of the first that is known, the others being NaN.
+
+    An identity there changes no bit. None where none is known.
+    """
+    known = np.isfinite(poses).all(axis=(1, 2))
+    if not known.any():
+        return None
+    first = poses[known.argmax()]
+    return poses if np.array_equal(first, np.eye(4)) else np.asarray(np.linalg.inv(first) @ poses)
 
 
 class ImageFiles:

@@ -14,7 +14,7 @@ from pathlib import Path
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.recordings.kitti import check_rigid, STAMP_OFFSET_NS
-from djet_ros.recordings.sequence import from_first, ImageFiles
+from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import increasing, lines, number_rows, stamped, whole_nanoseconds
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,9 @@ FOCAL_LENGTH = 990.323
 SIZE = (1280, 720)
 
 
-class VarosSequence:
+class VarosSequence(FrameSequence):
     """
-    A folder of VAROS: the recording's own, vehicle0, or cam0. A FrameSequence.
+    A folder of VAROS: the recording's own, vehicle0, or cam0.
 
     Stamps are those of the data set plus STAMP_OFFSET_NS. Ground truth is known where a pose has
     the stamp of an image. Raises DjetError where the folder does not keep to the layout.
@@ -37,29 +37,19 @@ class VarosSequence:
         camera = varos_camera(folder)
         if camera is None:
             raise DjetError(f'{folder} is no VAROS folder; it must hold vehicle0/cam0')
-        self.name = f'VAROS {folder.resolve().name}'
-        self._images = ImageFiles(sorted((camera / 'A').glob('*.png')))
-        self.size = self._images.size
-        if self.size != SIZE:
-            raise DjetError(f'{camera / "A"} has images of {self.size[0]}x{self.size[1]}, the '
+        images = ImageFiles(sorted((camera / 'A').glob('*.png')))
+        if images.size != SIZE:
+            raise DjetError(f'{camera / "A"} has images of {images.size[0]}x{images.size[1]}, the '
                             f'known camera of VAROS is for {SIZE[0]}x{SIZE[1]}')
-        self.K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
-                           [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
+        K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
+                      [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
         stamps = _stamps(camera / 'camM0_timestamps.csv')
-        if len(stamps) != len(self):
+        if len(stamps) != len(images.paths):
             raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
-                            f'{len(self)} images; there must be one for each')
-        self.stamps_ns = stamps + STAMP_OFFSET_NS
-        self.poses = _poses(
-            camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        return len(self._images.paths)
-
-    def image(self, index: int) -> NDArray[np.uint8]:
-        """Give a frame in gray, (H, W) uint8."""
-        return self._images.gray(index)
+                            f'{len(images.paths)} images; there must be one for each')
+        poses = _poses(camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
+        super().__init__(f'VAROS {folder.resolve().name}', images, K, stamps + STAMP_OFFSET_NS,
+                         poses)
 
 
 def varos_camera(folder: Path) -> Path | None:
@@ -86,9 +76,5 @@ def _poses(path: Path, stamps: NDArray[np.int64]) -> Array | None:
     for index, stamp in enumerate(stamps.tolist()):
         if stamp in known:
             poses[index, :3], poses[index, 3] = known[stamp], (0, 0, 0, 1)
-    found = np.isfinite(poses).all(axis=(1, 2))
-    if not found.any():
-        return None
-    check_rigid(poses[found], path)
-    poses[found] = from_first(poses[found])
-    return poses
+    check_rigid(poses[np.isfinite(poses).all(axis=(1, 2))], path)
+    return from_first(poses)

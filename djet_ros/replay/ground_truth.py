@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from djet_ros.core.types import Array
+from djet_ros.odometry.interpolation import poses_at
+from djet_ros.odometry.messages import pose_of
 from djet_ros.recordings.datasets import LONGEST_GAP_NS
+from djet_ros.recordings.recording import Recording
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 
 class GroundTruth:
@@ -14,6 +16,15 @@ class GroundTruth:
 
     def __init__(self) -> None:
         self._poses: dict[int, Array] = {}
+
+    @classmethod
+    def of(cls, recording: Recording) -> GroundTruth:
+        """Read all that a recording knows."""
+        truth = cls()
+        if recording.ground_truth_topic is not None:
+            for message in recording.messages({recording.ground_truth_topic}):
+                truth.add(*pose_of(message.message))
+        return truth
 
     def add(self, stamp_ns: int, pose: Array) -> None:
         """Take a pose; one with a number that is not finite is left out."""
@@ -36,21 +47,4 @@ class GroundTruth:
 
         Between two poses at most 0.1 s apart they are interpolated.
         """
-        result = np.full((len(stamps_ns), 4, 4), np.nan)
-        known, poses = self.known()
-        for i, stamp in enumerate(stamps_ns.tolist()):
-            after = int(np.searchsorted(known, stamp))
-            if stamp in self._poses:
-                result[i] = self._poses[stamp]
-            elif 0 < after < len(known) and known[after] - known[after - 1] <= LONGEST_GAP_NS:
-                share = (stamp - known[after - 1]) / (known[after] - known[after - 1])
-                result[i] = _between(poses[after - 1], poses[after], float(share))
-        return result
-
-
-def _between(before: Array, after: Array, share: float) -> Array:
-    pose = np.eye(4)
-    turn = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([before[:3, :3], after[:3, :3]])))
-    pose[:3, :3] = turn(share).as_matrix()
-    pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]
-    return pose
+        return poses_at(*self.known(), stamps_ns, LONGEST_GAP_NS)

@@ -20,7 +20,7 @@ from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.odometry.visual_odometry import TRACKED
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
-from djet_ros.recordings.sources import Source
+from djet_ros.recordings.recording import Recording
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
@@ -38,17 +38,19 @@ class Replay:
     """
     One run of a recording through the tracker, with everything that comes of it written.
 
-    name: path of the source, for people. What goes wrong in the middle does not raise: it ends the
-    run, and the summary and the outcome say what it was.
+    name: path of the recording, for people. What goes wrong in the middle does not raise: it ends
+    the run, and the summary and the outcome say what it was.
     """
 
-    def __init__(self, source: Source, config: Config, folder: ResultsFolder, name: str) -> None:
-        """Prepare the run; DjetError where the scale needs what the source does not have."""
-        self._source = source
+    def __init__(self, recording: Recording, config: Config, folder: ResultsFolder, name: str
+                 ) -> None:
+        """Prepare the run; DjetError where the scale needs what the recording does not have."""
+        self._recording = recording
         self._config = config
         self._folder = folder
         self._name = name
-        self._tracker = Tracker(config, message_type, _scale(source, config), source.image_topic)
+        self._tracker = Tracker(config, message_type, _scale(recording, config),
+                                recording.image_topic)
         self._truth = GroundTruth()
         self._log = _Log()
 
@@ -57,7 +59,7 @@ class Replay:
         started = perf_counter()
         complete, problem = False, 'broken off'
         try:
-            for message in self._source.messages():
+            for message in self._recording.messages():
                 if self._take(message) and progress is not None:
                     progress()
             complete, problem = True, self._complaint()
@@ -74,17 +76,17 @@ class Replay:
 
     def _take(self, message: BagMessage) -> bool:
         """Hand one message on; tell whether it was an image."""
-        source, tracker = self._source, self._tracker
-        if message.topic == source.image_topic:
+        recording, tracker = self._recording, self._tracker
+        if message.topic == recording.image_topic:
             self._image(message)
             return True
-        if message.topic == source.info_topic:
+        if message.topic == recording.info_topic:
             self._publish(tracker.camera_info(message.message), message.stamp_ns)
             if tracker.counts.rejected_infos and tracker.problem:
                 raise tracker.problem
-        elif message.topic == source.ground_truth_topic:
+        elif message.topic == recording.ground_truth_topic:
             self._truth.add(*pose_of(message.message))
-        elif message.topic == source.speed_topic:
+        elif message.topic == recording.speed_topic:
             tracker.speed(message.message)
         return False
 
@@ -119,7 +121,8 @@ class Replay:
         counts, log = self._tracker.counts, self._log
         if not counts.processed:
             return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
-                    f'{self._source.info_topic}; record it too, or choose one with --info-topic')
+                    f'{self._recording.info_topic}; record it too, or choose one with '
+                    '--info-topic')
         if log.first_problem:
             return (f'{self._name}: {counts.rejected.total()} of {counts.received} images could '
                     f'not be used; {log.first_problem}')
@@ -132,7 +135,7 @@ class Replay:
         counts: Counts = self._tracker.counts
         config = self._config
         return {
-            'source': self._name, 'image_topic': self._source.image_topic,
+            'source': self._name, 'image_topic': self._recording.image_topic,
             'method': config.estimator.method, 'preset': config.preset,
             'scale': config.odometry.scale, 'pairs_of_known_scale': self._log.scaled,
             'frames': counts.processed, 'pairs': len(self._log.pairs()),
@@ -220,13 +223,10 @@ class _Log:
         return np.array(poses)
 
 
-def _scale(source: Source, config: Config) -> ScaleSource:
+def _scale(recording: Recording, config: Config) -> ScaleSource:
     """Make the scale source; for ground truth, that of the whole recording is read first."""
     positions = None
-    if config.odometry.scale == 'ground_truth' and source.ground_truth_topic is not None:
-        truth = GroundTruth()
-        for message in source.messages({source.ground_truth_topic}):
-            truth.add(*pose_of(message.message))
-        stamps, poses = truth.known()
+    if config.odometry.scale == 'ground_truth' and recording.ground_truth_topic is not None:
+        stamps, poses = GroundTruth.of(recording).known()
         positions = stamps, poses[:, :3, 3]
     return scale_source(config.odometry, positions)

@@ -1,0 +1,244 @@
+"""
+Anything that can be replayed, as one stream of messages: bags and folders of image files.
+
+A folder becomes the messages that its bag would hold, and a ground-truth file becomes messages
+too, so that all of them pass through the same tracker.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Iterator
+from pathlib import Path, PurePosixPath
+import re
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError, one_line
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.bags import Bag, BagMessage, is_bag, Topic
+from djet_ros.recordings.closing import Closing
+from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.decoding import MAKE
+from djet_ros.recordings.kitti import KittiSequence, read_poses
+from djet_ros.recordings.sequence import FrameSequence
+from djet_ros.recordings.text import lines
+from djet_ros.recordings.trajectories import read_tum
+import numpy as np
+from numpy.typing import NDArray
+
+IMAGE_TOPIC = '/camera/image_rect'
+RAW_IMAGE_TOPIC = '/camera/image_raw'
+INFO_TOPIC = '/camera/camera_info'
+GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+CAMERA_FRAME = 'camera'
+WORLD_FRAME = 'camera_first'
+
+IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)
+POSE_TYPES = ('geometry_msgs/msg/PoseStamped', 'nav_msgs/msg/Odometry',
+              'geometry_msgs/msg/TransformStamped')
+SPEED_TYPES = ('geometry_msgs/msg/TwistStamped', 'nav_msgs/msg/Odometry')
+
+
+class Recording(Closing):
+    """
+    Images, CameraInfo, perhaps ground truth and speeds, as messages in order.
+
+    ``len()`` is the number of images, as far as it is known beforehand. ground_truth_topic and
+    speed_topic are None where there is none, or none is wanted.
+    """
+
+    image_topic: str
+    info_topic: str
+    ground_truth_topic: str | None
+    speed_topic: str | None
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Count the images."""
+
+    @abstractmethod
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Yield the messages, or only those of some topics; DjetError where there is damage."""
+
+
+class SequenceRecording(Recording):
+    """A sequence of image files as the messages of the bag that would be made of it."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        self._sequence = sequence
+        # By the name everybody knows whether images are rectified.
+        self.image_topic = RAW_IMAGE_TOPIC if sequence.distortion.any() else IMAGE_TOPIC
+        self.info_topic = INFO_TOPIC
+        self.ground_truth_topic = None if sequence.poses is None else GROUND_TRUTH_TOPIC
+        self.speed_topic = None
+
+    def __len__(self) -> int:
+        """Count the images."""
+        return len(self._sequence)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """
+        Yield ground truth, CameraInfo and image of each frame in turn.
+
+        The image comes last: whoever acts on it then has everything of the same stamp.
+        """
+        sequence = self._sequence
+        for index, stamp in enumerate(sequence.stamps_ns.tolist()):
+            if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
+                yield _ground_truth(stamp, sequence.poses[index])
+            if topics is None or self.image_topic in topics:
+                yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
+                    stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion))
+                yield BagMessage(self.image_topic, stamp, MAKE.picture(
+                    stamp, CAMERA_FRAME, sequence.raw(index)))
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class BagRecording(Recording):
+    """
+    The camera in a bag, with its ground truth and its speeds where they are wanted.
+
+    Topics that aren't named are found; DjetError lists the choices where that is not possible.
+    """
+
+    def __init__(self, path: Path, image_topic: str | None = None, info_topic: str | None = None,
+                 poses: Path | None = None, speed: bool = False,
+                 speed_topic: str | None = None) -> None:
+        """Open the bag and choose the topics; see ``open_recording``."""
+        self.bag = Bag(path)
+        try:
+            self._topics = [topic for topic in self.bag.topics if topic.message_count]
+            if not self._topics:
+                # If a break is the reason, this tells it.
+                next(self.bag.messages(), None)
+                raise DjetError(f'{path} holds no message; record it again')
+            image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
+            self.image_topic, self._count = image.name, image.message_count
+            self.info_topic = self._info_topic(info_topic)
+            self.ground_truth_topic = (self._ground_truth_topic() if poses is None
+                                       else GROUND_TRUTH_TOPIC)
+            self.speed_topic = self._speed_topic(speed_topic) if speed else None
+            self._poses = None if poses is None else _read_truth(poses, self._count)
+        except BaseException:
+            self.close()
+            raise
+
+    def __len__(self) -> int:
+        """Count the images (in a damaged bag, those that can be counted)."""
+        return self._count
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Yield the messages in the order of recording, and what the file of poses adds."""
+        wanted = {topic for topic in (self.image_topic, self.info_topic, self.ground_truth_topic,
+                                      self.speed_topic)
+                  if topic and (topics is None or topic in topics)}
+        if self._poses is None:
+            yield from self.bag.messages(wanted)
+            return
+        wanted.discard(GROUND_TRUTH_TOPIC)
+        stamps, poses = self._poses
+        if stamps is None:
+            yield from self._each_with_its_pose(wanted, poses)
+            return
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+            yield _ground_truth(stamp, pose)
+        yield from self.bag.messages(wanted)
+
+    def _each_with_its_pose(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
+        """Poses without stamps belong to the images, one to each."""
+        rows = iter(poses)
+        for message in self.bag.messages(wanted | {self.image_topic}):
+            if message.topic == self.image_topic and (pose := next(rows, None)) is not None:
+                yield _ground_truth(stamp_ns(message.message.header), pose)
+            if message.topic in wanted:
+                yield message
+
+    def close(self) -> None:
+        """Close the bag."""
+        self.bag.close()
+
+    def _speed_topic(self, name: str | None) -> str:
+        # The bag's own ground truth is no speed, even where other poses replace it.
+        fitting = [topic.name for topic in self._fitting(SPEED_TYPES)
+                   if topic.name != self._ground_truth_topic()]
+        chosen = [topic for topic in fitting if name in (None, topic)]
+        if len(chosen) != 1:
+            raise DjetError(f"{self.bag.path}: scale 'speed' needs one topic of speeds; "
+                            f'choose one with --speed-topic from: {", ".join(fitting) or "none"}')
+        return chosen[0]
+
+    def _fitting(self, types: Collection[str]) -> list[Topic]:
+        return [topic for topic in self._topics if topic.msgtype in types]
+
+    def _choose(self, what: str, option: str, types: Collection[str], name: str | None) -> Topic:
+        """Topic of some types by its name or, without one, because there is only one."""
+        fitting = self._fitting(types)
+        chosen = [topic for topic in fitting if name in (None, topic.name)]
+        if len(chosen) == 1:
+            return chosen[0]
+        if not fitting:
+            others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
+            raise DjetError(f'{self.bag.path} has no {what} topic, but {one_line(others)}; '
+                            'record it too')
+        choices = one_line(', '.join(
+            f'{topic.name} ({topic.message_count})' for topic in fitting))
+        if name is not None:
+            raise DjetError(f"{self.bag.path} has no {what} topic '{name}'; choose from {choices}")
+        raise DjetError(f'{self.bag.path} has {len(chosen)} {what} topics: {choices}; '
+                        f'choose one with {option}')
+
+    def _info_topic(self, name: str | None) -> str:
+        """Topic beside the images (image_transport's rule), or the only one of an only camera."""
+        if name is None:
+            have = self._fitting(CAMERA_INFO_TYPES)
+            # .../image_raw/compressed belongs to .../camera_info, as .../image_raw does.
+            for folder in list(PurePosixPath(self.image_topic).parents)[:2]:
+                if (beside := str(folder / 'camera_info')) in {topic.name for topic in have}:
+                    return beside
+            if len(have) == 1 and len(self._fitting(IMAGE_TYPES)) > 1:
+                raise DjetError(f'{self.bag.path} has no CameraInfo beside {self.image_topic}; '
+                                f'if {have[0].name} is meant, say so with --info-topic')
+        return self._choose('CameraInfo', '--info-topic', CAMERA_INFO_TYPES, name).name
+
+    def _ground_truth_topic(self) -> str | None:
+        """Name the only topic that calls itself ground truth."""
+        fitting = [topic.name for topic in self._fitting(POSE_TYPES)
+                   if re.search('ground_?truth', topic.name)]
+        return fitting[0] if len(fitting) == 1 else None
+
+
+def open_recording(path: Path, image_topic: str | None = None, info_topic: str | None = None,
+                   poses: Path | None = None, speed: bool = False,
+                   speed_topic: str | None = None) -> Recording:
+    """
+    Open a bag, or a folder in the layout of KITTI, TUM RGB-D or EuRoC.
+
+    poses: ground truth instead of the recording's own, as KITTI (one row per image) or TUM
+    (stamped) file; speed: whether speeds are wanted too. Raises DjetError.
+    """
+    if is_bag(path) or not path.exists():
+        return BagRecording(path, image_topic, info_topic, poses, speed, speed_topic)
+    if image_topic or info_topic or speed:
+        raise DjetError(f'{path} is a folder of images; topics and scale speed are for bags')
+    if poses is not None:
+        return SequenceRecording(KittiSequence(path, poses))
+    return SequenceRecording(open_sequence(path))
+
+
+def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
+    """Poses of a TUM file with their stamps, or of a KITTI file, which must have one per image."""
+    first = next((text for _, text in lines(path)), '')
+    if len(first.replace(',', ' ').split()) == 8:
+        return read_tum(path)
+    poses = read_poses(path)
+    if len(poses) != images:
+        raise DjetError(f'{path} has {len(poses)} poses, the recording has {images} images; give '
+                        'the file that belongs to it')
+    return None, poses
+
+
+def _ground_truth(stamp: int, pose: Array) -> BagMessage:
+    return BagMessage(GROUND_TRUTH_TOPIC, stamp, MAKE.pose_in(stamp, WORLD_FRAME, pose))
