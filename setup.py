@@ -89,8 +89,8 @@ setup(
     entry_points={
         'console_scripts': [
             'djet = djet_ros.cli.main:main',
-            'pose_graph_node = djet_ros.ros.pose_graph_node:main',
-            'vo_node = djet_ros.ros.vo_node:main',
+            'pose_graph_node = djet_ros.cli.nodes:pose_graph_node',
+            'vo_node = djet_ros.cli.nodes:vo_node',
         ],
     },
 )

@@ -28,6 +28,12 @@ ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
                    str(HERE.parent), os.environ.get('PYTHONPATH', '')]))}
 
 
+def command(node: str, before: str = '') -> list[str]:
+    """Give the command that runs a node; before: what its Python is to do first."""
+    return [sys.executable, '-c', f'{before}import sys; from djet_ros.cli.nodes import {node}; '
+            f'sys.exit({node}())']
+
+
 class Peer:
     """A process that publishes, subscribes or calls; see ros_peer.py."""
 
@@ -118,14 +124,14 @@ class NodeProcess:
     """The node under test in a process of its own, with its log."""
 
     def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any],
-                 module: str = 'djet_ros.ros.vo_node') -> None:
+                 name: str = 'vo_node') -> None:
         """Start it with words for ROS, such as remappings, and with parameters by name."""
         self.path = log
         values = [word for name, value in parameters.items()
                   for word in ('-p', f'{name}:={json.dumps(value)}')]
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [sys.executable, '-m', module, '--ros-args', *words, *values],
+                [*command(name), '--ros-args', *words, *values],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 
     @property

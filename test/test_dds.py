@@ -13,18 +13,17 @@ from cards import Cards, K, pose, SIZE
 from dds_graph import (
     Command,
     ENVIRONMENT,
-    Graph,
     IMAGE_TYPE,
     INFO_TYPE,
+    needs_dds,
     NODE,
     Peer,
-    Profile,
     TYPES,
 )
 from djet_ros.cli.main import main
 from djet_ros.dds.names import Names
-from djet_ros.dds.wire import encode
 from djet_ros.lab.scenes import render_sequence
+from djet_ros.live.middleware import Profile
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
@@ -32,6 +31,8 @@ from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, serialised
+
+pytestmark = needs_dds
 
 IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
 RECTIFIED = '/camera/image_rect'
@@ -200,6 +201,7 @@ def test_a_latched_camera_info_from_before_the_node_is_heard(live, peer, drive):
 
 def test_garbage_on_the_topics_is_said_and_counted_and_the_next_pair_is_tracked(
         live, peer, drive):
+    from djet_ros.dds.wire import encode
     one = live(*EVERY, *FAST)
     infos, images = peer.advertise(INFO, INFO_TYPE), peer.advertise(IMAGE, IMAGE_TYPE)
     good = encode(image(drive[0], stamp_ns=stamp(9)))
@@ -297,6 +299,7 @@ def call(peer: Peer, service: str, number: int) -> bytes:
 
 
 def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
+    from djet_ros.dds.graph import Graph
     file = tmp_path / 'cyclone.xml'
     file.write_text('<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/>'
                     '</Interfaces></General></Domain></CycloneDDS>')

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 import signal
 import subprocess
-import sys
 from time import sleep
 from typing import Any
 
@@ -15,7 +14,7 @@ from cards import Cards, K, pose, SIZE
 from djet_ros.odometry.messages import pose_of, stamp_ns
 import numpy as np
 import pytest
-from ros_graph import ENVIRONMENT, NodeProcess, Peer
+from ros_graph import command, ENVIRONMENT, NodeProcess, Peer
 from ros_messages import camera_info, image
 
 pytestmark = [
@@ -68,7 +67,7 @@ def nodes(tmp_path: Path, listener: Peer) -> Iterator[Callable[..., NodeProcess]
 
     def start(name: str, **parameters: Any) -> NodeProcess:
         one = NodeProcess(tmp_path / f'{name}.log', ['-r', f'image:={IMAGE}'], parameters,
-                          f'djet_ros.ros.{name}')
+                          name)
         started.append(one)
         return one
 
@@ -189,14 +188,13 @@ def test_what_is_missing_is_said_with_its_resolved_name(
         assert line in graph.log
 
 
-def node(*words: str, program: str = '') -> subprocess.CompletedProcess[str]:
-    program += ('import sys; from djet_ros.ros.pose_graph_node import main; sys.exit(main())')
-    return subprocess.run([sys.executable, '-c', program, *words], env=ENVIRONMENT, timeout=60,
-                          capture_output=True, text=True, check=False)
+def node(*words: str, before: str = '') -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*command('pose_graph_node', before), *words], env=ENVIRONMENT,
+                          timeout=60, capture_output=True, text=True, check=False)
 
 
 def test_without_gtsam_it_says_in_one_line_how_to_get_it() -> None:
-    done = node(program='import sys; sys.modules["gtsam"] = None; ')
+    done = node(before='import sys; sys.modules["gtsam"] = None; ')
     assert (done.returncode, done.stderr) == (
         2, "pose_graph_node: error: gtsam is missing: pip install 'djet_ros[slam]'\n")
 

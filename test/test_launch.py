@@ -8,10 +8,10 @@ import json
 import os
 from pathlib import Path
 import re
+import shlex
 import shutil
 import signal
 import subprocess
-import sys
 from time import monotonic, sleep
 from typing import Any
 
@@ -23,6 +23,7 @@ from djet_ros.live.topics import graph_outputs, odometry_outputs
 from djet_ros.odometry.messages import Messages
 from djet_ros.posegraph.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
 import pytest
+from ros_graph import command
 import yaml
 
 ROOT = Path(__file__).parents[1]
@@ -112,7 +113,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
     commands.mkdir(parents=True)
     for name in ('vo_node', 'pose_graph_node'):
         node = commands / name
-        node.write_text(f'#!/bin/sh\nexec {sys.executable} -m djet_ros.ros.{name} "$@"\n')
+        node.write_text(f'#!/bin/sh\nexec {shlex.join(command(name))} "$@"\n')
         node.chmod(0o755)
     return {**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}',
             'AMENT_PREFIX_PATH': f'{tmp_path}:{os.environ["AMENT_PREFIX_PATH"]}',

@@ -20,7 +20,7 @@ from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
-from ros_graph import ENVIRONMENT, NODE, NodeProcess, Peer
+from ros_graph import command, ENVIRONMENT, NODE, NodeProcess, Peer
 from ros_messages import camera_info, compressed, header, image, message_type, roi, serialised
 
 pytestmark = [pytest.mark.ros, pytest.mark.skipif(
@@ -468,7 +468,7 @@ def test_a_wrong_value_at_the_start_ends_it_in_one_line(tmp_path):
     for wrong, reason in (('estimator.window:=4', 'window is 4; it must be odd'),
                           ('odometry.scale:=ground_truth', 'only a recording has')):
         done = subprocess.run(
-            [sys.executable, '-m', 'djet_ros.ros.vo_node', '--ros-args', '-p', wrong],
+            [*command('vo_node'), '--ros-args', '-p', wrong],
             env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 2
         line, = done.stderr.splitlines()

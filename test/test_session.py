@@ -9,10 +9,10 @@ from typing import Any
 
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
+from djet_ros.live import session as sessions
 from djet_ros.live.session import Session
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.ros import session as sessions
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type, serialised

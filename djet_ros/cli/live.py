@@ -38,11 +38,12 @@ def run(args: argparse.Namespace) -> int:
     config, use_sim_time = _configuration(args)
 
     from djet_ros.dds.graph import Graph
-    from djet_ros.dds.live_node import LiveNode
+    from djet_ros.dds.middleware import DdsMiddleware
     from djet_ros.dds.names import Names
+    from djet_ros.live.odometry_face import OdometryFace
     names = Names(NODE_NAME, args.remap)
     with Graph() as graph:
-        return LiveNode(graph, config, names, use_sim_time).run(stop)
+        return OdometryFace(DdsMiddleware(graph, names, use_sim_time), config).run(stop)
 
 
 def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:

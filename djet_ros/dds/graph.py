@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
@@ -26,6 +25,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from djet_ros.dds.wire import dds_type_name, decode, encode, sample_type
 from djet_ros.errors import DjetError
+from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
 from djet_ros.recordings.decoding import jazzy
 
 # A write holds Python's interpreter lock; whoever has to wait longer asks again.
@@ -70,35 +70,6 @@ _OFF = """\
 </Domain></CycloneDDS>,"""
 
 _RANGES = {'LOCALHOST': _LOCALHOST, 'SUBNET': _SUBNET, 'OFF': _OFF, 'SYSTEM_DEFAULT': ''}
-
-
-@dataclass(frozen=True)
-class Profile:
-    """Quality of service; depth None keeps all, which makes a reliable publisher wait."""
-
-    reliable: bool = True
-    depth: int | None = 10
-    latched: bool = False
-
-    def __str__(self) -> str:
-        """Say it in ROS's words."""
-        return (f'{"reliable" if self.reliable else "best_effort"}, '
-                f'{"transient_local" if self.latched else "volatile"}')
-
-    def qos(self, user_data: str = '') -> Qos:
-        """Say it in DDS's words; user_data is what ROS tells its peers in addition."""
-        return Qos(
-            Policy.Reliability.Reliable(_MAX_BLOCKING) if self.reliable
-            else Policy.Reliability.BestEffort,
-            Policy.History.KeepAll if self.depth is None else Policy.History.KeepLast(self.depth),
-            Policy.Durability.TransientLocal if self.latched else Policy.Durability.Volatile,
-            Policy.ResourceLimits(max_samples=-1 if self.depth else _KEEP_ALL_ROOM),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(user_data.encode()))
-
-    def incompatible_with(self, offered: Profile) -> bool:
-        """Tell whether a subscription of this profile refuses a publisher."""
-        return self.reliable > offered.reliable or self.latched > offered.latched
 
 
 class Publisher:
@@ -156,7 +127,7 @@ class Subscription:
         self._reader = reader
         self._batch = batch
         self._callback = callback
-        self._refused = 0
+        self._garbage = 0
         self.condition = ReadCondition(reader, _ANY)
 
     def dispatch(self) -> None:
@@ -165,9 +136,14 @@ class Subscription:
             if sample.sample_info.valid_data:
                 self._callback(sample.data, sample.sample_info)
 
+    def count_garbage(self) -> None:
+        """Count a sample that is no message of its type as one that never came."""
+        self._garbage += 1
+
     def new_losses(self) -> int:
         """Count the messages that were lost on the way since the last call."""
-        return int(self._reader.get_sample_lost_status().total_count_change)
+        number, self._garbage = self._garbage, 0
+        return number + int(self._reader.get_sample_lost_status().total_count_change)
 
     def new_refusals(self) -> int:
         """Count the publishers that turned up since the last call and do not fit."""
@@ -212,7 +188,8 @@ class Graph:
         """Leave the graph."""
         self.close()
 
-    def advertise(self, topic: str, ros_type: str, profile: Profile = Profile()) -> Publisher:
+    def advertise(self, topic: str, ros_type: str,
+                  profile: Profile = DEFAULT_PROFILE) -> Publisher:
         """Publish on a topic from now on."""
         return self.advertise_raw(f'rt{topic}', dds_type_name(ros_type), profile,
                                   _type_hash(ros_type))
@@ -222,11 +199,11 @@ class Graph:
         """Publish on a topic under its DDS names."""
         sample = sample_type(dds_type)
         writer = DataWriter(self._participant, Topic(self._participant, dds_topic, sample),
-                            profile.qos(user_data))
+                            _qos(profile, user_data))
         return Publisher(writer, sample)
 
     def listen(self, topic: str, ros_type: str, callback: Callable[[Any], None],
-               profile: Profile = Profile(), *, batch: int = 100,
+               profile: Profile = DEFAULT_PROFILE, *, batch: int = 100,
                garbage: Callable[[str], None] = lambda reason: None) -> Subscription:
         """
         Hand the messages on a topic to a callback.
@@ -238,6 +215,7 @@ class Graph:
             try:
                 message = decode(data, ros_type)
             except DjetError as error:
+                subscription.count_garbage()
                 garbage(f'a message on {topic} could not be read: {error}')
                 return
             callback(message)
@@ -252,7 +230,7 @@ class Graph:
         """Hand CDR and sample information on a topic, under its DDS names, to a callback."""
         reader = DataReader(self._participant,
                             Topic(self._participant, dds_topic, sample_type(dds_type)),
-                            profile.qos(user_data))
+                            _qos(profile, user_data))
         subscription = Subscription(reader, dds_topic, profile, batch, callback)
         self._waiting.attach(subscription.condition)
         self._subscriptions.append(subscription)
@@ -264,10 +242,10 @@ class Graph:
         for subscription in list(self._subscriptions):
             subscription.dispatch()
 
-    def offers(self, topic: str) -> list[tuple[str, Profile]]:
-        """Give who publishes a topic, as an identifier, and with which quality of service."""
-        return [(str(one.participant_key), _profile(one.qos))
-                for one in self._publications.read(1000)
+    def offers(self, topic: str) -> list[Offer]:
+        """Give who publishes a topic."""
+        return [Offer(f'participant {one.participant_key}', _ros_type(one.type_name),
+                      _profile(one.qos)) for one in self._publications.read(1000)
                 if one.topic_name == f'rt{topic}' and
                 one.sample_info.instance_state == InstanceState.Alive]
 
@@ -299,8 +277,26 @@ def _chooses_interfaces(uri: str) -> bool:
     return any('<NetworkInterface' in text for text in texts)
 
 
+def _ros_type(dds_name: str) -> str:
+    """Give the ROS type such as 'sensor_msgs/msg/Image' of a DDS type."""
+    return dds_name.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
+
+
 def _type_hash(ros_type: str) -> str:
     return f'typehash={jazzy().hash_rihs01(ros_type)};'
+
+
+def _qos(profile: Profile, user_data: str = '') -> Qos:
+    """Quality of service in DDS's words; user_data is what ROS tells its peers in addition."""
+    return Qos(
+        Policy.Reliability.Reliable(_MAX_BLOCKING) if profile.reliable
+        else Policy.Reliability.BestEffort,
+        Policy.History.KeepAll if profile.depth is None
+        else Policy.History.KeepLast(profile.depth),
+        Policy.Durability.TransientLocal if profile.latched else Policy.Durability.Volatile,
+        Policy.ResourceLimits(max_samples=-1 if profile.depth else _KEEP_ALL_ROOM),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(user_data.encode()))
 
 
 def _profile(qos: Qos) -> Profile:

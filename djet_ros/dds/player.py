@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from threading import Event
 from time import monotonic
 
-from djet_ros.dds.graph import Graph, Profile, Publisher
+from djet_ros.dds.graph import Graph, Publisher
 from djet_ros.dds.names import Names
+from djet_ros.live.middleware import Profile
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import MAKE, message_type
 from djet_ros.recordings.recording import Recording

@@ -14,7 +14,8 @@ import struct
 from time import monotonic, sleep
 from typing import Any
 
-from djet_ros.dds.graph import Graph, Profile
+from djet_ros.dds.graph import Graph
+from djet_ros.live.middleware import Profile
 
 _HEADER = slice(4, 20)
 _PREFIX = 'std_srvs::srv::dds_::Trigger_'
@@ -24,9 +25,9 @@ _PATIENCE = 0.1
 
 
 class TriggerServer:
-    """Calls an action on each request, and answers that it succeeded."""
+    """Calls an action on each request, and answers that it succeeded and what it did."""
 
-    def __init__(self, graph: Graph, name: str, action: Callable[[], None]) -> None:
+    def __init__(self, graph: Graph, name: str, action: Callable[[], str]) -> None:
         self._action = action
         # By this a client knows that both topics belong to one server.
         own = f'serviceid={".".join(f"{byte:x}" for byte in secrets.token_bytes(16))};'
@@ -39,12 +40,11 @@ class TriggerServer:
         header = data[_HEADER]
         if len(header) < 16:
             return
-        self._action()
+        text = self._action().encode() + b'\0'
         client = re.search('clientid=[^;]*;', self._requests.user_data_of(info))
         if client:
             end = monotonic() + _PATIENCE
             while not self._answers.listens(client[0]) and monotonic() < end:
                 sleep(0.005)
-        # success, and an empty text
         self._answers.send(data[:4] + header + struct.pack(
-            '<B3xIB' if data[1] & 1 else '>B3xIB', True, 1, 0))
+            '<B3xI' if data[1] & 1 else '>B3xI', True, len(text)) + text)

@@ -47,6 +47,7 @@ class GraphSession:
         self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._infos: deque[Any] = deque(maxlen=1)
         self._latencies = Latencies()
+        self._lost = 0
         self._heard = dict.fromkeys(topics, -np.inf)
         self._stopping = False
         self._worker = Thread(target=self._work, name='pose_graph', daemon=True)
@@ -87,6 +88,10 @@ class GraphSession:
         """Take a CameraInfo."""
         self._heard['camera_info'] = np.inf
         self._infos.append(message)
+
+    def count_lost(self, number: int) -> None:
+        """Count images that were sent and never came."""
+        self._lost += number
 
     def reset(self) -> None:
         """Forget the map and what waits, as soon as what is in work is done."""
@@ -141,7 +146,8 @@ class GraphSession:
         return [*self._slam.work(at_once=True), self._slam.diagnostics(time_ns())]
 
     def _face_values(self) -> dict[str, str]:
-        return {'messages dropped': str(self._queue.dropped), **self._latencies.values()}
+        return {'messages dropped': str(self._queue.dropped),
+                'images lost on the way': str(self._lost), **self._latencies.values()}
 
     def _publish(self, outgoing: Sequence[Outgoing]) -> None:
         if outgoing and not self._stopping:

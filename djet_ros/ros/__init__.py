@@ -1,1 +1,1 @@
-"""The live nodes on rclpy: wiring alone. All that needs a ROS 2 installation is here."""
+"""The live nodes on ROS 2: wiring alone; nothing here can be imported without rclpy."""

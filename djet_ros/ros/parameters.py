@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-import difflib
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
@@ -11,6 +10,14 @@ from djet_ros.config.flat import flat, FlatParameter, from_flat, with_values
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own
 from djet_ros.errors import DjetError
+from djet_ros.live.parameters import (
+    FIXED,
+    for_a_live_graph,
+    KNOWN,
+    known,
+    SHARED,
+    unknown_parameter,
+)
 from djet_ros.posegraph.live_config import flat_slam, LiveSlamConfig, slam_config
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -21,43 +28,35 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-# What a subscription or the queue was made with holds for its life.
-FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
-         'ros.queue_size')
-
-# Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
-SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
-          'odometry.frame_convention', 'ros.image_transport', 'ros.qos_reliability',
-          'ros.queue_policy')
-
-_KNOWN = flat(Config())
-
 
 class Parameters:
     """
     Parameters of a node that declares them automatically from overrides.
 
-    config: what they say. apply is called with each new configuration, before it is asked for
-    here. Raises DjetError where a value given at the start can't be used; unknown names are
-    only warned of, because a file may serve several nodes.
+    config: what they say. Raises DjetError where a value given at the start can't be used;
+    unknown names are only warned of, because a file may serve several nodes.
     """
 
-    def __init__(self, node: Node, apply: Callable[[Config], None]) -> None:
-        self._apply = apply
+    def __init__(self, node: Node) -> None:
+        self._node = node
         given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
         for name in given:
-            if name not in _KNOWN and not is_ros_own(name):
-                node.get_logger().warning(_refusal(name))
-        self.config = _live(from_flat(_ours(given)))
+            if name not in KNOWN and not is_ros_own(name):
+                node.get_logger().warning(unknown_parameter(name))
+        self.config = _live(from_flat(known(given)))
 
         # Declared anew with the types, ranges and texts that the overrides do not know.
         for item in flat(self.config).values():
             if item.name in given:
                 node.undeclare_parameter(item.name)
             node.declare_parameter(item.name, item.value, descriptor(item), ignore_override=True)
-        node.add_pre_set_parameters_callback(self._complete)
-        node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._take)
+
+    def call_on_change(self, apply: Callable[[Config], None]) -> None:
+        """Accept changes from now on; apply is called with each new configuration."""
+        self._apply = apply
+        self._node.add_pre_set_parameters_callback(self._complete)
+        self._node.add_on_set_parameters_callback(self._check)
+        self._node.add_post_set_parameters_callback(self._take)
 
     def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
         """Make integers floats where those belong, and let a preset set its values."""
@@ -70,7 +69,7 @@ class Parameters:
         before = flat(self.config)
         return [Parameter(item.name, value=item.value) for item in flat(config).values()
                 if item.name in values or item.value != before[item.name].value
-                ] + [one for one in parameters if one.name not in _KNOWN]
+                ] + [one for one in parameters if one.name not in KNOWN]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -96,9 +95,9 @@ def graph_parameters(node: Node) -> tuple[Config, LiveSlamConfig]:
     given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
     own = flat_slam(LiveSlamConfig())
     for name in given:
-        if name not in own and name not in _KNOWN and not is_ros_own(name):
-            node.get_logger().warning(_refusal(name, own))
-    config = from_flat(_ours(given))
+        if name not in own and name not in KNOWN and not is_ros_own(name):
+            node.get_logger().warning(unknown_parameter(name, own))
+    config = from_flat(known(given))
     slam = slam_config({name: value for name, value in given.items() if name in own})
     shared = [item for item in flat(config).values()
               if item.name in SHARED or item.name.startswith('estimator.')]
@@ -128,30 +127,13 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
 
 
 def _live(config: Config) -> Config:
-    """Refuse what can't be had on a live graph."""
-    if config.odometry.scale == 'ground_truth':
-        raise DjetError("odometry.scale is 'ground_truth', which only a recording has; choose "
-                        'none, constant or speed')
+    """Refuse what can't be had on a live graph, or not in this ROS."""
+    for_a_live_graph(config)
     if config.ros.publish_tf and find_spec('tf2_msgs') is None:
         raise DjetError('ros.publish_tf is true, and the package tf2_msgs is not installed: '
                         'apt install ros-$ROS_DISTRO-tf2-msgs')
     return config
 
 
-def _refusal(name: str, own: Iterable[str] = ()) -> str:
-    """Word why an unknown name is unknown."""
-    if near := difflib.get_close_matches(name, own, n=1, cutoff=0.8):
-        return f"unknown parameter '{name}'; did you mean '{near[0]}'?"
-    try:
-        from_flat({name: None})
-    except DjetError as error:
-        return str(error)
-    raise ValueError(f'{name} is a parameter')
-
-
 def _values(parameters: list[Parameter]) -> dict[str, Any]:
-    return _ours({one.name: one.value for one in parameters})
-
-
-def _ours(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name in _KNOWN}
+    return known({one.name: one.value for one in parameters})

@@ -1,19 +1,14 @@
-"""Entry point of the live SLAM: ``ros2 run djet_ros pose_graph_node``."""
+"""The pose graph as a ROS 2 node."""
 
 from __future__ import annotations
 
-import sys
-
-from djet_ros.ros.entry import run_node
-
-
-def main() -> int:
-    """Run the node until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
-    return run_node('pose_graph_node', 'djet_ros.ros.graph_node',
-                    "Closes the loops of vo_node's odometry, as a ROS 2 node.",
-                    without_ros="without ROS, 'djet slam' works on recorded bags",
-                    extra=('gtsam', 'slam'))
+from djet_ros.live.face import Face
+from djet_ros.live.graph_face import GraphFace
+from djet_ros.ros.middleware import RosMiddleware
+from djet_ros.ros.parameters import graph_parameters
+from rclpy.node import Node
 
 
-if __name__ == '__main__':
-    sys.exit(main())
+def make(node: Node) -> Face:
+    """Make the pose graph of a node's parameters, which hold for its life."""
+    return GraphFace(RosMiddleware(node), *graph_parameters(node))

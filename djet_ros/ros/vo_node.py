@@ -1,17 +1,17 @@
-"""Entry point of the live odometry: ``ros2 run djet_ros vo_node``."""
+"""The odometry as a ROS 2 node."""
 
 from __future__ import annotations
 
-import sys
-
-from djet_ros.ros.entry import run_node
-
-
-def main() -> int:
-    """Run the node until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
-    return run_node('vo_node', 'djet_ros.ros.node', 'Visual odometry by D-JET as a ROS 2 node.',
-                    without_ros="without ROS, 'djet replay' works on recorded bags")
+from djet_ros.live.face import Face
+from djet_ros.live.odometry_face import OdometryFace
+from djet_ros.ros.middleware import RosMiddleware
+from djet_ros.ros.parameters import Parameters
+from rclpy.node import Node
 
 
-if __name__ == '__main__':
-    sys.exit(main())
+def make(node: Node) -> Face:
+    """Make the odometry of a node's parameters; they can be changed while it runs."""
+    parameters = Parameters(node)
+    face = OdometryFace(RosMiddleware(node), parameters.config)
+    parameters.call_on_change(face.configure)
+    return face

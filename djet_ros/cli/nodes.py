@@ -1,4 +1,4 @@
-"""How the commands of ROS 2 nodes begin and end."""
+"""The commands of the ROS 2 nodes: ``ros2 run djet_ros vo_node`` and ``pose_graph_node``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,23 @@ Topics, parameters and the rest are given as to every ROS node:
 """
 
 
-def run_node(name: str, module: str, description: str, *, without_ros: str,
-             extra: tuple[str, str] | None = None) -> int:
+def vo_node() -> int:
+    """Run the odometry until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
+    return _run('vo_node', 'Visual odometry by D-JET as a ROS 2 node.',
+                without_ros="without ROS, 'djet replay' works on recorded bags")
+
+
+def pose_graph_node() -> int:
+    """Run the pose graph until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
+    return _run('pose_graph_node', "Closes the loops of vo_node's odometry, as a ROS 2 node.",
+                without_ros="without ROS, 'djet slam' works on recorded bags",
+                extra=('gtsam', 'slam'))
+
+
+def _run(name: str, description: str, *, without_ros: str,
+         extra: tuple[str, str] | None = None) -> int:
     """
-    Run the node of a module, by its ``run``, until SIGINT or SIGTERM; gives the exit code.
+    Run a node until SIGINT or SIGTERM; gives the exit code.
 
     2 means something that the user can mend, said in one line; without_ros: what can be had
     where ROS is missing; extra: a library that it needs, and the extra that brings it.
@@ -38,17 +51,17 @@ def run_node(name: str, module: str, description: str, *, without_ros: str,
 
     from djet_ros.errors import DjetError, one_line
     try:
-        run = import_module(module).run
-        from rclpy.utilities import remove_ros_args
+        running = import_module('djet_ros.ros.running')
+        make = import_module(f'djet_ros.ros.{name}').make
     except ImportError as error:
         # Such as an rclpy that was built for another Python.
         return _fail(name, f'this Python ({sys.executable}) lacks something: {one_line(error)}')
     parser = argparse.ArgumentParser(
         prog=name, description=description, epilog=_EPILOG.format(name=name),
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args(remove_ros_args()[1:])
+    parser.parse_args(running.own_words())
     try:
-        return 0 if stop.is_set() else int(run(stop))
+        return 0 if stop.is_set() else int(running.run_node(name, make, stop))
     except DjetError as error:
         return _fail(name, str(error))
 

@@ -1,0 +1,95 @@
+"""Plain DDS as a live node's middleware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import sys
+from time import monotonic, time_ns
+from typing import Any
+
+from djet_ros.dds.graph import Graph, Publisher, Subscription
+from djet_ros.dds.names import Names
+from djet_ros.dds.trigger import TriggerServer
+from djet_ros.live.middleware import Offer, Profile
+from djet_ros.live.topics import IMAGE_TYPES
+from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
+from djet_ros.recordings.decoding import message_type
+
+_GARBAGE_LOG_PERIOD = 5.0
+
+_LEVELS = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}
+
+
+class DdsMiddleware:
+    """
+    The ROS graph as a node sees it that is none to ROS: topics and services alone.
+
+    use_sim_time: stamps of now are those of /clock.
+    """
+
+    qos_remedy = 'ros.qos_reliability'
+    message_type = staticmethod(message_type)
+
+    def __init__(self, graph: Graph, names: Names, use_sim_time: bool = False) -> None:
+        self._graph = graph
+        self._names = names
+        self._clock: int | None = None
+        self._last_garbage = -float('inf')
+        self._services: list[TriggerServer] = []
+        if use_sim_time:
+            self._clock = 0
+            graph.listen('/clock', 'rosgraph_msgs/msg/Clock', self._take_clock, Profile(False, 1))
+
+    @property
+    def node(self) -> str:
+        """Name of the node with its namespace."""
+        return self._names.full_node
+
+    def resolve(self, name: str) -> str:
+        """Give the full name of a topic or service, remapped."""
+        return self._names.resolve(name)
+
+    def expand(self, name: str) -> str:
+        """Give the full name, not remapped."""
+        return self._names.expand(name)
+
+    def now_ns(self) -> int:
+        """Time of the system, or of /clock."""
+        return time_ns() if self._clock is None else self._clock
+
+    def log(self, level: str, text: str) -> None:
+        """Log a line, in the form of ROS's log."""
+        seconds, rest = seconds_and_rest(time_ns())
+        print(f'[{_LEVELS[level]}] [{seconds}.{rest:09d}] [{self._names.node}]: {text}',
+              file=sys.stderr, flush=True)
+
+    def advertise(self, topic: str, kind: str) -> Publisher:
+        """Publish on a topic."""
+        return self._graph.advertise(topic, kind)
+
+    def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
+               profile: Profile) -> Subscription:
+        """Hand the messages on a topic to a callback."""
+        # One image at a time: it waits where the queue is full, and services need their turn.
+        return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
+                                  batch=1 if kind in IMAGE_TYPES.values() else 100)
+
+    def offers(self, topic: str) -> list[Offer]:
+        """Give who publishes a topic."""
+        return self._graph.offers(topic)
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
+        self._services.append(TriggerServer(self._graph, self.resolve(name), action))
+
+    def spin(self, seconds: float) -> None:
+        """Wait for messages, at most for some time, and hand them out."""
+        self._graph.spin(seconds)
+
+    def _take_clock(self, message: Any) -> None:
+        self._clock = ns_of_time(message.clock)
+
+    def _note_garbage(self, reason: str) -> None:
+        if monotonic() - self._last_garbage >= _GARBAGE_LOG_PERIOD:
+            self._last_garbage = monotonic()
+            self.log('warning', reason)

@@ -1,0 +1,161 @@
+"""The wiring of a live node, whatever carries its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from threading import Event
+from time import monotonic
+from typing import Any, Protocol
+
+from djet_ros.config.sections import NodeConfig
+from djet_ros.live.middleware import Middleware, Profile, Publisher, Subscription
+from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
+from djet_ros.odometry.messages import seconds_and_rest
+from djet_ros.odometry.tracker import Outgoing
+
+_TICK = 1.0
+
+
+class LiveSession(Protocol):
+    """What a node has its work done by, in a thread of its own."""
+
+    def start(self) -> None:
+        """Begin to work."""
+
+    def stop(self) -> None:
+        """Publish nothing more."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the work ended by an error."""
+
+    def tick(self) -> None:
+        """Say what no message makes it say; called once a second."""
+
+    def image(self, message: Any) -> None:
+        """Take an Image or a CompressedImage."""
+
+    def camera_info(self, message: Any) -> None:
+        """Take a CameraInfo."""
+
+    def count_lost(self, number: int) -> None:
+        """Count images that were sent and never came."""
+
+
+class Face:
+    """A node around a session, to which it is the wiring: it publishes from its thread."""
+
+    # To be made by a subclass, before it listens.
+    session: LiveSession
+
+    def __init__(self, middleware: Middleware) -> None:
+        self._middleware = middleware
+        self._outputs: dict[str, Publisher] = {}
+        self._inputs: list[Subscription] = []
+        self._images: Subscription | None = None
+        self._latched = False
+        self._last_tick = -float('inf')
+
+    def run(self, stop: Event) -> int:
+        """Work until stop is set; 1 where the work ended by an error."""
+        self.session.start()
+        try:
+            while not stop.is_set():
+                self._middleware.spin(0.1)
+                if self.session.failed:
+                    return 1
+                if monotonic() - self._last_tick >= _TICK:
+                    self._last_tick = monotonic()
+                    self._tick()
+            return 0
+        finally:
+            self.session.stop()
+
+    # What a session asks for
+
+    def publish(self, outgoing: Sequence[Outgoing]) -> None:
+        """Publish messages; diagnostics are of now, all others of their image's time."""
+        for topic, message in outgoing:
+            if topic == '/diagnostics':
+                stamp = message.header.stamp
+                stamp.sec, stamp.nanosec = seconds_and_rest(self._middleware.now_ns())
+            if not self._outputs[topic].publish(message):
+                self.log('warning', f'a message on {topic} was not sent: a subscription does not '
+                                    'keep up')
+
+    def log(self, level: str, text: str) -> None:
+        """Log a line."""
+        self._middleware.log(level, text)
+
+    def count_publishers(self, topic: str) -> int:
+        """Count who publishes a topic."""
+        return len(self._middleware.offers(topic))
+
+    def wants_debug_image(self) -> bool:
+        """Tell whether anybody subscribes to the debug image."""
+        output = self._outputs.get('debug_image')
+        return output is not None and bool(output.listeners)
+
+    # Inputs and outputs
+
+    def image_topics(self, config: NodeConfig) -> tuple[str, str]:
+        """Resolve the names of the images and of their CameraInfo."""
+        return image_topics(self._middleware.resolve, self._middleware.expand,
+                            config.image_transport)
+
+    def advertise(self, outputs: Mapping[str, str]) -> None:
+        """Make the publishers of topics with their types that are not there yet."""
+        for topic in outputs.keys() - self._outputs.keys():
+            self._outputs[topic] = self._middleware.advertise(
+                self._middleware.resolve(full_name(topic)), outputs[topic])
+
+    def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
+               profile: Profile) -> Subscription:
+        """Subscribe to a resolved topic; a publisher that does not fit is reported."""
+        self._inputs.append(self._middleware.listen(topic, kind, callback, profile))
+        return self._inputs[-1]
+
+    def listen_to_camera(self, image: str, info: str, transport: str, profile: Profile) -> None:
+        """Subscribe to images and their CameraInfo, which may be latched; the last inputs."""
+        self._info_topic = info
+        # CameraInfo first: of two that wait, it is to be taken before its image.
+        self.listen(info, INFO_TYPE, self.session.camera_info, profile)
+        self._images = self.listen(image, IMAGE_TYPES[transport], self.session.image, profile)
+
+    # Once a second
+
+    def _tick(self) -> None:
+        if self._images is not None:
+            self.session.count_lost(self._images.new_losses())
+        for subscription in self._inputs:
+            if subscription.new_refusals():
+                self._report_mismatch(subscription)
+        self._listen_for_latched()
+        self.session.tick()
+
+    def _listen_for_latched(self) -> None:
+        """Hear a CameraInfo that was sent before this node was there, where it was latched."""
+        # To ask everybody for it would keep those away that do not latch.
+        if self._latched:
+            return
+        for _, _, offered in self._middleware.offers(self._info_topic):
+            if offered.latched:
+                self._latched = True
+                self._middleware.listen(self._info_topic, INFO_TYPE, self.session.camera_info,
+                                        Profile(offered.reliable, 1, latched=True))
+                return
+
+    def _report_mismatch(self, subscription: Subscription) -> None:
+        topic, ours = subscription.topic, subscription.profile
+        for who, _, offered in self._middleware.offers(topic):
+            if ours.incompatible_with(offered):
+                self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
+                         f'{self._middleware.node} asks for {ours}. Nothing is received from it; '
+                         'set ' + self._middleware.qos_remedy.format(topic=topic))
+
+
+def input_profile(config: NodeConfig) -> Profile:
+    """Profile of the inputs; to lose nothing takes a sender that repeats and room for it all."""
+    every = config.queue_policy == 'every'
+    return Profile(reliable=every or config.qos_reliability == 'reliable',
+                   depth=None if every else config.qos_depth)

@@ -1,0 +1,41 @@
+"""The pose graph as a live node: its topics and its service, whatever carries them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.live.face import Face, input_profile
+from djet_ros.live.graph_session import GraphSession
+from djet_ros.live.middleware import Middleware, Profile
+from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs
+from djet_ros.posegraph.live_config import LiveSlamConfig
+from djet_ros.posegraph.live_slam import LiveSlam
+
+# Messages that the middleware keeps while Python is in a long optimisation.
+_DEPTH = 1000
+
+
+class GraphFace(Face):
+    """The live SLAM on a graph."""
+
+    def __init__(self, middleware: Middleware, config: Config, slam: LiveSlamConfig) -> None:
+        super().__init__(middleware)
+        image, info = self.image_topics(config.ros)
+        topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
+        self.session: GraphSession = GraphSession(
+            LiveSlam(config, slam, middleware.message_type, image), self,
+            {**topics, 'image': image, 'camera_info': info})
+        self.advertise(graph_outputs(tf=slam.publish_tf))
+        for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
+                                                 self.session.relative_pose)):
+            self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH))
+        self.listen_to_camera(image, info, config.ros.image_transport,
+                              replace(input_profile(config.ros), depth=slam.image_buffer))
+        middleware.serve('~/reset', self._reset)
+        self.log('info', f'odometry from {topics["odometry"]}, images from {image}, '
+                         f'camera_info from {info}')
+
+    def _reset(self) -> str:
+        self.session.reset()
+        return ''

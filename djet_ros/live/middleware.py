@@ -1,0 +1,108 @@
+"""What a live node asks of its middleware; ROS 2 and plain DDS each answer in their own way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from djet_ros.odometry.messages import MessageType
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Quality of service; depth None keeps all, which makes a reliable publisher wait."""
+
+    reliable: bool = True
+    depth: int | None = 10
+    latched: bool = False
+
+    def __str__(self) -> str:
+        """Say it in ROS's words."""
+        return (f'{"reliable" if self.reliable else "best_effort"}, '
+                f'{"transient_local" if self.latched else "volatile"}')
+
+    def incompatible_with(self, offered: Profile) -> bool:
+        """Tell whether a subscription of this profile refuses a publisher."""
+        return self.reliable > offered.reliable or self.latched > offered.latched
+
+
+DEFAULT_PROFILE = Profile()
+
+
+class Offer(NamedTuple):
+    """A publisher of a topic: who it is, for people, its ROS type and its quality of service."""
+
+    who: str
+    kind: str
+    profile: Profile
+
+
+class Publisher(Protocol):
+    """Sends messages of one topic; may be used from any thread."""
+
+    def publish(self, message: Any) -> bool:
+        """Send a message; False where the subscriptions left no room for it."""
+
+    @property
+    def listeners(self) -> int:
+        """Number of subscriptions."""
+
+
+class Subscription(Protocol):
+    """Hears one topic; profile is what it asks for, after overrides by the user."""
+
+    topic: str
+
+    @property
+    def profile(self) -> Profile:
+        """Quality of service that it asks for."""
+
+    def new_losses(self) -> int:
+        """Count the messages that were lost on the way since the last call."""
+
+    def new_refusals(self) -> int:
+        """Count the publishers that turned up since the last call and do not fit."""
+
+
+class Middleware(Protocol):
+    """The graph as one node sees it. Callbacks come from the thread that calls ``spin``."""
+
+    # What to set where a publisher's quality of service does not fit.
+    qos_remedy: str
+
+    @property
+    def node(self) -> str:
+        """Name of the node with its namespace, as in '/left/vo_node'."""
+
+    @property
+    def message_type(self) -> MessageType:
+        """Class of messages by the name of its type."""
+
+    def resolve(self, name: str) -> str:
+        """Give the full name of a topic or service, remapped."""
+
+    def expand(self, name: str) -> str:
+        """Give the full name, not remapped."""
+
+    def now_ns(self) -> int:
+        """Time for stamps, in nanoseconds; simulated where the user asked for it."""
+
+    def log(self, level: str, text: str) -> None:
+        """Log a line; level is 'info', 'warning' or 'error'."""
+
+    def advertise(self, topic: str, kind: str) -> Publisher:
+        """Publish messages of a ROS type on a topic, by its resolved name."""
+
+    def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
+               profile: Profile) -> Subscription:
+        """Hand the messages on a topic, by its resolved name, to a callback."""
+
+    def offers(self, topic: str) -> Sequence[Offer]:
+        """Give who publishes a topic, by its resolved name."""
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        """Serve std_srvs/srv/Trigger: an action that succeeds and says what it did."""
+
+    def spin(self, seconds: float) -> None:
+        """Wait for messages, at most for some time, and hand them out."""

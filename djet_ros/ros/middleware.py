@@ -1,0 +1,176 @@
+"""ROS 2 as a live node's middleware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher as RclpyPublisher
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_srvs.srv import Trigger
+
+_OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
+                                   QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
+
+
+def message_type(name: str) -> Any:
+    """Give the class of a message type such as 'sensor_msgs/msg/Image'."""
+    return _message_type(name)
+
+
+@cache
+def _message_type(name: str) -> Any:
+    package, kind, message = name.split('/')
+    return getattr(import_module(f'{package}.{kind}'), message)
+
+
+class RosPublisher:
+    """Publishes messages of one topic."""
+
+    def __init__(self, publisher: RclpyPublisher) -> None:
+        self._publisher = publisher
+
+    def publish(self, message: Any) -> bool:
+        """Hand a message to the middleware, which never refuses one."""
+        self._publisher.publish(message)
+        return True
+
+    @property
+    def listeners(self) -> int:
+        """Number of subscriptions."""
+        return int(self._publisher.get_subscription_count())
+
+
+class RosSubscription:
+    """Hears one topic, and counts what its events tell."""
+
+    def __init__(self, node: Node, topic: str, kind: str, callback: Callable[[Any], None],
+                 profile: Profile) -> None:
+        self.topic = topic
+        self._lost = self._refused = 0
+        self._subscription = node.create_subscription(
+            message_type(kind), topic, callback, _qos(profile),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=self._note_refusal, message_lost=self._note_loss),
+            # Overrides are by topic, and a second subscription to one is told from the publisher.
+            qos_overriding_options=None if profile.latched else _OVERRIDES)
+
+    @property
+    def profile(self) -> Profile:
+        """Quality of service that it asks for, after overrides."""
+        return _profile(self._subscription.qos_profile)
+
+    def new_losses(self) -> int:
+        """Count the messages that were lost on the way since the last call."""
+        number, self._lost = self._lost, 0
+        return number
+
+    def new_refusals(self) -> int:
+        """Count the publishers that turned up since the last call and do not fit."""
+        number, self._refused = self._refused, 0
+        return number
+
+    def _note_loss(self, event: Any) -> None:
+        self._lost += event.total_count_change
+
+    def _note_refusal(self, event: Any) -> None:
+        self._refused += event.total_count_change
+
+
+class RosMiddleware:
+    """The ROS graph as a node sees it."""
+
+    qos_remedy = 'ros.qos_reliability or qos_overrides.{topic}.subscription.*'
+    message_type = staticmethod(message_type)
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+
+    @property
+    def node(self) -> str:
+        """Name of the node with its namespace."""
+        return str(self._node.get_fully_qualified_name())
+
+    def resolve(self, name: str) -> str:
+        """Give the full name of a topic or service, remapped."""
+        return str(self._node.resolve_topic_name(name))
+
+    def expand(self, name: str) -> str:
+        """Give the full name, not remapped."""
+        return str(self._node.resolve_topic_name(name, only_expand=True))
+
+    def now_ns(self) -> int:
+        """Time of the node's clock, which may be simulated."""
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def log(self, level: str, text: str) -> None:
+        """Log a line by the node's logger."""
+        logger = self._node.get_logger()
+        # rclpy wants each place in a program to log at one level.
+        if level == 'info':
+            logger.info(text)
+        elif level == 'warning':
+            logger.warning(text)
+        else:
+            logger.error(text)
+
+    def advertise(self, topic: str, kind: str) -> RosPublisher:
+        """Publish on a topic; its quality of service can be overridden by parameters."""
+        return RosPublisher(self._node.create_publisher(
+            message_type(kind), topic, _qos(DEFAULT_PROFILE), qos_overriding_options=_OVERRIDES))
+
+    def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
+               profile: Profile) -> RosSubscription:
+        """Hand the messages on a topic to a callback; overrides as for ``advertise``."""
+        return RosSubscription(self._node, topic, kind, callback, profile)
+
+    def offers(self, topic: str) -> list[Offer]:
+        """Give who publishes a topic."""
+        return [Offer(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
+                      _profile(one.qos_profile))
+                for one in self._node.get_publishers_info_by_topic(topic)]
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
+        def answer(_: Any, response: Any) -> Any:
+            response.message = action()
+            response.success = True
+            return response
+
+        self._node.create_service(Trigger, name, answer)
+
+    def spin(self, seconds: float) -> None:
+        """Wait for something to do, at most for some time, and do it."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+
+def _qos(profile: Profile) -> QoSProfile:
+    return QoSProfile(
+        history=(QoSHistoryPolicy.KEEP_ALL if profile.depth is None
+                 else QoSHistoryPolicy.KEEP_LAST),
+        depth=profile.depth or 1,
+        reliability=(QoSReliabilityPolicy.RELIABLE if profile.reliable
+                     else QoSReliabilityPolicy.BEST_EFFORT),
+        durability=(QoSDurabilityPolicy.TRANSIENT_LOCAL if profile.latched
+                    else QoSDurabilityPolicy.VOLATILE))
+
+
+def _profile(qos: QoSProfile) -> Profile:
+    return Profile(reliable=qos.reliability is QoSReliabilityPolicy.RELIABLE,
+                   depth=None if qos.history is QoSHistoryPolicy.KEEP_ALL else qos.depth,
+                   latched=qos.durability is QoSDurabilityPolicy.TRANSIENT_LOCAL)
