@@ -18,7 +18,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
         (f'share/{package_name}/config', glob('config/*')),
-        (f'share/{package_name}/launch', glob('launch/*.py')),
+        (f'share/{package_name}/launch', glob('launch/*')),
     ],
     zip_safe=True,
     python_requires='>=3.11',

@@ -1,5 +1,6 @@
 """Play a bag into the odometry: ros2 launch djet_ros replay.launch.py bag:=FOLDER ."""
 
+from djet_ros.ros.launching import arguments, CONFIG
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
 from launch.conditions import IfCondition, UnlessCondition
@@ -7,27 +8,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
-SHARE = FindPackageShare('djet_ros')
 LOOP = LaunchConfiguration('loop')
-
-# Also understood by vo.launch.py, which is included.
-PASSED_ON = ('image', 'params_file', 'rviz')
-
-ARGUMENTS = [
-    DeclareLaunchArgument('bag', description='folder or file of the recording'),
-    DeclareLaunchArgument('rate', default_value='1.0', description='how many times as fast'),
-    DeclareLaunchArgument('loop', default_value='false', choices=['true', 'false'],
-                          description='begin again at the end'),
-    DeclareLaunchArgument('image', default_value='/camera/image_rect',
-                          description='topic of the images; as it stands, as djet kitti-to-bag '
-                          'names it'),
-    DeclareLaunchArgument('params_file',
-                          default_value=PathJoinSubstitution([SHARE, 'config', 'replay.yaml']),
-                          description='YAML file with parameters of vo_node; as it stands, every '
-                          'image is worked on'),
-    DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
-                          description='show it in RViz'),
-]
 
 
 def player(*options, condition):
@@ -40,12 +21,17 @@ def player(*options, condition):
 
 def generate_launch_description():
     """Describe the player, and include vo.launch.py with simulated time."""
-    vo = PathJoinSubstitution([SHARE, 'launch', 'vo.launch.py'])
+    vo = PathJoinSubstitution([FindPackageShare('djet_ros'), 'launch', 'vo.launch.py'])
     return LaunchDescription([
-        *ARGUMENTS,
+        DeclareLaunchArgument('bag', description='folder or file of the recording'),
+        DeclareLaunchArgument('rate', default_value='1.0', description='how many times as fast'),
+        DeclareLaunchArgument('loop', default_value='false', choices=['true', 'false'],
+                              description='begin again at the end'),
+        # As djet kitti-to-bag names the images, and so that every image is worked on.
+        *arguments('image', 'params_file', 'rviz', image='/camera/image_rect',
+                   params_file=PathJoinSubstitution([CONFIG, 'replay.yaml'])),
         IncludeLaunchDescription(PythonLaunchDescriptionSource(vo), launch_arguments={
-            'use_sim_time': 'true', **{name: LaunchConfiguration(name) for name in PASSED_ON},
-        }.items()),
+            'use_sim_time': 'true'}.items()),
         player(condition=UnlessCondition(LOOP)),
         player('--loop', condition=IfCondition(LOOP)),
     ])

@@ -30,8 +30,10 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
 
 ARGUMENTS = {
-    'vo.launch.py': {'image', 'camera_info', 'params_file', 'use_sim_time', 'rviz'},
-    'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'use_sim_time'},
+    'vo.launch.py': {'image', 'camera_info', 'params_file', 'namespace', 'name', 'log_level',
+                     'respawn', 'use_sim_time', 'rviz'},
+    'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'namespace',
+                       'log_level', 'respawn', 'use_sim_time'},
     'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'rviz'},
 }
 
@@ -72,13 +74,13 @@ def test_foxglove_shows_what_the_nodes_publish_and_the_launch_files_camera() -> 
                ('pose_graph_node', graph_outputs(tf=True))]
     published = {topic if topic.startswith('/') else f'/{node}/{topic}'
                  for node, topics_of_node in outputs for topic in topics_of_node}
-    default = re.search("'image', default_value='(.*)'",
-                        (ROOT / 'launch' / 'vo.launch.py').read_text())
-    assert default is not None
-    camera = {default[1], default[1].rpartition('/')[0] + '/camera_info'}
+    images = '/camera/image_raw'
+    assert f"'default_value': '{images[1:]}'" in (
+        ROOT / 'djet_ros' / 'ros' / 'launching.py').read_text()
+    camera = {images, images.rpartition('/')[0] + '/camera_info'}
     shown = {text for text in texts(layout) if text.startswith('/')}
     assert shown <= published | camera
-    assert shown >= {default[1], '/vo_node/debug_image', '/vo_node/path',
+    assert shown >= {images, '/vo_node/debug_image', '/vo_node/path',
                      '/pose_graph_node/path', '/diagnostics'}
     assert Messages.component in texts(layout)
 
@@ -92,9 +94,11 @@ def test_every_panel_of_foxglove_has_its_place() -> None:
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_the_arguments_are_listed_and_explained(path: Path) -> None:
     pytest.importorskip('launch_ros', reason='launch comes with ROS 2')
+    from launch.actions import DeclareLaunchArgument
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
     description = get_launch_description_from_python_launch_file(str(path))
-    arguments = description.get_launch_arguments()
+    # Its own; where the package is installed, those of included files are found as well.
+    arguments = [one for one in description.entities if isinstance(one, DeclareLaunchArgument)]
     assert {argument.name for argument in arguments} == ARGUMENTS[path.name]
     assert all(argument.description for argument in arguments)
 
@@ -120,15 +124,17 @@ def environment(tmp_path: Path) -> dict[str, str]:
             'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_LOG_DIR': str(tmp_path / 'log')}
 
 
-def launched(environment: dict[str, str], log: Path, *words: str, until: str) -> str:
-    """Run ros2 launch until a text is in its output, then end it by Ctrl-C; gives the output."""
+def launched(environment: dict[str, str], log: Path, *words: str, until: str,
+             times: int = 1) -> str:
+    """Run ros2 launch until its output has a text so often, end it by Ctrl-C, give the output."""
     with log.open('w') as file:
         process = subprocess.Popen(['ros2', 'launch', 'djet_ros', *words], env=environment,
                                    stdout=file, stderr=subprocess.STDOUT,
                                    start_new_session=True)
     try:
         end = monotonic() + 30
-        while until not in log.read_text() and monotonic() < end and process.poll() is None:
+        while log.read_text().count(until) < times and monotonic() < end \
+                and process.poll() is None:
             sleep(0.1)
         process.send_signal(signal.SIGINT)
         process.wait(20)
@@ -147,6 +153,29 @@ def test_vo_launch_starts_the_node_on_the_topics_given(
     assert 'images from /left/image_raw, camera_info from /left/camera_info' in said
     assert 'queue policy latest' in said
     assert re.search(r'vo_node-1\]: process has finished cleanly', said)
+
+
+@pytest.mark.ros
+def test_vo_launch_names_the_node_and_starts_it_again_after_an_error(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    broken = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
+    broken.write_text('#!/bin/sh\necho started with "$@"\nexit 1\n')
+    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'namespace:=left',
+                    'name:=eye', 'respawn:=true', 'log_level:=warn',
+                    until='process started with pid', times=2)
+    assert '__node:=eye' in said
+    assert '__ns:=/left' in said
+    assert '--log-level warn' in said
+
+
+@pytest.mark.ros
+def test_two_cameras_have_their_own_nodes_and_topics(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    said = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
+                    until='queue policy', times=2)
+    for side in ('left', 'right'):
+        assert f'[{side}.vo_node]: images from /{side}/camera/image_raw, camera_info from ' \
+               f'/{side}/camera/camera_info' in said
 
 
 @pytest.mark.ros

@@ -82,7 +82,7 @@ def workspace(request: pytest.FixtureRequest, copied: Callable[[str], Path]) -> 
 def shares_its_files(prefix: Path) -> bool:
     """Whether all that ROS looks for is below the prefix."""
     share = prefix / 'share' / 'djet_ros'
-    wanted = [ROOT / 'package.xml', *ROOT.glob('config/*'), *ROOT.glob('launch/*.py')]
+    wanted = [ROOT / 'package.xml', *ROOT.glob('config/*'), *ROOT.glob('launch/*.launch.*')]
     return (prefix / 'share/ament_index/resource_index/packages/djet_ros').exists() and all(
         (share / path.relative_to(ROOT)).read_bytes() == path.read_bytes() for path in wanted)
 

@@ -1,0 +1,66 @@
+"""What the launch files of the nodes share: their arguments, and how a node is started."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from launch import Substitution
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+CONFIG = PathJoinSubstitution([FindPackageShare('djet_ros'), 'config'])
+
+_TRUTH = {'choices': ['true', 'false'], 'default_value': 'false'}
+
+# By name: the description, and what else DeclareLaunchArgument is told.
+_ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
+    'image': ('topic of the images, relative to the namespace',
+              {'default_value': 'camera/image_raw'}),
+    'camera_info': ('topic of their CameraInfo; as it stands, beside the images',
+                    {'default_value': 'camera_info'}),
+    'params_file': ('YAML file with parameters of vo_node; pose_graph_node takes from it what '
+                    'both have to agree on',
+                    {'default_value': PathJoinSubstitution([CONFIG, 'vo.yaml'])}),
+    'slam_params_file': ('YAML file with parameters of pose_graph_node',
+                         {'default_value': PathJoinSubstitution([CONFIG, 'slam.yaml'])}),
+    'namespace': ('namespace of nodes and topics, such as the name of a camera',
+                  {'default_value': ''}),
+    'name': ('name of the odometry node', {'default_value': 'vo_node'}),
+    'log_level': ('from which level on the nodes log', {
+        'default_value': 'info', 'choices': ['debug', 'info', 'warn', 'error', 'fatal']}),
+    'respawn': ('start a node again that has ended by an error', _TRUTH),
+    'use_sim_time': ('take the time from /clock', _TRUTH),
+    'rviz': ('show it in RViz, for the names as they stand', _TRUTH),
+}
+
+
+def arguments(*names: str, **defaults: str | Substitution) -> list[DeclareLaunchArgument]:
+    """Declare arguments by name; defaults: other default values than usual."""
+    return [DeclareLaunchArgument(name, description=text, **{
+        **more, **({'default_value': defaults[name]} if name in defaults else {})})
+            for name in names for text, more in [_ARGUMENTS[name]]]
+
+
+def sim_time() -> dict[str, ParameterValue]:
+    """Give the parameter use_sim_time as it was asked for."""
+    return {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+
+
+def node(executable: str, name: str | Substitution, *files: str, **parameters: Any) -> Node:
+    """
+    Describe a node of ours on the camera that the arguments name.
+
+    files: arguments that hold a parameter file; parameters: on top of these, with __ for a dot.
+    """
+    return Node(
+        package='djet_ros', executable=executable, name=name, output='screen',
+        namespace=LaunchConfiguration('namespace'), respawn=LaunchConfiguration('respawn'),
+        respawn_delay=2.0,
+        remappings=[(topic, LaunchConfiguration(topic)) for topic in ('image', 'camera_info')],
+        parameters=[*(ParameterFile(LaunchConfiguration(file)) for file in files),
+                    {key.replace('__', '.'): value for key, value in parameters.items()},
+                    sim_time()],
+        ros_arguments=['--log-level', LaunchConfiguration('log_level')])
