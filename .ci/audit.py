@@ -35,8 +35,8 @@ def main() -> int:
     unknown = [package for package in others if 'skip_reason' in package]
     if unknown:
         print(f'audit: {len(unknown)} of {len(others)} packages could not be audited '
-              f"({unknown[0]['skip_reason']}, ...); is pypi.org reached, and not only a mirror "
-              'that knows of no vulnerabilities?', file=sys.stderr)
+              f"({unknown[0]['skip_reason']}, ...); is a service reached that knows of "
+              'vulnerabilities, and not only a mirror of packages?', file=sys.stderr)
         return 3
     print(f'audit: {len(others)} packages, none with a known vulnerability')
     return 0

@@ -3,7 +3,9 @@ The 256 binary tests of ORB (Rublee et al., ICCV 2011) in the order of OpenCV's 
 
 Bit i is ``I(p_i) < I(q_i)`` on the smoothed image. The table was recovered from ``cv2.ORB`` by
 finding, for each bit, the one pair of pixels that explains its descriptors of random images;
-a test holds it against ``cv2.ORB.compute`` bit for bit.
+a test holds it against ``cv2.ORB.compute`` bit for bit. Its values are those of OpenCV's table
+``bit_pattern_31_`` (features2d/src/orb.cpp, by E. Rublee, V. Rabaud and G. Bradski; copyright 2009
+Willow Garage, Inc., BSD licence, which stands in NOTICE).
 """
 
 from __future__ import annotations
