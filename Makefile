@@ -5,6 +5,10 @@ LOWEST := .venv-lowest
 AUDIT := .venv-audit
 FUZZ_SECONDS ?= 30
 SEQUENCE ?=
+FRAMES ?= 21
+REAL_FRAMES ?=
+ONLY ?=
+SEEDS ?= 0,1,2,3,4
 PYTEST := python -m pytest -n auto --dist loadfile
 
 # the first that is there, works (a pyenv shim may not) and is new enough
@@ -12,7 +16,7 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 	$$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
 	2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test lint lowest fuzz audit clean
+.PHONY: demo test lint lowest fuzz audit results pages clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
@@ -36,6 +40,16 @@ fuzz: $(VENV)/.installed-fuzz
 # known vulnerabilities in the newest versions that setup.py allows, the extras' too
 audit: $(AUDIT)/.installed
 	$(AUDIT)/bin/python .ci/audit.py
+
+# the figures of doc/results.md and the README's table; a broken run is taken up where it ended
+results: $(VENV)/.installed-test,peers
+	$(VENV)/bin/python doc/measure.py --frames $(FRAMES) --seeds $(SEEDS) \
+		$(if $(REAL_FRAMES),--real-frames $(REAL_FRAMES)) $(if $(ONLY),--only '$(ONLY)')
+	$(VENV)/bin/python doc/pages.py
+
+# what stands between generated marks in the README and in doc/
+pages: $(VENV)/.installed-test,peers
+	$(VENV)/bin/python doc/pages.py
 
 clean:
 	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info

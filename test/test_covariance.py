@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
@@ -11,6 +13,9 @@ from djet_ros.core.types import Status
 from djet_ros.lab.scenes.pair import render_pair
 import numpy as np
 from scipy.spatial.transform import Rotation
+import yaml
+
+BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
 
 
 def normalised_squared_error(name: str, first: int) -> float:
@@ -31,7 +36,8 @@ def test_errors_are_as_large_as_the_covariance_says():
     found = [normalised_squared_error(name, first)
              for name in ('road', 'loop', 'sharp_turn', 'underwater')
              for first in range(5, 100, 19)]
-    assert 5 / 2 < np.mean(found) < 5 * 2
+    bounds = yaml.safe_load(BOUNDS.read_text())['normalised_squared_error']
+    assert bounds['least'] < np.mean(found) < bounds['most']
 
 
 def test_settling_on_the_opposite_direction_turns_what_goes_with_it():

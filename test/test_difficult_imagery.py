@@ -1,8 +1,8 @@
 """
 What the odometry makes of images that are hard.
 
-The README's table "What it does on bad images" states an outcome for each kind: the statuses that
-may occur and, where a motion is told, bounds on its median errors. Each row is tried here.
+doc/bounds.yaml states an outcome for each kind, and doc/robustness.md shows it: the statuses that
+may occur and, where a motion is told, bounds on its median errors. Each is tried here.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-import re
 from typing import NamedTuple
 
 import cv2
@@ -24,9 +23,10 @@ from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 from numpy.typing import NDArray
 import pytest
+import yaml
 
 Gray = NDArray[np.uint8]
-README = Path(__file__).parents[1] / 'README.md'
+BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 SIZE = (620, 188)
 FRAMES = 7
@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What the README states of a kind of images."""
+    """What is stated of a kind of images."""
 
     statuses: set[Status]
     rotation: float | None
@@ -50,17 +50,10 @@ class Stated(NamedTuple):
 
 
 def stated() -> dict[str, Stated]:
-    """Rows of the README's table."""
-    section = README.read_text().split('What it does on bad images')[2].split('\n#')[0]
-    rows = re.findall(r'^\| ([^|]+) \| ([^|]+) \|$', section, re.MULTILINE)
-    result = {}
-    for name, text in rows[2:]:
-        bounds = re.search(r'below ([\d.]+)°(?: / ([\d.]+)°)?', text)
-        rotation, direction = bounds.groups() if bounds else (None, None)
-        result[name] = Stated({Status(word) for word in re.findall(r'`([A-Z_]+)`', text)},
-                              float(rotation) if rotation else None,
-                              float(direction) if direction else None)
-    return result
+    """Give what is stated of each kind."""
+    return {one['images']: Stated({Status(word) for word in one['statuses']},
+                                  one.get('rotation'), one.get('direction'))
+            for one in yaml.safe_load(BOUNDS.read_text())['hard_images']}
 
 
 # Kinds of images

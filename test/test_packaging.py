@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 NODES = ('vo_node', 'pose_graph_node')
@@ -152,13 +153,11 @@ def test_every_dependency_is_bounded_and_the_lower_bounds_are_tested(
     assert {name: Version(version) for name, version in pins} == lower
 
 
-def test_the_readme_lists_every_dependency_with_its_bounds(distribution: Distribution) -> None:
+def test_the_pages_list_every_dependency_with_its_bounds(distribution: Distribution) -> None:
     listed = {}
-    for name, extra, versions, reason in re.findall(
-            r'^\| `([^`]+)`(?:, extra `(\w+)`)? \| (>=\S+) \| (.+) \|$',
-            (ROOT / 'README.md').read_text(), re.MULTILINE):
-        assert len(reason) > 4
-        listed[name.lower(), extra] = SpecifierSet(versions)
+    for one in yaml.safe_load((ROOT / 'doc' / 'dependencies.yaml').read_text()):
+        assert len(one['reason']) > 4
+        listed[one['name'].lower(), one.get('extra', '')] = SpecifierSet(one['versions'])
     needed = {}
     for requirement in map(Requirement, distribution.requires or []):
         extra = re.search(r'extra == .(\w+)', str(requirement.marker))

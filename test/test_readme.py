@@ -1,16 +1,32 @@
-"""What the README names exists: tests, make targets, commands and linked files."""
+"""What the pages name exists, and what they show is what the data beside them give."""
 
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 import re
+import shlex
+import shutil
+import subprocess
+import sys
+from typing import Any
 
-from djet_ros.cli.main import COMMANDS
+from djet_ros.cli.main import main
+import pytest
+from test_layers import ORDER
+import yaml
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / 'README.md').read_text()
+DOC = ROOT / 'doc'
+PAGES = [ROOT / 'README.md', *sorted(DOC.glob('*.md'))]
+
+each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+
+
+def data(name: str) -> Any:
+    return yaml.safe_load((DOC / f'{name}.yaml').read_text())
 
 
 @cache
@@ -19,36 +35,115 @@ def functions_in(file: str) -> set[str]:
     return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
 
 
-def test_every_test_that_is_named_exists() -> None:
-    named = re.findall(r'`(test_\w+\.py|…)(?:::(test_\w+))?`', README)
-    assert len(named) > 40
-    file = ''
-    for where, name in named:
-        file = file if where == '…' else where
-        assert not name or name in functions_in(file), f'{file}::{name}'
+def exists(test: str) -> bool:
+    file, _, name = test.partition('::')
+    return (ROOT / 'test' / file).exists() and (not name or name in functions_in(file))
 
 
-def test_every_promise_names_a_test() -> None:
-    section = README.split('\n## What is promised')[1].split('\n## ')[0]
-    rows = re.findall(r'^\| (.+) \| (.+) \|$', section, re.MULTILINE)[2:]
-    assert len(rows) > 12
-    for promise, held_by in rows:
-        assert '::test_' in held_by, promise
+def test_the_readme_fits_in_the_hand():
+    assert len((ROOT / 'README.md').read_bytes()) <= 8000
 
 
-def test_every_make_target_and_command_that_is_named_exists() -> None:
-    makefile = (ROOT / 'Makefile').read_text()
-    for target in re.findall(r'(?:^|`)make ([a-z]+)', README, re.MULTILINE):
+def test_the_pages_show_what_the_data_give(tmp_path):
+    done = subprocess.run([sys.executable, DOC / 'pages.py', '--check'], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_figure_that_was_typed_would_be_seen_and_mended(tmp_path):
+    shutil.copytree(DOC, tmp_path / 'doc')
+    readme = tmp_path / 'README.md'
+    whole = (ROOT / 'README.md').read_text()
+    readme.write_text(whole.replace('<!-- generated: summary -->\n',
+                                    '<!-- generated: summary -->\nD-JET is the best.\n'))
+    command = [sys.executable, tmp_path / 'doc' / 'pages.py']
+    said = subprocess.run([*command, '--check'], capture_output=True, text=True, check=False)
+    assert said.returncode == 1
+    assert 'README.md' in said.stderr
+    subprocess.run(command, check=True)
+    assert readme.read_text() == whole
+
+
+def test_every_promise_and_every_answer_names_tests_that_exist():
+    promises = data('promises')
+    assert promises and all(one['tests'] for one in promises)
+    for one in [*promises, *data('reports')]:
+        for test in one['tests']:
+            assert exists(test), test
+
+
+@each_page
+def test_every_test_that_is_named_exists(page):
+    for test in re.findall(r'`(test_\w+\.py(?:::test_\w+)?)`', page.read_text()):
+        assert exists(test), test
+
+
+@each_page
+def test_every_make_target_that_is_named_exists(page):
+    makefile, text = (ROOT / 'Makefile').read_text(), page.read_text()
+    for target in [*re.findall(r'`make ([a-z]+)', text),
+                   *(words[1] for words in commands(text) if words[0] == 'make')]:
         assert f'\n{target}:' in makefile, target
-    for command in re.findall(r'(?:^|`)\s*djet ([a-z][a-z-]*)', README, re.MULTILINE):
-        assert command in COMMANDS, command
 
 
-def test_every_linked_file_and_section_exists() -> None:
-    titles = [re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-')
-              for title in re.findall(r'^#+ (.+)$', README, re.MULTILINE)]
-    for target in re.findall(r'\]\(([^)]+)\)', README):
-        if target.startswith('#'):
-            assert target[1:] in titles, target
-        elif '://' not in target:
-            assert (ROOT / target).exists(), target
+def commands(text: str) -> Iterator[list[str]]:
+    """Give the words of each command in the blocks of shell code."""
+    for block in re.findall(r'^```(?:sh|bash)\n(.*?)^```', text, re.MULTILINE | re.DOTALL):
+        for command in re.split(r'\n|&&', block):
+            words = shlex.split(command, comments=True)
+            if words:
+                yield words
+
+
+def calls(text: str) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Give verbs and options of djet in blocks of code, and its verbs in sentences."""
+    for words in commands(text):
+        if words[0] == 'djet':
+            options = tuple(word.partition('=')[0] for word in words if word.startswith('-'))
+            yield tuple(words[1:3 if words[1] == 'lab' else 2]), options
+    for verbs in re.findall(r'`djet ((?:lab )?[a-z][a-z-]*)', text):
+        yield tuple(verbs.split()), ()
+
+
+@each_page
+def test_every_command_and_option_that_is_named_exists(page, capsys):
+    for verbs, options in set(calls(page.read_text())):
+        with pytest.raises(SystemExit) as ended:
+            main([*verbs, '--help'])
+        assert ended.value.code == 0, verbs
+        said = capsys.readouterr().out
+        for option in options:
+            assert re.search(rf'(?<![\w-]){option}(?![\w-])', said), (verbs, option)
+
+
+@each_page
+def test_every_linked_file_and_section_exists(page):
+    for target in re.findall(r'\]\(([^)]+)\)', page.read_text()):
+        name, _, section = target.partition('#')
+        if '://' in target:
+            continue
+        linked = page.parent / name if name else page
+        assert linked.exists(), target
+        assert not section or section in sections(linked), target
+
+
+def sections(page: Path) -> list[str]:
+    """Anchors of the titles of a page."""
+    return [re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-')
+            for title in re.findall(r'^#+ (.+)$', page.read_text(), re.MULTILINE)]
+
+
+def test_the_rooms_that_the_design_page_lists_are_the_folders_in_their_order():
+    listed = [set(level) for level in data('rooms')]
+    folders = {path.parent.name for path in ROOT.glob('djet_ros/*/__init__.py')}
+    assert set().union(*listed) == folders
+    assert listed == [set(rooms) & folders for rooms in reversed(ORDER) if set(rooms) & folders]
+
+
+def test_no_host_of_a_package_registry_is_named():
+    hosts = re.compile('|'.join((r'pypi\.' + 'org', 'python' + 'hosted', r'crates\.' + 'io')))
+    tracked = subprocess.run(['git', 'ls-files'], cwd=ROOT, capture_output=True, text=True,
+                             check=False).stdout.split() or PAGES
+    named = [path for path in tracked if hosts.search(
+        (ROOT / path).read_bytes().decode('utf-8', 'replace'))]
+    assert not named

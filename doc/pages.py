@@ -1,0 +1,307 @@
+"""
+Fills what stands between ``generated`` marks in README.md and doc/*.md, from the data beside it.
+
+    python doc/pages.py           # write
+    python doc/pages.py --check   # say which blocks are not what the data give; exit code 1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import json
+from pathlib import Path
+import re
+import sys
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+DOC = ROOT / 'doc'
+PAGES = (ROOT / 'README.md', *sorted(DOC.glob('*.md')))
+BLOCK = re.compile(r'(?<=<!-- generated: )([\w -]+)( -->\n).*?(?=<!-- end -->)', re.DOTALL)
+RESULTS = DOC / 'results.json'
+
+TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-point',
+          'opencv_ransac': 'OpenCV RANSAC', 'usac_magsac': 'OpenCV MAGSAC++',
+          'poselib': 'PoseLib', 'sift_poselib': 'SIFT + PoseLib', 'klt_poselib': 'KLT + PoseLib'}
+OURS = ('djet', 'rpe', 'pjet', 'five_point')
+# The README's columns, where they were measured.
+SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
+# Scenes in which the camera does not move from its place have no direction to compare.
+NO_WAY = ('rotation', 'standstill')
+
+
+def main(check: bool) -> int:
+    results = json.loads(RESULTS.read_text())
+    stale = []
+    for page in PAGES:
+        text = page.read_text()
+        filled = BLOCK.sub(lambda found: found[1] + found[2] + BLOCKS[found[1]](results), text)
+        if filled != text:
+            stale.append(page.relative_to(ROOT).as_posix())
+            if not check:
+                page.write_text(filled)
+    if check and stale:
+        print(f'not what the data give, run make pages: {", ".join(stale)}', file=sys.stderr)
+        return 1
+    return 0
+
+
+def data(name: str) -> Any:
+    return yaml.safe_load((DOC / f'{name}.yaml').read_text())
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ['---'] * len(header), *rows]
+    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
+
+
+# What was recorded, listed and promised
+
+
+def recorded(name: str) -> Callable[[Any], str]:
+    def block(_: Any) -> str:
+        one = data('recorded')[name]
+        return (f'Measured with version {one["version"]}. {one["how"]}\n\n'
+                + table(one['header'], one['rows']))
+    return block
+
+
+def reports(_: Any) -> str:
+    return table(('report', 'answer', 'held by'), (
+        (one['report'], one['answer'], tests(one['tests'])) for one in data('reports')))
+
+
+def promises(_: Any) -> str:
+    return table(('promise', 'held by'), (
+        (one['promise'], ' '.join(filter(None, (tests(one['tests']), one.get('also')))))
+        for one in data('promises')))
+
+
+def tests(names: Iterable[str]) -> str:
+    return ', '.join(f'`{name}`' for name in names)
+
+
+def hard_images(_: Any) -> str:
+    return table(('images', 'outcome'), (
+        (one['images'], hard_outcome(one)) for one in data('bounds')['hard_images']))
+
+
+def hard_outcome(one: dict[str, Any]) -> str:
+    text = ' or '.join(f'`{status}`' for status in one['statuses'])
+    if 'rotation' in one:
+        text += f'; below {one["rotation"]:g}°'
+    if 'direction' in one:
+        text += f' / {one["direction"]:g}°'
+    return text + (f': {one["note"]}' if 'note' in one else '')
+
+
+def covariance_bound(_: Any) -> str:
+    bound = data('bounds')['normalised_squared_error']
+    return (f'* A test holds its mean over such pairs between {bound["least"]:g} and '
+            f'{bound["most"]:g}.\n')
+
+
+def dependencies(_: Any) -> str:
+    return table(('package', 'versions', 'what for'), (
+        (f'`{one["name"]}`' + (f', extra `{one["extra"]}`' if 'extra' in one else ''),
+         one['versions'], one['reason']) for one in data('dependencies')))
+
+
+def short_dependencies(_: Any) -> str:
+    return table(('package', 'what for'), (
+        (f'`{one["name"]}`' + (f' (`{one["extra"]}`)' if 'extra' in one else ''),
+         one.get('short', one['reason'])) for one in data('dependencies')))
+
+
+def rooms(_: Any) -> str:
+    lines = []
+    for level in data('rooms'):
+        lines += [f'    {name:<11} {text}' for name, text in level.items()]
+    return '```\ndjet_ros/\n' + '\n'.join(lines) + '\n```\n'
+
+
+# Measured by doc/measure.py
+
+
+def summary(results: Any) -> str:
+    """Lay out the README's one table: mean errors and failures over all pairs."""
+    shown = [name for name in SHOWN if name in methods_of(results)]
+    rows = [(name, str(pairs(part)), *(cell(part, method, 'mean') for method in shown))
+            for name, part in sequences(results) if name not in NO_WAY]
+    return (f'Mean errors in degrees, rotation / direction of translation, and failed pairs in '
+            f'brackets. {conditions(results)}\n\n'
+            + table(('', 'pairs', *(TITLES[name] for name in shown)), rows))
+
+
+def conditions(results: Any) -> str:
+    settings = results['settings']
+    seeds = len(settings['seeds'])
+    return (f'Rendered scenes have exact ground truth: the first {settings["frames"]} frames of '
+            f'{seeds} {"seed" if seeds == 1 else "seeds"}. Each pair is estimated by itself.')
+
+
+def measured_with(results: Any) -> str:
+    versions = ', '.join(f'{name} {number}' for name, number in results['versions'].items())
+    real = results['settings']['real_frames']
+    state = '' if results['complete'] else '**This run is not complete.** '
+    return (f'{state}{conditions(results)} Real sequences are taken '
+            f'{f"to frame {real}" if real else "as far as they are there"}. '
+            f'Measured on {results["cores"]} cores with {versions}.\n')
+
+
+def compared(results: Any) -> str:
+    return ''.join(f'### {name}\n\n{comparison(part)}\n' for name, part in sequences(results))
+
+
+def comparison(part: Any) -> str:
+    """Lay out one sequence by method."""
+    seeds = len(part['seeds'])
+    head = f'{pairs(part)} pairs' + (f' of {seeds} seeds' if seeds > 1 else '')
+    worst = ('worst seed',) if seeds > 1 else ()
+    header = ('method', 'preset', 'rotation: mean', 'median', '95 %', *worst,
+              'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'ms')
+    rows = []
+    for one in part['methods']:
+        figures = [figure for what in ('rotation', 'direction')
+                   for figure in (*(number(one[what][name]) for name in ('mean', 'median', 'p95')),
+                                  *(number(worst_seed(one, what)) for _ in worst))]
+        rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
+                     *figures, str(one['failed']), str(one['sure']), f'{one["ms"]:.0f}'))
+    return f'{head}.\n\n{table(header, rows)}'
+
+
+def worst_seed(one: Any, what: str) -> float | None:
+    return max((seed[what] for seed in one['by_seed'] if seed[what] is not None), default=None)
+
+
+def against_rpe(results: Any) -> str:
+    """Say, sequence by sequence, how D-JET does against re-projection error."""
+    rows = []
+    for preset in ('best', 'paper'):
+        for name, part in sequences(results):
+            ours, theirs = find(part, 'djet', preset), find(part, 'rpe', preset)
+            rows.append((name, preset, *(ratio(ours, theirs, what, kind)
+                                         for what in ('rotation', 'direction')
+                                         for kind in ('mean', 'median')),
+                         f'{ours["failed"]} / {theirs["failed"]}'))
+    lost = [f'{row[0]} ({row[1]})' for row in rows if '**' in ''.join(row)]
+    verdict = (f'D-JET is behind in at least one of these figures on: {", ".join(lost)}.' if lost
+               else 'D-JET is behind in none of these figures.')
+    return (f'D-JET over RP-E with the same matches, starts and loss; below 1 D-JET is better, '
+            f'above it, in bold, worse. {verdict}\n\n'
+            + table(('', 'preset', 'rotation: mean', 'median', 'direction: mean', 'median',
+                     'failed, D-JET / RP-E'), rows))
+
+
+def ratio(ours: Any, theirs: Any, what: str, kind: str) -> str:
+    if not ours[what][kind] or not theirs[what][kind]:
+        return '–'
+    value = ours[what][kind] / theirs[what][kind]
+    return f'**{value:.2f}**' if value > 1 else f'{value:.2f}'
+
+
+def odometry(results: Any) -> str:
+    rows = []
+    for name, part in sequences(results):
+        one = part['odometry']
+        rows.append((name, str(one['pairs']),
+                     *(number(one[what][kind]) for what in ('rotation', 'direction')
+                       for kind in ('mean', 'median', 'max')),
+                     str(one['failed']), str(one['sure'])))
+    return table(('', 'pairs', 'rotation: mean', 'median', 'largest', 'direction: mean', 'median',
+                  'largest', 'failed', 'of these `OK`'), rows)
+
+
+def closure(results: Any) -> str:
+    rows = []
+    for name, part in sequences(results):
+        for method, one in part['closure'].items():
+            rows.append((name, TITLES[method], number(one['median_deg']), number(one['p95_deg']),
+                         number(one['claimed_median_deg']),
+                         number(one['normalised_square_mean'], 1),
+                         number(one['error_median_deg']),
+                         f'{one["triangles"]:.0f} of {one["triangles"] + one["without"]:.0f}'))
+    return table(('', 'method', 'left, median', '95 %', 'claimed', 'square (3 if true)',
+                  'error against the truth, median', 'triangles'), rows)
+
+
+def ablation(results: Any) -> str:
+    part = results['parts'].get('ablation')
+    if part is None:
+        return 'Not measured yet.\n'
+    rows = [(TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
+             pair_of(one, 'median')) for one in part['variants']]
+    return (f'Over the first {part["frames"]} frames of {", ".join(part["of"])}.\n\n'
+            + table(('method', 'change', 'mean (failed)', 'median'), rows))
+
+
+def speed(results: Any) -> str:
+    part = results['parts'].get('speed')
+    if part is None:
+        return 'Not measured yet.\n'
+    both = (part, part['all_cores'])
+    rows = [("time over OpenCV's chain", *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
+            ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in both)),
+            *((f'{stage}, ms', *(f'{one["stages_ms"][stage]:.1f}' for one in both))
+              for stage in part['stages_ms'])]
+    growth = [(f'{name} {key}', f'{value:.1f}')
+              for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))
+              for key, value in part[by].items()]
+    return (f'Of {part["of"]}, {part["pairs"]} pairs, from file to pose.\n\n'
+            + table(('', 'one thread', 'all cores'), rows)
+            + f'\nThe D-JET stage, surfaces and optimisation, in ms. A dense descriptor costs '
+            f'1/{part["kernel_speedup_over_cv2"]:.0f} of one by `cv2.ORB.compute`; a frame that '
+            f'is kept takes {part["bytes_per_frame"] / 1e6:.1f} MB.\n\n'
+            + table(('', 'ms'), growth))
+
+
+def sequences(results: Any) -> list[tuple[str, Any]]:
+    return [(name, part) for name, part in results['parts'].items() if 'methods' in part]
+
+
+def methods_of(results: Any) -> set[str]:
+    return {one['method'] for _, part in sequences(results) for one in part['methods']}
+
+
+def pairs(part: Any) -> int:
+    count: int = part['methods'][0]['pairs']
+    return count
+
+
+def find(part: Any, method: str, preset: str = 'best') -> Any:
+    return next((one for one in part['methods']
+                 if (one['method'], one['preset']) == (method, preset)), None)
+
+
+def cell(part: Any, method: str, kind: str) -> str:
+    one = find(part, method)
+    return '–' if one is None else cell_of(one, kind)
+
+
+def cell_of(one: Any, kind: str) -> str:
+    return pair_of(one, kind) + (f' ({one["failed"]})' if one['failed'] else '')
+
+
+def pair_of(one: Any, kind: str) -> str:
+    return f'{number(one["rotation"][kind])} / {number(one["direction"][kind], 2)}'
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    return '–' if value is None else f'{value:.{digits}f}'
+
+
+BLOCKS: dict[str, Callable[[Any], str]] = {
+    'summary': summary, 'short dependencies': short_dependencies, 'dependencies': dependencies,
+    'rooms': rooms, 'reports': reports, 'promises': promises, 'hard images': hard_images,
+    'covariance bound': covariance_bound,
+    'measured with': measured_with, 'compared': compared, 'against rpe': against_rpe,
+    'odometry': odometry, 'closure': closure, 'ablation': ablation, 'speed': speed,
+    **{name: recorded(name) for name in (
+        'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height')},
+}
+
+
+if __name__ == '__main__':
+    sys.exit(main('--check' in sys.argv[1:]))
