@@ -5,14 +5,16 @@ from pathlib import Path
 
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
 from hypothesis import given, settings, strategies as st
 import pytest
 
-SHIPPED = Path(__file__).parent.parent / 'config' / 'vo.yaml'
+CONFIG = Path(__file__).parent.parent / 'config'
+SHIPPED = CONFIG / 'vo.yaml'
+GENERATED = {'vo.yaml': ('', 'estimator', 'odometry', 'ros'), 'slam.yaml': ('slam',)}
 
 
 def written(tmp_path, text):
@@ -21,16 +23,23 @@ def written(tmp_path, text):
     return path
 
 
-def test_the_shipped_yaml_is_the_generated_one():
-    expected = dump_yaml(Config(), preset_as_comments=True)
-    assert SHIPPED.read_text() == expected, (
-        "write config/vo.yaml anew: python -c 'from djet_ros.config.sections import *; "
+@pytest.mark.parametrize('name', GENERATED)
+def test_the_shipped_yaml_is_the_generated_one(name):
+    expected = dump_yaml(Config(), GENERATED[name], preset_as_comments=True)
+    assert (CONFIG / name).read_text() == expected, (
+        f"write config/{name} anew: python -c 'from djet_ros.config.sections import *; "
         'from djet_ros.config.yaml_files import *; print(dump_yaml(Config(), '
-        "preset_as_comments=True), end=str())' > config/vo.yaml")
+        f"{GENERATED[name]}, preset_as_comments=True), end=str())' > config/{name}")
+
+
+def test_every_parameter_is_in_one_of_the_shipped_yamls():
+    shipped = [part for parts in GENERATED.values() for part in parts]
+    assert sorted(shipped) == sorted(['', *SECTIONS])
 
 
 def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
-    assert load_yaml(SHIPPED) == Config()
+    for name in GENERATED:
+        assert load_yaml(CONFIG / name) == Config()
     assert load_yaml(SHIPPED, from_flat({'preset': 'paper'})).preset == 'best'
     assert '# method: "djet"' in SHIPPED.read_text()
 
@@ -82,7 +91,14 @@ def test_integers_are_taken_for_floats_and_floats_not_for_integers():
 @pytest.mark.parametrize('name, value, message', [
     ('estimator.windw', 7, "did you mean 'estimator.window'"),
     ('max_gap', 1.0, "did you mean 'odometry.max_gap'"),
-    ('zzzzzz', 1, "unknown parameter 'zzzzzz'"),
+    ('loop_gaps', 1.0, "did you mean 'slam.loop_gap'"),
+    ('estimator.loop_gap', 1.0, "did you mean 'slam.loop_gap'"),
+    ('ros.path_perod', 1.0, "did you mean 'ros.path_period'"),
+    ('slam.path_perod', 1.0, "did you mean 'slam.path_period'"),
+    ('zzzzzz', 1, "unknown parameter 'zzzzzz'$"),
+    ('nonsense', 1, "unknown parameter 'nonsense'$"),
+    ('slam.links', 'two', r'slam\.links is .two.; it must be of type int'),
+    ('slam.max_keyframes', 1, r'slam\.max_keyframes is 1; it must lie between'),
     ('estimator.window', 8, 'must be odd'),
     ('estimator.window', 700, 'between 3 and 15'),
     ('estimator.window', True, 'of type int'),

@@ -5,7 +5,6 @@ from time import monotonic, sleep
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat
 from djet_ros.odometry.messages import stamp_ns
-from djet_ros.posegraph.live_config import LiveSlamConfig
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -26,8 +25,10 @@ class Live:
         from djet_ros.posegraph.live_slam import LiveSlam
         self.graph = Graph()
         self.slam = LiveSlam(
-            from_flat({'estimator.max_features': 500}), LiveSlamConfig(
-                keyframe_distance=0.4, loop_gap=0.5, **parameters), message_type, 'image_rect')
+            from_flat({'estimator.max_features': 500, 'slam.keyframe_distance': 0.4,
+                       'slam.loop_gap': 0.5,
+                       **{f'slam.{name}': value for name, value in parameters.items()}}),
+            message_type, 'image_rect')
         self.session = GraphSession(self.slam, self.graph, TOPICS)
         self.session.start()
         self._cards, self._odometry, self._was = Cards(), Odometry(), None

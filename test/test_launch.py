@@ -18,10 +18,8 @@ from typing import Any
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import NodeConfig
 from djet_ros.config.yaml_files import load_yaml
-from djet_ros.errors import DjetError
 from djet_ros.live.topics import graph_outputs, odometry_outputs
 from djet_ros.odometry.messages import Messages
-from djet_ros.posegraph.live_config import dump_slam_yaml, LiveSlamConfig, slam_config
 import pytest
 from ros_graph import command
 import yaml
@@ -201,19 +199,3 @@ def test_slam_launch_feeds_the_pose_graph_with_the_odometry(
     assert 'unknown parameter' not in said
     for node in ('vo_node-1', 'pose_graph_node-2'):
         assert f'[{node}]: process has finished cleanly' in said
-
-
-def test_the_parameters_of_the_pose_graph_are_all_listed_with_their_defaults() -> None:
-    text = (ROOT / 'config' / 'slam.yaml').read_text()
-    assert text == dump_slam_yaml()
-    section, = yaml.safe_load(text).values()
-    assert slam_config({f'slam.{name}': value for name, value
-                        in section['ros__parameters']['slam'].items()}) == LiveSlamConfig()
-
-
-def test_a_parameter_of_the_pose_graph_is_refused_by_its_name() -> None:
-    assert slam_config({'slam.loop_gap': 5}) == LiveSlamConfig(loop_gap=5.0)
-    for name, value in (('slam.max_keyframes', 1), ('slam.links', 'two'),
-                        ('slam.publish_tf', 1), ('slam.loop_gap', float('nan'))):
-        with pytest.raises(DjetError, match=name):
-            slam_config({name: value})

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from cards import Cards, K, pose, REST, SIZE
 from djet_ros.config.flat import from_flat
-from djet_ros.config.sections import Config, OdometryConfig
+from djet_ros.config.sections import Config, OdometryConfig, SlamConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
 from djet_ros.lab.alignment import aligned, position_rmse
@@ -18,7 +18,6 @@ from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.graph import Edge, PoseGraph
-from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.steps import Steps
 from djet_ros.recordings.recording import open_recording
 import numpy as np
@@ -179,7 +178,7 @@ def live():
     return LiveSlam
 
 
-QUICK = LiveSlamConfig(keyframe_distance=0.5, loop_gap=0.5, optimise_period=0.0, path_period=0.0)
+QUICK = SlamConfig(keyframe_distance=0.5, loop_gap=0.5, optimise_period=0.0, path_period=0.0)
 FEW_FEATURES = from_flat({'estimator.max_features': 800})
 
 
@@ -187,7 +186,7 @@ class Drive:
     """A way past cards, as an odometry that drifts to the right tells it."""
 
     def __init__(self, live, config=FEW_FEATURES, slam=QUICK, drift=0.01):
-        self.slam = live(config, slam, message_type, 'image_rect')
+        self.slam = live(replace(config, slam=slam), message_type, 'image_rect')
         self.slam.camera_info(camera_info(K, SIZE))
         self.odometry = Odometry(config.odometry.frame_convention)
         self._cards, self._drift, self._frame = Cards(), pose(x=drift), 0
@@ -464,7 +463,7 @@ def test_diagnostics_come_once_a_second_and_when_the_state_changes(live):
 
 
 def test_it_says_what_it_waits_for(live):
-    slam = live(Config(), QUICK, message_type)
+    slam = live(Config(slam=QUICK), message_type)
     assert slam.state == ('WARN', 'waiting for odometry')
     odometry = Odometry()
     slam.odometry(odometry.start())
@@ -512,7 +511,7 @@ def test_on_a_block_driven_twice_the_error_shrinks_by_a_factor(live, tmp_path):
     lengths = GroundTruthScale(np.array([*truth]),
                                np.array([one[:3, 3] for one in truth.values()]), 0.01)
     tracker = Tracker(config, message_type, lengths, source.image_topic)
-    slam = live(config, LiveSlamConfig(), message_type, source.image_topic)
+    slam = live(config, message_type, source.image_topic)
     before, path = {}, None
     for topic, _, message in source.messages({source.image_topic, source.info_topic}):
         if topic == source.info_topic:

@@ -10,6 +10,7 @@ import tracemalloc
 
 from cards import Cards, K, pose
 import cv2
+from djet_ros.config.sections import SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
@@ -19,7 +20,6 @@ from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
-from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.images import Seen, SeenFile
 from djet_ros.posegraph.keyframes import choose_keyframes, without_common_length

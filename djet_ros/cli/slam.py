@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,9 @@ from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import load_yaml
-from djet_ros.core.parameter import describe
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
-from djet_ros.posegraph.config import SlamConfig
-from djet_ros.posegraph.offline import run_slam
+from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import make_room
 from djet_ros.recordings.recording import open_recording, Recording
@@ -64,47 +61,40 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                         help='parameters of the odometry as YAML; for a recording, as the next '
                         'seven')
     add_flags(parser, _REPLAY_FLAGS)
-    slam = parser.add_argument_group('keyframes and loops')
-    for name, description in describe(SlamConfig()).items():
-        default = getattr(SlamConfig(), name)
-        slam.add_argument('--' + name.replace('_', '-'), type=type(default), default=default,
-                          metavar=type(default).__name__.upper(),
-                          help=f'{description.text} (default: %(default)s)')
+    add_flags(parser.add_argument_group('keyframes and loops'), PARAMETERS)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Run, with progress on stderr, and show what came of it."""
-    try:
-        parameters = SlamConfig(**{field.name: getattr(args, field.name)
-                                   for field in fields(SlamConfig)})
-    except ValueError as error:
-        raise DjetError(str(error)) from None
+    given = flag_values(args)
+    of_slam = {name: given.pop(name) for name in PARAMETERS if name in given}
+    config = with_values(load_yaml(args.config) if args.config else Config(), {**given, **of_slam})
     make_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
-        if args.config or flag_values(args):
+        if args.config or given:
             raise DjetError(f'{results} holds results, which have their parameters already; give '
                             'the recording itself, to replay it with others')
     else:
-        results = _replayed(args)
+        results = _replayed(args, config)
     source, name = _source(results, args)
     try:
-        config, frames = load_yaml(results / 'config.yaml'), read_results(results)
+        config = with_values(load_yaml(results / 'config.yaml'), of_slam)
+        frames = read_results(results)
         with _bar('keyframes') as progress:
-            slam = run_slam(frames, source, config, parameters, progress, args.output)
+            slam = run_slam(frames, source, config, progress, args.output)
         truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
     finally:
         source.close()
-    summary = write_report(args.output, slam, truth, name, config, parameters)
+    summary = write_report(args.output, slam, truth, name, config)
     Console().print(_table(summary))
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
 
 
-def _replayed(args: argparse.Namespace) -> Path:
+def _replayed(args: argparse.Namespace, config: Config) -> Path:
     """Replay the recording into the output folder, and give the folder of the results."""
-    config = with_values(load_yaml(args.config) if args.config else Config(), flag_values(args))
     source = open_recording(args.input, args.image_topic, args.info_topic, args.poses,
                             speed=config.odometry.scale == 'speed',
                             speed_topic=args.speed_topic)

@@ -10,7 +10,8 @@ from djet_ros.config.flat import flat, parse_value
 from djet_ros.config.sections import Config
 
 
-def add_flags(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
+def add_flags(parser: argparse.ArgumentParser | argparse._ArgumentGroup,
+              names: Iterable[str]) -> None:
     """
     Add a command-line flag for each flat name: ``--max-gap`` for ``odometry.max_gap``.
 

@@ -19,6 +19,9 @@ from djet_ros.errors import DjetError
 
 Value = bool | int | float | str
 
+# Share of equal letters beyond which one name is taken for another mistyped.
+_LIKE = 0.75
+
 
 @dataclass(frozen=True)
 class FlatParameter:
@@ -53,19 +56,22 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     value of another type, and on one outside its described range.
     """
     known = flat(config)
-    checked = {name: _typed(_lookup(name, known), value) for name, value in values.items()}
+    if strange := [name for name in values if name not in known]:
+        raise DjetError(why_unknown(strange[0]))
+    checked = {name: _typed(known[name], value) for name, value in values.items()}
+    mark = ''
     try:
         if 'preset' in checked:
             name = str(checked.pop('preset'))
             config = replace(config, preset=name, estimator=preset(name))
-        for section in SECTIONS:
-            changes = {name.partition('.')[2]: value for name, value in checked.items()
-                       if name.startswith(f'{section}.')}
+        for part in SECTIONS:
+            mark = f'{part}.'
+            changes = {name.removeprefix(mark): value for name, value in checked.items()
+                       if name.startswith(mark)}
             if changes:
-                changed = replace(getattr(config, section), **changes)
-                config = replace(config, **{section: changed})
+                config = replace(config, **{part: replace(getattr(config, part), **changes)})
     except ValueError as error:
-        raise DjetError(str(error)) from None
+        raise DjetError(f'{mark}{error}') from None
     return config
 
 
@@ -74,13 +80,19 @@ def from_flat(values: Mapping[str, Any]) -> Config:
     return with_values(Config(), values)
 
 
-def _lookup(name: str, known: Mapping[str, FlatParameter]) -> FlatParameter:
-    if name in known:
-        return known[name]
-    by_last = {full.rpartition('.')[2]: full for full in known}
-    near = difflib.get_close_matches(str(name), [*known, *by_last], n=1, cutoff=0.5)
-    hint = f"; did you mean '{by_last.get(near[0], near[0])}'?" if near else ''
-    raise DjetError(f"unknown parameter '{name}'{hint}")
+def why_unknown(name: str) -> str:
+    """Word that no parameter has this name, with the one whose last name is nearly the same."""
+    def likeness(full: str) -> tuple[float, float]:
+        return (_ratio(full.rpartition('.')[2], str(name).rpartition('.')[2]),
+                _ratio(full, str(name)))
+
+    nearest = max(flat(Config()), key=likeness)
+    hint = f"; did you mean '{nearest}'?" if likeness(nearest)[0] > _LIKE else ''
+    return f"unknown parameter '{name}'{hint}"
+
+
+def _ratio(a: str, b: str) -> float:
+    return difflib.SequenceMatcher(None, a, b).ratio()
 
 
 def _typed(item: FlatParameter, value: Any) -> Value:

@@ -58,6 +58,53 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True)
+class SlamConfig:
+    """How loops are closed, offline and live. Raises ValueError like its sisters."""
+
+    keyframe_distance: float = parameter(
+        2.0, 'way after which a frame becomes a keyframe, in metres or in units of the trajectory',
+        minimum=1e-6, maximum=1e6)
+    keyframe_turn: float = parameter(
+        10.0, 'turn after which a frame becomes a keyframe, in degrees', minimum=0.1, maximum=180)
+    links: int = parameter(
+        1, 'to how many keyframes before it a keyframe is linked; beyond the last one, by direct '
+        'estimates', minimum=1, maximum=10)
+    length_noise: float = parameter(
+        0.02, 'standard deviation by which known lengths differ from one another, as a share; '
+        "what the odometry's scale_uncertainty says beyond it is common to all of them (the "
+        'radius of a wheel, the height of a camera) and bends nothing', minimum=1e-6, maximum=10.0)
+    loop_gap: float = parameter(
+        20.0, 'seconds that must lie between two keyframes that close a loop',
+        minimum=0.0, maximum=1e6)
+    loop_votes: int = parameter(
+        20, 'features that must look alike before a loop is verified; a large number closes no '
+        'loops', minimum=1, maximum=1_000_000)
+    loop_candidates: int = parameter(
+        2, 'most alike keyframes that are verified for each keyframe', minimum=1, maximum=100)
+    loop_inliers: int = parameter(
+        60, 'inliers that verify a loop', minimum=8, maximum=10000)
+    loop_share: float = parameter(
+        0.5, 'share of inliers among the matches that verifies a loop', minimum=0.05, maximum=1.0)
+    max_keyframes: int = parameter(
+        1000, 'keyframes that are kept, with their images; beyond it the oldest is forgotten, and '
+        'what was known by it becomes a fixed part of the rest', minimum=2, maximum=1_000_000)
+    image_buffer: int = parameter(
+        50, 'newest images that wait for their odometry', minimum=1, maximum=10_000)
+    optimise_period: float = parameter(
+        2.0, 'seconds between two optimisations while new loops are found',
+        minimum=0.0, maximum=3600.0)
+    path_period: float = parameter(
+        1.0, 'seconds between two paths', minimum=0.0, maximum=3600.0)
+    map_frame: str = parameter('map', 'frame id in which the optimised poses are given')
+    publish_tf: bool = parameter(
+        True, 'whether map_frame -> odom_frame is published on tf')
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their described range."""
+        check(self)
+
+
+@dataclass(frozen=True)
 class NodeConfig:
     """What is between the odometry and the graph. Raises ValueError like its sisters."""
 
@@ -93,7 +140,7 @@ class NodeConfig:
 @dataclass(frozen=True)
 class Config:
     """
-    All parameters, in the three sections that the flat names begin with.
+    All parameters, in the four sections that the flat names begin with.
 
     ``preset`` names where the values of ``estimator`` started from; ``with_values`` keeps the two
     in step.
@@ -104,6 +151,7 @@ class Config:
         'algorithm as printed); values given for the estimator come on top', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    slam: SlamConfig = field(default_factory=SlamConfig)
     ros: NodeConfig = field(default_factory=NodeConfig)
 
     def __post_init__(self) -> None:
@@ -111,4 +159,4 @@ class Config:
         check(self)
 
 
-SECTIONS = ('estimator', 'odometry', 'ros')
+SECTIONS = ('estimator', 'odometry', 'slam', 'ros')

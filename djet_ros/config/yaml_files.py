@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ _ROS_OWN = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
 _YAML_HEAD = """\
-# Parameters of vo_node, also read by `djet replay --config FILE`.
+# Parameters of the nodes, also read by `djet replay` and `djet slam` with --config FILE.
 # Made from djet_ros/config by its dump_yaml; a test holds that the two agree.
 """
 
@@ -79,34 +79,36 @@ def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
             yield str(name), value
 
 
-def dump_yaml(config: Config, *, preset_as_comments: bool = False) -> str:
+def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,
+              preset_as_comments: bool = False) -> str:
     """
     Write the configuration as YAML in ROS's layout, each parameter under its description.
 
-    With preset_as_comments the estimator's values that the preset gives anyway are commented
-    out, so that the file leaves the choice of preset free.
+    parts: the sections that are written; '' are the parameters that stand in none. With
+    preset_as_comments the estimator's values that the preset gives anyway are commented out, so
+    that the file leaves the choice of preset free.
     """
     silent = set()
-    if preset_as_comments:
+    if preset_as_comments and 'estimator' in parts:
         given = flat(replace(config, estimator=preset(config.preset)))
         silent = {item.name for item in section(config, 'estimator')
                   if item.value == given[item.name].value}
-    lines = ['/**:', '  ros__parameters:']
-    for part in ('', *SECTIONS):
-        indent = '    '
-        if part:
-            lines += ['', f'{indent}{part}:']
-            indent = '      '
+    texts = []
+    for part in parts:
+        lines = [f'    {part}:'] if part else []
+        indent = '      ' if part else '    '
         for item in section(config, part):
             lines += textwrap.wrap(explain(item), 97, initial_indent=f'{indent}# ',
                                    subsequent_indent=f'{indent}# ')
             mark = '# ' if item.name in silent else ''
             name = item.name.rpartition('.')[2]
             lines.append(f'{indent}{mark}{name}: {_yaml_scalar(item.value)}')
-    if silent.issuperset(item.name for item in section(config, 'estimator')):
-        # A section of comments alone would be null, which ROS refuses.
-        lines = [f'    # {line.strip()}' if line == '    estimator:' else line for line in lines]
-    return _YAML_HEAD + (_PRESET_NOTE if silent else '') + '\n'.join(lines) + '\n'
+        if part and silent.issuperset(item.name for item in section(config, part)):
+            # A section of comments alone would be null, which ROS refuses.
+            lines[0] = f'    # {part}:'
+        texts.append('\n'.join(lines) + '\n')
+    return (_YAML_HEAD + (_PRESET_NOTE if silent else '') + '/**:\n  ros__parameters:\n'
+            + '\n'.join(texts))
 
 
 def _yaml_scalar(value: Value) -> str:

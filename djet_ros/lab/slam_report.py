@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros import __version__
+from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.style import COLOURS, figure
-from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.graph_files import write_graph
-from djet_ros.posegraph.offline import Slam, travelled
+from djet_ros.posegraph.offline import PARAMETERS, Slam, travelled
 from djet_ros.recordings.trajectories import TumWriter
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,8 @@ _LINES: dict[str, Any] = {'before': {'color': COLOURS['rpe'], 'ls': '--'},
                           'after': {'color': COLOURS['djet']}}
 
 
-def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Config,
-                 parameters: SlamConfig) -> dict[str, Any]:
+def write_report(folder: Path, slam: Slam, truth: Array, name: str,
+                 config: Config) -> dict[str, Any]:
     """
     Write trajectories, graph, plot and summary into a folder, and give the summary.
 
@@ -45,13 +45,15 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str, config: Conf
         _write_tum(folder / f'{which}_tum.txt', frames.stamps_ns, poses)
     for kind in ('g2o', 'csv'):
         write_graph(graph, folder / f'pose_graph.{kind}', kind)
+    values = flat(config)
+    parameters = {full.removeprefix('slam.'): values[full].value for full in PARAMETERS}
     kinds = Counter(edge.kind for edge in graph.edges)
     summary: dict[str, Any] = {
         'source': name, 'scale': config.odometry.scale, 'scale_known': slam.scale_known,
         'scale_uncertainty': config.odometry.scale_uncertainty if slam.scale_known else None,
         'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
         'rejected': {kind: slam.rejected(kind) for kind in ('link', 'loop') if kinds[kind]},
-        'way': travelled(slam.before()), 'parameters': asdict(parameters),
+        'way': travelled(slam.before()), 'parameters': parameters,
         'version': __version__}
     known = np.isfinite(truth).all(axis=(1, 2))
     if known.sum() > 2:

@@ -9,7 +9,6 @@ from djet_ros.live.face import Face, input_profile
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs
-from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.live_slam import LiveSlam
 
 # Messages that the middleware keeps while Python is in a long optimisation.
@@ -19,19 +18,19 @@ _DEPTH = 1000
 class GraphFace(Face):
     """The live SLAM on a graph."""
 
-    def __init__(self, middleware: Middleware, config: Config, slam: LiveSlamConfig) -> None:
+    def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
         image, info = self.image_topics(config.ros)
         topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
         self.session: GraphSession = GraphSession(
-            LiveSlam(config, slam, middleware.message_type, image), self,
+            LiveSlam(config, middleware.message_type, image), self,
             {**topics, 'image': image, 'camera_info': info})
-        self.advertise(graph_outputs(tf=slam.publish_tf))
+        self.advertise(graph_outputs(tf=config.slam.publish_tf))
         for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
                                                  self.session.relative_pose)):
             self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH))
         self.listen_to_camera(image, info, config.ros.image_transport,
-                              replace(input_profile(config.ros), depth=slam.image_buffer))
+                              replace(input_profile(config.ros), depth=config.slam.image_buffer))
         middleware.serve('~/reset', self._reset)
         self.log('info', f'odometry from {topics["odometry"]}, images from {image}, '
                          f'camera_info from {info}')

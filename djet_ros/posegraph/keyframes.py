@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from djet_ros.config.sections import SlamConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.uncertainty import compose
-from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.graph import Edge, PoseGraph
 import numpy as np
 from numpy.typing import NDArray

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from djet_ros.config.sections import SlamConfig
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
@@ -14,7 +15,6 @@ from djet_ros.odometry.uncertainty import compose, rotated
 from djet_ros.posegraph.backend import optimise
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.keyframes import Hanging
-from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.steps import Step
 import numpy as np
@@ -50,7 +50,7 @@ class LiveMap:
     The memory is bounded by ``max_keyframes``: see ``_forget_oldest``.
     """
 
-    def __init__(self, estimator: EstimatorConfig, config: LiveSlamConfig) -> None:
+    def __init__(self, estimator: EstimatorConfig, config: SlamConfig) -> None:
         self._config = config
         self._finder = EdgeFinder(estimator, config)
         self.keyframes: deque[Keyframe] = deque()

@@ -20,7 +20,6 @@ from djet_ros.odometry.messages import Messages, MessageType, OPTICAL_TO_BODY, s
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.keyframes import without_common_length
-from djet_ros.posegraph.live_config import LiveSlamConfig
 from djet_ros.posegraph.live_map import LiveMap
 from djet_ros.posegraph.steps import Step, Steps
 import numpy as np
@@ -35,7 +34,7 @@ class LiveSlam:
     """
     Closes loops while the odometry goes on.
 
-    config: that of the odometry, as far as both share it (estimator, odometry.frame_convention,
+    config: slam, and what it shares with the odometry (estimator, odometry.frame_convention,
     odometry.rectified, odometry.scale_uncertainty); message_type gives the class for a type name;
     image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
 
@@ -43,9 +42,8 @@ class LiveSlam:
     (the optimised poses of the keyframes and of the newest frame), /diagnostics.
     """
 
-    def __init__(self, config: Config, slam: LiveSlamConfig, message_type: MessageType,
-                 image_topic: str = '') -> None:
-        self.config, self.slam = config, slam
+    def __init__(self, config: Config, message_type: MessageType, image_topic: str = '') -> None:
+        self.config, self.slam = config, config.slam
         # What a face adds to each diagnostics message.
         self.face_values: dict[str, str] = {}
         self._messages = _Messages(message_type, config.odometry)

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 
+from djet_ros.config.sections import SlamConfig
 from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -17,7 +18,6 @@ from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
-from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.graph import Edge
 from djet_ros.posegraph.images import Seen
 from djet_ros.posegraph.places import PlaceIndex

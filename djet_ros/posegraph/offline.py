@@ -9,13 +9,17 @@ from pathlib import Path
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.posegraph.backend import optimise, Solution
-from djet_ros.posegraph.config import SlamConfig
 from djet_ros.posegraph.graph import PoseGraph
 from djet_ros.posegraph.images import frames_at, SeenFile
 from djet_ros.posegraph.keyframes import choose_keyframes, Keyframes, without_common_length
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.recordings.recording import Recording
 import numpy as np
+
+# What the offline SLAM goes by, of the section slam; the rest is for live use.
+PARAMETERS = tuple(f'slam.{name}' for name in (
+    'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap', 'loop_votes',
+    'loop_candidates', 'loop_inliers', 'loop_share'))
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Slam:
                    for edge, trust in zip(self.solution.graph.edges, self.solution.trust))
 
 
-def run_slam(frames: PoseGraph, recording: Recording, config: Config, slam: SlamConfig,
+def run_slam(frames: PoseGraph, recording: Recording, config: Config,
              progress: Callable[[int, int], None] | None = None,
              scratch: Path | None = None) -> Slam:
     """
@@ -62,6 +66,7 @@ def run_slam(frames: PoseGraph, recording: Recording, config: Config, slam: Slam
     """
     # Composed with others, what is wrong with an edge would no longer be seen.
     frames.check()
+    slam = config.slam
     keyframes = choose_keyframes(without_common_length(
         frames, config.odometry.scale_uncertainty, slam.length_noise), slam)
     graph = keyframes.graph

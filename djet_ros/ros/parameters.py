@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
-from djet_ros.config.flat import flat, FlatParameter, from_flat, with_values
+from djet_ros.config.flat import flat, FlatParameter, from_flat, why_unknown, with_values
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import (
-    FIXED,
-    for_a_live_graph,
-    KNOWN,
-    known,
-    SHARED,
-    unknown_parameter,
-)
-from djet_ros.posegraph.live_config import flat_slam, LiveSlamConfig, slam_config
+from djet_ros.live.parameters import FIXED, for_a_live_graph, ODOMETRY, SHARED
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -39,17 +31,10 @@ class Parameters:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
-        for name in given:
-            if name not in KNOWN and not is_ros_own(name):
-                node.get_logger().warning(unknown_parameter(name))
-        self.config = _live(from_flat(known(given)))
-
-        # Declared anew with the types, ranges and texts that the overrides do not know.
-        for item in flat(self.config).values():
-            if item.name in given:
-                node.undeclare_parameter(item.name)
-            node.declare_parameter(item.name, item.value, descriptor(item), ignore_override=True)
+        given = _given(node)
+        self.config = _live(from_flat(given))
+        _declare(node, (item for item in flat(self.config).values() if item.name in ODOMETRY),
+                 given)
 
     def call_on_change(self, apply: Callable[[Config], None]) -> None:
         """Accept changes from now on; apply is called with each new configuration."""
@@ -69,7 +54,7 @@ class Parameters:
         before = flat(self.config)
         return [Parameter(item.name, value=item.value) for item in flat(config).values()
                 if item.name in values or item.value != before[item.name].value
-                ] + [one for one in parameters if one.name not in KNOWN]
+                ] + [one for one in parameters if one.name not in ODOMETRY]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -85,28 +70,38 @@ class Parameters:
             self.config = config
 
 
-def graph_parameters(node: Node) -> tuple[Config, LiveSlamConfig]:
+def graph_parameters(node: Node) -> Config:
     """
     Declare the parameters of a pose graph, which hold for the node's life, and read them.
 
     Those that it shares with the odometry may come from the same file. Raises DjetError where a
     value can't be used; unknown names are only warned of.
     """
-    given = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
-    own = flat_slam(LiveSlamConfig())
-    for name in given:
-        if name not in own and name not in KNOWN and not is_ros_own(name):
-            node.get_logger().warning(unknown_parameter(name, own))
-    config = from_flat(known(given))
-    slam = slam_config({name: value for name, value in given.items() if name in own})
-    shared = [item for item in flat(config).values()
-              if item.name in SHARED or item.name.startswith('estimator.')]
-    for item in (*shared, *flat_slam(slam).values()):
+    given = _given(node)
+    config = from_flat(given)
+    _declare(node, (item for item in flat(config).values() if item.name in SHARED
+                    or item.name.startswith(('estimator.', 'slam.'))), given, read_only=True)
+    return config
+
+
+def _given(node: Node) -> dict[str, Any]:
+    """Values that came with the start, by names that some node of ours has."""
+    known = flat(Config())
+    values = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
+    for name in values:
+        if name not in known and not is_ros_own(name):
+            node.get_logger().warning(why_unknown(name))
+    return {name: value for name, value in values.items() if name in known}
+
+
+def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any], *,
+             read_only: bool = False) -> None:
+    """Declare anew with the types, ranges and texts that the overrides do not know."""
+    for item in items:
         if item.name in given:
             node.undeclare_parameter(item.name)
-        node.declare_parameter(item.name, item.value, descriptor(item, read_only=True),
+        node.declare_parameter(item.name, item.value, descriptor(item, read_only=read_only),
                                ignore_override=True)
-    return config, slam
 
 
 def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDescriptor:
@@ -136,4 +131,4 @@ def _live(config: Config) -> Config:
 
 
 def _values(parameters: list[Parameter]) -> dict[str, Any]:
-    return known({one.name: one.value for one in parameters})
+    return {one.name: one.value for one in parameters if one.name in ODOMETRY}

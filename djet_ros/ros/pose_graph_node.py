@@ -11,4 +11,4 @@ from rclpy.node import Node
 
 def make(node: Node) -> Face:
     """Make the pose graph of a node's parameters, which hold for its life."""
-    return GraphFace(RosMiddleware(node), *graph_parameters(node))
+    return GraphFace(RosMiddleware(node), graph_parameters(node))
