@@ -40,7 +40,7 @@ setup(
         'audit': [
             'pip-audit>=2.9,<3',
         ],
-        # `djet evaluate --scheduler`
+        # `djet lab evaluate --scheduler`
         'cluster': [
             'distributed>=2024.5,<2027',
         ],
@@ -52,7 +52,7 @@ setup(
         'fuzz': [
             'atheris>=3.0,<4',
         ],
-        # what `djet evaluate` compares with
+        # what `djet lab evaluate` compares with
         'peers': [
             'evo>=1.38,<2',
             'poselib>=2.0.5,<3',

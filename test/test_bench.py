@@ -20,7 +20,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def bench(*arguments: object) -> subprocess.CompletedProcess[str]:
     code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'bench', *map(str, arguments)],
+    return subprocess.run([sys.executable, '-c', code, 'lab', 'bench', *map(str, arguments)],
                           capture_output=True, text=True, timeout=300)
 
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import djet_ros
-from djet_ros.cli.main import COMMANDS
+from djet_ros.cli.main import COMMANDS, LAB
 import pytest
 
 # The command as pip's script calls it, and the same with one more subcommand.
@@ -24,8 +24,7 @@ def run(args):
 
 COMMANDS['probe'] = 'what one test needs'
 probe = types.ModuleType('djet_ros.cli.probe')
-probe.add_parser = lambda subparsers: subparsers.add_parser('probe')
-probe.run = run
+probe.DESCRIPTION, probe.add_arguments, probe.run = '', lambda parser: None, run
 sys.modules[probe.__name__] = probe
 sys.exit(main(['probe']))
 """
@@ -43,27 +42,43 @@ def start_probe(body: str) -> subprocess.Popen[str]:
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def test_the_list_of_commands_is_the_list_of_their_modules() -> None:
-    files = Path(djet_ros.__file__).parent.glob('cli/*.py')
-    modules = {path.stem.replace('_', '-') for path in files
-               if 'def add_parser(' in path.read_text()}
-    assert set(COMMANDS) == modules
+def verbs(folder: str) -> set[str]:
+    """Give the commands that have a module in a folder of the package."""
+    files = (Path(djet_ros.__file__).parent / folder).glob('*.py')
+    return {path.stem.replace('_', '-') for path in files
+            if 'def add_arguments(' in path.read_text()}
 
 
-def test_help_names_every_command_without_importing_any() -> None:
-    listing = subprocess.run([sys.executable, '-X', 'importtime', '-c', DJET, '--help'],
+def test_the_lists_of_commands_are_the_lists_of_their_modules() -> None:
+    assert set(COMMANDS) == verbs('cli') | {'lab'}
+    assert set(LAB) == verbs('cli/lab')
+
+
+@pytest.mark.parametrize(('words', 'commands'), [((), COMMANDS), (('lab',), LAB)])
+def test_help_names_every_command_without_importing_any(
+        words: tuple[str, ...], commands: dict[str, str]) -> None:
+    listing = subprocess.run([sys.executable, '-X', 'importtime', '-c', DJET, *words, '--help'],
                              capture_output=True, text=True, timeout=60, check=False)
     assert listing.returncode == 0
-    assert set(COMMANDS) <= set(listing.stdout.split())
+    assert set(commands) <= set(listing.stdout.split())
     for library in ('numpy', 'cv2', 'rosbags', 'rich', 'matplotlib'):
         assert f'| {library}\n' not in listing.stderr
 
 
-@pytest.mark.parametrize('command', COMMANDS)
+@pytest.mark.parametrize('command', [*COMMANDS, *(f'lab {verb}' for verb in LAB)])
 def test_every_command_has_help(command: str) -> None:
-    answer = djet(command, '--help')
+    answer = djet(*command.split(), '--help')
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.startswith(f'usage: djet {command} ')
+    assert answer.stderr == ''
+
+
+@pytest.mark.parametrize('verb', LAB)
+def test_the_old_spelling_of_a_lab_verb_works_with_a_hint_of_one_line(verb: str) -> None:
+    old, new = djet(verb, '--help'), djet('lab', verb, '--help')
+    assert (old.returncode, old.stdout) == (0, new.stdout)
+    assert old.stderr.count('\n') == 1
+    assert f'djet lab {verb}' in old.stderr
 
 
 def test_the_version_is_the_packages() -> None:
@@ -71,7 +86,8 @@ def test_the_version_is_the_packages() -> None:
 
 
 @pytest.mark.parametrize('arguments', [
-    (), ('reply',), ('--fast',), ('--', 'demo', '--fast'), ('demo', '--fast'), ('-', 'demo')])
+    (), ('reply',), ('--fast',), ('--', 'demo', '--fast'), ('demo', '--fast'), ('-', 'demo'),
+    ('lab',), ('lab', 'demo'), ('lab', 'bench', '--fast')])
 def test_a_wrong_command_line_gives_one_line_and_exit_code_2(arguments: tuple[str, ...]) -> None:
     answer = djet(*arguments)
     assert answer.returncode == 2

@@ -25,7 +25,7 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
     code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'closure', *map(str, arguments)],
+    return subprocess.run([sys.executable, '-c', code, 'lab', 'closure', *map(str, arguments)],
                           capture_output=True, text=True, timeout=300, check=False)
 
 

@@ -1,4 +1,4 @@
-"""``djet evaluate`` and ``djet ablate`` on rendered frames, mostly in real processes."""
+"""``djet lab evaluate`` and ``djet lab ablate`` on rendered frames, mostly in real processes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def short(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def djet(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
-    return subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
+    return subprocess.run([*DJET, 'lab', *map(str, arguments)], capture_output=True, text=True,
                           timeout=300, check=False)
 
 
@@ -273,7 +273,7 @@ def test_a_dask_cluster_writes_the_same_bytes(road, short, tmp_path):
 def running(road: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Give a run with one worker whose first chunk is done and whose second is not."""
     process = subprocess.Popen(
-        [*DJET, 'evaluate', str(road), '--output', str(tmp_path), '--workers', '1', *RUN],
+        [*DJET, 'lab', 'evaluate', str(road), '--output', str(tmp_path), '--workers', '1', *RUN],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: len(chunks(tmp_path)) == 1)
     yield process

@@ -161,8 +161,8 @@ def test_a_disk_that_is_full_from_the_start_is_named(drive, disk):
 
 @pytest.mark.parametrize('command', [
     ['replay', 'DRIVE', '--output', 'DISK/results'], ['kitti-to-bag', 'DRIVE', 'DISK/bag'],
-    ['soak', '--output', 'DISK/deep/soak.json', '--frames', '100'],
-    ['render', 'road', 'DISK/road', '--frames', '1', '--size', '160x120']])
+    ['lab', 'soak', '--output', 'DISK/deep/soak.json', '--frames', '100'],
+    ['lab', 'render', 'road', 'DISK/road', '--frames', '1', '--size', '160x120']])
 def test_a_disk_that_is_read_only_is_named(drive, disk, command):
     # Modes do not hold root back; this does.
     place = disk('size=1m,ro')
@@ -188,8 +188,8 @@ def contents(path: Path) -> object:
 COMMANDS = {
     'replay': ['replay', 'SEQUENCE', '--output', 'OUT'],
     'kitti-to-bag': ['kitti-to-bag', 'SEQUENCE', 'OUT'],
-    'render': ['render', 'road', 'OUT', '--frames', '1', '--size', '160x120'],
-    'similarity': ['similarity', 'IMAGE', '--output', 'OUT.png', '--points', '80,60'],
+    'render': ['lab', 'render', 'road', 'OUT', '--frames', '1', '--size', '160x120'],
+    'similarity': ['lab', 'similarity', 'IMAGE', '--output', 'OUT.png', '--points', '80,60'],
 }
 
 

@@ -1,4 +1,4 @@
-"""``djet similarity`` and ``djet surfaces``: what they show, and that they can be drawn."""
+"""The figures of ``djet lab``: what they show, and that they can be drawn."""
 
 from __future__ import annotations
 
@@ -36,6 +36,11 @@ def gray() -> np.ndarray:
     noise = np.random.default_rng(3).integers(0, 256, (200, 300)).astype(np.float32)
     image = sum(cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1, 2, 4))
     return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def lab(words: list[str]) -> int:
+    """Run a verb of djet lab in this process."""
+    return main(['lab', *words])
 
 
 def test_a_point_is_most_like_itself(gray):
@@ -82,9 +87,9 @@ def test_rounds_end_where_the_estimator_ends(road):
 def test_figures_are_drawn_in_the_size_of_what_they_show(road, tmp_path, capsys):
     images = [str(road / 'image_0' / f'{i:06d}.png') for i in (0, 1)]
     few, many, both = (tmp_path / 'new' / f'{name}.png' for name in ('few', 'many', 'both'))
-    assert main(['similarity', images[0], '--points', '200,80', '--output', str(few)]) == 0
-    assert main(['similarity', images[0], '--count', '4', '--output', str(many)]) == 0
-    assert main(['similarity', *images, '--count', '4', '--output', str(both)]) == 0
+    assert lab(['similarity', images[0], '--points', '200,80', '--output', str(few)]) == 0
+    assert lab(['similarity', images[0], '--count', '4', '--output', str(many)]) == 0
+    assert lab(['similarity', *images, '--count', '4', '--output', str(both)]) == 0
     sizes = [PIL.open(path).size for path in (few, many, both)]
     assert sizes[0][0] < sizes[1][0]
     assert sizes[1] == sizes[2]
@@ -93,11 +98,11 @@ def test_figures_are_drawn_in_the_size_of_what_they_show(road, tmp_path, capsys)
 
 def test_an_animation_has_a_frame_for_each_round(road, tmp_path, capsys):
     moving, still = tmp_path / 'surfaces.gif', tmp_path / 'surfaces.png'
-    assert main(['surfaces', str(road), '--pair', '1', '--output', str(moving)]) == 0
+    assert lab(['surfaces', str(road), '--pair', '1', '--output', str(moving)]) == 0
     rounds = int(capsys.readouterr().out.splitlines()[0].split()[-2])
     assert rounds > 1
     assert PIL.open(moving).n_frames == rounds
-    assert main(['surfaces', str(road), '--pair', '1', '--output', str(still)]) == 0
+    assert lab(['surfaces', str(road), '--pair', '1', '--output', str(still)]) == 0
     assert PIL.open(still).size[0] > 500
 
 
@@ -106,9 +111,9 @@ def test_two_images_and_a_camera_are_as_good_as_a_sequence(road, tmp_path, capsy
     K = KittiSequence(road).K
     camera = ','.join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     file = str(tmp_path / 'surfaces.png')
-    assert main(['surfaces', *images, '--camera', camera, '--output', file]) == 0
+    assert lab(['surfaces', *images, '--camera', camera, '--output', file]) == 0
     one = capsys.readouterr().out
-    assert main(['surfaces', str(road), '--pair', '1', '--output', file, '--overwrite']) == 0
+    assert lab(['surfaces', str(road), '--pair', '1', '--output', file, '--overwrite']) == 0
     assert capsys.readouterr().out == one
 
 
@@ -134,7 +139,7 @@ def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, sai
     (tmp_path / 'text').write_text('no image')
     cv2.imwrite(str(tmp_path / 'flat.png'), np.zeros((200, 200), np.uint8))
     places = {'road': road, 'image': road / 'image_0' / '000000.png', 'flat': 'flat.png'}
-    code = main([str(places.get(word, word)) for word in arguments])
+    code = lab([str(places.get(word, word)) for word in arguments])
     captured = capsys.readouterr()
     assert code == 2
     assert captured.err.startswith('djet: error: ')
@@ -144,7 +149,7 @@ def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, sai
 
 def test_drawing_needs_no_screen(road, tmp_path):
     draw = ('import sys; from djet_ros.cli.main import main; '
-            f'sys.exit(main(["similarity", {str(road / "image_0" / "000000.png")!r}]))')
+            f'sys.exit(main(["lab", "similarity", {str(road / "image_0" / "000000.png")!r}]))')
     answer = subprocess.run([sys.executable, '-c', draw], cwd=tmp_path, env={'PATH': ''},
                             capture_output=True, text=True, timeout=60, check=False)
     assert answer.returncode == 0, answer.stderr

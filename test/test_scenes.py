@@ -235,7 +235,7 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(
 
 def test_the_command_writes_the_same_bytes_in_another_process(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, '-c', DJET, 'render', 'repeated_texture', tmp_path / 'a',
+        [sys.executable, '-c', DJET, 'lab', 'render', 'repeated_texture', tmp_path / 'a',
          '--frames', '2', '--size', '160x64'], capture_output=True, text=True, check=True)
     folder = render_sequence('repeated_texture', tmp_path / 'b', 2, size=TINY)
     other = tmp_path / 'a' / folder.relative_to(tmp_path / 'b')

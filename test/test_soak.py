@@ -22,7 +22,7 @@ FRAMES = 100
 
 def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
     code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'soak', *map(str, arguments)],
+    return subprocess.run([sys.executable, '-c', code, 'lab', 'soak', *map(str, arguments)],
                           capture_output=True, text=True, timeout=300, check=False)
 
 

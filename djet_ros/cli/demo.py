@@ -9,26 +9,26 @@ import shlex
 from typing import Any
 
 from djet_ros.cli import main
+from djet_ros.cli.options import add_output
+from djet_ros.cli.terminal import new_table, spread
 from djet_ros.errors import DjetError
 from djet_ros.replay.results import PLOT, SUMMARY
 from rich.console import Console
 from rich.table import Table
 
+DESCRIPTION = """\
+Render a road with known camera poses (or take a KITTI sequence), convert it to a bag, replay the
+bag with D-JET and with re-projection error (RP-E), and compare the two.
+"""
+
 METHODS = ('djet', 'rpe')
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser(
-        'demo', description='Render a road with known camera poses (or take a KITTI sequence), '
-        'convert it to a bag, replay the bag with D-JET and with re-projection error (RP-E), and '
-        'compare the two.')
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('sequence', nargs='?', type=Path, metavar='SEQUENCE_DIR',
                         help='folder such as sequences/00 (default: render a road)')
-    parser.add_argument('--output', type=Path, default=Path('demo'), metavar='DIR',
-                        help='folder of everything that is written (default: %(default)s)')
-    parser.add_argument('--overwrite', action='store_true',
-                        help='replace what an earlier demo left in the output folder')
+    add_output(parser, 'folder of everything that is written', 'demo')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     overwrite = ['--overwrite'] if args.overwrite else []
     sequence = args.sequence
     if sequence is None:
-        _djet('render', 'road', args.output / 'rendered', *overwrite)
+        _djet('lab', 'render', 'road', args.output / 'rendered', *overwrite)
         sequence, = (args.output / 'rendered' / 'sequences').iterdir()
     bag = args.output / 'bag'
     _djet('kitti-to-bag', sequence, bag, *overwrite)
@@ -60,18 +60,11 @@ def _djet(*arguments: str | Path) -> None:
 
 
 def _comparison(summaries: dict[str, dict[str, Any]]) -> Table:
-    table = Table(title='errors against ground truth, in degrees: mean / median / largest')
-    for heading in ('method', 'pairs', 'pairs/s', 'rotation', 'direction of translation'):
-        table.add_column(heading, justify='left' if heading == 'method' else 'right')
+    table = new_table('errors against ground truth, in degrees: mean / median / p95 / max',
+                      'method', 'pairs', 'pairs/s', 'rotation', 'direction of translation')
     for method, summary in summaries.items():
         rate = summary['pairs'] / summary['seconds']
         table.add_row(method, str(summary['pairs']), f'{rate:.1f}',
-                      _errors(summary.get('rotation_error_deg')),
-                      _errors(summary.get('translation_error_deg')))
+                      spread(summary.get('rotation_error_deg')),
+                      spread(summary.get('translation_error_deg')))
     return table
-
-
-def _errors(statistics: dict[str, float] | None) -> str:
-    if statistics is None:
-        return 'no ground truth'
-    return ' / '.join(f'{statistics[name]:.3f}' for name in ('mean', 'median', 'max'))

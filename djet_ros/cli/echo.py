@@ -28,16 +28,13 @@ _SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames rec
 _COLOURS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'echo', help='what a live odometry says, in the terminal', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('--diagnostics', action='store_true',
                         help='state, rate, latency and path length instead of poses')
     parser.add_argument('--node', default=NODE_NAME, metavar='NAME',
                         help='name of the node (default: %(default)s)')
     add_remappings(parser)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:

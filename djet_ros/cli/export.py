@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite
+from djet_ros.cli.options import add_output
 from djet_ros.posegraph.graph_files import FORMATS, write_graph
 from djet_ros.replay.graph_of_results import read_results
 
@@ -19,16 +18,13 @@ covariances; tum and kitti have the poses alone.
 """
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser('export', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('results', type=Path, metavar='RESULTS',
                         help="folder that 'djet replay' wrote")
     parser.add_argument('--format', choices=tuple(FORMATS), default='g2o',
                         help='default: %(default)s')
-    parser.add_argument('--output', type=Path, required=True, metavar='FILE')
-    add_overwrite(parser)
-    return parser
+    add_output(parser, 'where the graph goes', metavar='FILE')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
+from djet_ros.cli.options import add_frames, add_overwrite
+from djet_ros.cli.terminal import progress_bar
 from djet_ros.recordings.bag_writers import STORAGES, write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 DESCRIPTION = """\
 Write a KITTI odometry sequence (image_0/*.png, calib.txt, times.txt) as a rosbag2 with
@@ -18,11 +17,8 @@ Write a KITTI odometry sequence (image_0/*.png, calib.txt, times.txt) as a rosba
 """
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'kitti-to-bag', help='write a KITTI odometry sequence as a rosbag2',
-        description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('sequence', type=Path, metavar='SEQUENCE_DIR',
                         help='folder such as sequences/00')
     parser.add_argument('out', type=Path, metavar='OUT', help='folder of the new bag')
@@ -30,23 +26,16 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
                         help='ground truth (default: ../../poses/NN.txt where it exists)')
     parser.add_argument('--storage', choices=tuple(STORAGES), default='mcap',
                         help='file format of the bag (default: %(default)s)')
-    parser.add_argument('--start', type=int, default=0, metavar='N',
-                        help='first frame (default: %(default)s)')
-    parser.add_argument('--end', type=int, metavar='N',
-                        help='frame after the last one (default: all)')
-    parser.add_argument('--overwrite', action='store_true',
-                        help='replace an existing bag once the new one is complete')
-    return parser
+    add_frames(parser)
+    add_overwrite(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert, with a progress bar on stderr, and say what was written."""
     sequence = KittiSequence(args.sequence, args.poses, args.start, args.end)
-    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
-                  TimeRemainingColumn(), console=Console(stderr=True)) as bar:
-        task = bar.add_task(sequence.name, total=len(sequence))
+    with progress_bar(sequence.name, len(sequence)) as progress:
         write_kitti_bag(sequence, args.out, args.storage, overwrite=args.overwrite,
-                        progress=lambda written: bar.update(task, completed=written))
+                        progress=progress)
     seconds = (sequence.stamps_ns[-1] - sequence.stamps_ns[0]) / 1e9
     truth = 'with' if sequence.poses is not None else 'without'
     width, height = sequence.size

@@ -19,17 +19,14 @@ the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/odo
 {ENVIRONMENT}"""
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'live', help='the odometry on a ROS 2 graph, without ROS', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('--params', type=Path, metavar='FILE',
                         help='parameters as YAML, in the layout of ROS or plain')
     parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
                         help='a parameter, such as ros.queue_policy:=every, or '
                         'use_sim_time:=true; on top of the file; may be repeated')
     add_remappings(parser)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:

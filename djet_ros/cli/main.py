@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from importlib import import_module
 import os
 import sys
-from types import ModuleType
 from typing import NoReturn
 
 from djet_ros import __version__
@@ -17,22 +16,25 @@ from djet_ros.threads import one_blas_thread
 # Only the module of the command that is called gets imported: help is quick, and no command
 # needs the libraries of another.
 COMMANDS = {
-    'render': 'render a scene with exact ground truth as a KITTI sequence',
-    'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
     'replay': 'get the trajectory of a camera from a recording',
-    'export': 'write the pose graph of a replay for a SLAM backend',
     'live': 'the odometry on a ROS 2 graph, without ROS',
     'play': 'a recording onto a ROS 2 graph, without ROS',
     'echo': 'what a live odometry says, in the terminal',
     'slam': 'close loops offline and optimise the trajectory with GTSAM',
-    'bench': 'measure the speed, as ratios against OpenCV from one run',
-    'soak': 'run many frames through the odometry: does memory or latency grow?',
+    'export': 'write the pose graph of a replay for a SLAM backend',
+    'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
+    'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
+    'lab': 'measure and draw: errors, speed, memory, surfaces (djet lab --help)',
+}
+LAB = {
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
     'closure': 'how well the rotations of three frames agree: no ground truth needed',
+    'bench': 'measure the speed, as ratios against OpenCV from one run',
+    'soak': 'run many frames through the odometry: does memory or latency grow?',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",
     'surfaces': 'draw one match on its Hamming surface, round by round',
-    'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
+    'render': 'render a scene with exact ground truth as a KITTI sequence',
 }
 
 # Where a module and the distribution that brings it differ in name.
@@ -76,20 +78,46 @@ def run(argv: Sequence[str]) -> int:
     """Run one subcommand, letting its exceptions through."""
     parser = _Parser(prog='djet', description='Visual odometry by D-JET, from bags and datasets.')
     parser.add_argument('--version', action='version', version=f'djet_ros {__version__}')
-    subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
-    command = next((argument for argument in argv if not argument.startswith('-')), None)
-    for name, summary in COMMANDS.items():
-        if name == command:
-            _module(name).add_parser(subparsers)
-        else:
-            subparsers.add_parser(name, help=summary)
-    args = parser.parse_args(argv)
-    code: int = _module(str(command)).run(args)
+    words = _as_spelt_today(argv)
+    _add_commands(parser, COMMANDS, words)
+    args = parser.parse_args(words)
+    code: int = args.run(args)
     return code
 
 
-def _module(command: str) -> ModuleType:
-    return import_module('djet_ros.cli.' + command.replace('-', '_'))
+def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, str],
+                  words: Sequence[str], package: str = 'djet_ros.cli') -> None:
+    """Add all commands by name, and the arguments of the one that the words call."""
+    subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
+    place = _first_plain(words)
+    for name, summary in commands.items():
+        command = subparsers.add_parser(name, help=summary)
+        if place is None or words[place] != name:
+            continue
+        if name == 'lab':
+            command.description = 'Measure the odometry, and draw what goes on in it.'
+            _add_commands(command, LAB, words[place + 1:], f'{package}.lab')
+        else:
+            module = import_module(f"{package}.{name.replace('-', '_')}")
+            command.description = module.DESCRIPTION
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
+
+
+def _as_spelt_today(argv: Sequence[str]) -> list[str]:
+    """Put ``lab`` before its verbs, which stood at the first level in version 0.1, and say so."""
+    words, place = list(argv), _first_plain(argv)
+    if place is not None and words[place] in LAB:
+        verb = words[place]
+        print(f"djet: 'djet {verb}' is 'djet lab {verb}' now; the old spelling goes with the next "
+              'version', file=sys.stderr)
+        words.insert(place, 'lab')
+    return words
+
+
+def _first_plain(words: Sequence[str]) -> int | None:
+    """Where the first word stands that is no option."""
+    return next((i for i, word in enumerate(words) if not word.startswith('-')), None)
 
 
 def _how_to_install(error: ModuleNotFoundError) -> str:

@@ -6,9 +6,9 @@ import argparse
 import math
 from pathlib import Path
 import sys
-from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
+from djet_ros.cli.options import add_topics
 from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import open_recording
 
@@ -19,10 +19,8 @@ subscriber that asks for it, the player rather waits than loses an image; Camera
 {ENVIRONMENT}"""
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'play', help='a recording onto a ROS 2 graph, without ROS', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='BAG',
                         help='rosbag2, ROS 1 bag, or folder in KITTI, TUM RGB-D or EuRoC layout')
     parser.add_argument('--rate', type=float, default=1.0, metavar='R',
@@ -30,11 +28,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
     parser.add_argument('--clock', action='store_true',
                         help='publish the time of recording on /clock')
-    for what in ('image', 'info'):
-        parser.add_argument(f'--{what}-topic', metavar='TOPIC',
-                            help='needed where the bag has several')
+    add_topics(parser, 'image', 'info')
     add_remappings(parser)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:

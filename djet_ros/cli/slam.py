@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 from typing import Any
 
+from djet_ros.cli.options import add_output
+from djet_ros.cli.replay import add_replay_options, configured, replayed
+from djet_ros.cli.terminal import new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
-from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
@@ -22,10 +21,8 @@ from djet_ros.recordings.outputs import make_room
 from djet_ros.recordings.recording import open_recording, Recording
 from djet_ros.replay.graph_of_results import read_results
 from djet_ros.replay.ground_truth import GroundTruth
-from djet_ros.replay.replay import Replay
-from djet_ros.replay.results import ResultsFolder, SUMMARY as REPLAY_SUMMARY
+from djet_ros.replay.results import SUMMARY as REPLAY_SUMMARY
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -41,35 +38,22 @@ _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale
                  'odometry.scale_uncertainty')
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser: argparse.ArgumentParser = subparsers.add_parser('slam', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('input', type=Path, metavar='RESULTS_OR_RECORDING',
                         help="folder that 'djet replay' wrote, or what it can replay")
-    parser.add_argument('--output', type=Path, default=Path('slam'), metavar='DIR',
-                        help='folder of what is written (default: %(default)s)')
-    parser.add_argument('--overwrite', action='store_true',
-                        help='replace what an earlier run left in the output folder')
+    add_output(parser, 'folder of what is written', 'slam')
     parser.add_argument('--source', type=Path, metavar='RECORDING',
                         help='where the recording of RESULTS is now, if it was moved')
-    parser.add_argument('--poses', type=Path, metavar='FILE',
-                        help="ground truth instead of the recording's own")
-    for what in ('image', 'info', 'speed'):
-        parser.add_argument(f'--{what}-topic', metavar='TOPIC',
-                            help='needed where the bag has several')
-    parser.add_argument('--config', type=Path, metavar='FILE',
-                        help='parameters of the odometry as YAML; for a recording, as the next '
-                        'seven')
-    add_flags(parser, _REPLAY_FLAGS)
+    add_replay_options(parser, _REPLAY_FLAGS)
     add_flags(parser.add_argument_group('keyframes and loops'), PARAMETERS)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Run, with progress on stderr, and show what came of it."""
     given = flag_values(args)
     of_slam = {name: given.pop(name) for name in PARAMETERS if name in given}
-    config = with_values(load_yaml(args.config) if args.config else Config(), {**given, **of_slam})
+    config = configured(args)
     make_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
@@ -77,12 +61,15 @@ def run(args: argparse.Namespace) -> int:
             raise DjetError(f'{results} holds results, which have their parameters already; give '
                             'the recording itself, to replay it with others')
     else:
-        results = _replayed(args, config)
+        results = args.output / 'replay'
+        outcome = replayed(args, config, args.input, results)
+        if outcome.problem:
+            raise DjetError(outcome.problem)
     source, name = _source(results, args)
     try:
         config = with_values(load_yaml(results / 'config.yaml'), of_slam)
         frames = read_results(results)
-        with _bar('keyframes') as progress:
+        with progress_bar('keyframes') as progress:
             slam = run_slam(frames, source, config, progress, args.output)
         truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
     finally:
@@ -91,24 +78,6 @@ def run(args: argparse.Namespace) -> int:
     Console().print(_table(summary))
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
-
-
-def _replayed(args: argparse.Namespace, config: Config) -> Path:
-    """Replay the recording into the output folder, and give the folder of the results."""
-    source = open_recording(args.input, args.image_topic, args.info_topic, args.poses,
-                            speed=config.odometry.scale == 'speed',
-                            speed_topic=args.speed_topic)
-    path: Path = args.output / 'replay'
-    try:
-        with ResultsFolder(path, config, args.overwrite) as folder, _bar('replay') as progress:
-            done = count(1)
-            outcome = Replay(source, config, folder, str(args.input)).run(
-                lambda: progress(next(done), len(source)))
-    finally:
-        source.close()
-    if outcome.problem:
-        raise DjetError(outcome.problem)
-    return path
 
 
 def _source(results: Path, args: argparse.Namespace) -> tuple[Recording, str]:
@@ -124,19 +93,9 @@ def _source(results: Path, args: argparse.Namespace) -> tuple[Recording, str]:
     return open_recording(path, topic, args.info_topic, args.poses), summary['source']
 
 
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar; give the function that moves it, to (done, of how many)."""
-    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
-                  TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
 def _table(summary: dict[str, Any]) -> Table:
-    table = Table(title=f"{Path(summary['source']).name}: scale {summary['scale']}")
-    for heading in ('', 'before', 'after'):
-        table.add_column(heading, justify='right' if heading else 'left')
+    table = new_table(f"{Path(summary['source']).name}: scale {summary['scale']}", '', 'before',
+                      'after')
     table.add_row('keyframes', '', f"{summary['keyframes']} of {summary['frames']}")
     for kind, number in sorted(summary['edges'].items()):
         rejected = summary['rejected'].get(kind, 0)

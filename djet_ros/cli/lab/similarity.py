@@ -1,12 +1,11 @@
-"""``djet similarity``: the paper's Figure 1, for one image or between two."""
+"""``djet lab similarity``: the paper's Figure 1, for one image or between two."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite
+from djet_ros.cli.options import add_output, check_output
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -16,7 +15,6 @@ from djet_ros.lab.similarity import (
     read_image,
     self_similarity,
 )
-from djet_ros.recordings.outputs import check_file
 import numpy as np
 
 DESCRIPTION = """\
@@ -28,15 +26,12 @@ the second the Hamming distances as heat maps, with the fitted paraboloids and t
 _LARGEST_RADIUS = 100
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser('similarity', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('image', type=Path, metavar='IMAGE', help='PNG or JPEG')
     parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2',
                         help='second image of the same place (default: the first)')
-    parser.add_argument('--output', type=Path, default=Path('similarity.png'), metavar='FILE',
-                        help='PNG to write (default: %(default)s)')
-    add_overwrite(parser)
+    add_output(parser, 'PNG to write', 'similarity.png', 'FILE')
     parser.add_argument('--points', nargs='+', metavar='X,Y',
                         help='pixels in the first image (default: the strongest keypoints)')
     parser.add_argument('--count', type=int, default=6, metavar='N',
@@ -49,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
-    check_file(args.output, args.overwrite, '.png')
+    check_output(args, '.png')
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
     points = None if args.points is None else np.array([_point(text) for text in args.points])

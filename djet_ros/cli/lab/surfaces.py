@@ -1,13 +1,12 @@
-"""``djet surfaces``: one correspondence through the rounds of Algorithm 1."""
+"""``djet lab surfaces``: one correspondence through the rounds of Algorithm 1."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from djet_ros.cli.outputs import add_overwrite
+from djet_ros.cli.options import add_output, check_output
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
@@ -17,7 +16,6 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.sequences import pair_of_frames
 from djet_ros.lab.similarity import read_image
 from djet_ros.lab.surface_steps import animate_course, draw_course, follow, telling_match
-from djet_ros.recordings.outputs import check_file
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,15 +25,12 @@ paraboloid and its minimum, the epipolar line of the pose, and the optimum on it
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser('surfaces', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE',
                         help='a sequence or a bag, or the first of two images')
     parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2', help='the second image')
-    parser.add_argument('--output', type=Path, default=Path('surfaces.png'), metavar='FILE',
-                        help='PNG, or GIF for an animation (default: %(default)s)')
-    add_overwrite(parser)
+    add_output(parser, 'PNG, or GIF for an animation', 'surfaces.png', 'FILE')
     parser.add_argument('--camera', metavar='FX,FY,CX,CY',
                         help='camera of two images, in pixels')
     parser.add_argument('--pair', type=int, default=0, metavar='I',
@@ -50,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
-    check_file(args.output, args.overwrite, '.png', '.gif')
+    check_output(args, '.png', '.gif')
     draw = draw_course if args.output.suffix.lower() == '.png' else animate_course
     config = from_flat(flag_values(args)).estimator
     first, second, K = _images(args)

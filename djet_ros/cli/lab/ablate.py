@@ -1,21 +1,14 @@
-"""``djet ablate``: the paper's Table 2, and what each part of D-JET contributes."""
+"""``djet lab ablate``: the paper's Table 2, and what each part of D-JET contributes."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from djet_ros.cli.pair_runs import (
-    add_run_arguments,
-    evaluated,
-    print_table,
-    shared_values,
-    split,
-)
+from djet_ros.cli.lab.pair_runs import add_run_arguments, evaluated, shared_values, show
+from djet_ros.cli.options import split
 from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.ablation_report import write_ablation
-from rich.console import Console
 
 DESCRIPTION = """\
 Estimate the relative pose of all neighbouring frames by D-JET as a preset has it, and with one
@@ -25,9 +18,8 @@ ended.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser('ablate', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     add_run_arguments(parser)
     parser.add_argument('--windows', default='3,5,7,15', metavar='LIST',
                         help='sides of the sampling area in pixels, odd (default: %(default)s)')
@@ -45,10 +37,7 @@ def run(args: argparse.Namespace) -> int:
                                  shared_values(args), good_start=args.good_start)
     with evaluated(args, competing) as (datasets, records):
         tables = write_ablation(args.output, datasets, competing, records)
-    console = Console()
-    for table in tables:
-        print_table(console, table)
-    console.print(f'page: {args.output / "index.html"}', soft_wrap=True)
+    show(tables, args.output)
     return 0
 
 

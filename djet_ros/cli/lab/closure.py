@@ -1,4 +1,4 @@
-"""``djet closure``: how well the rotations of three frames agree, without ground truth."""
+"""``djet lab closure``: how well the rotations of three frames agree, without ground truth."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.outputs import add_json_output, write_json
-from djet_ros.cli.pair_runs import split
+from djet_ros.cli.options import add_json_output, check_output, split, write_json
+from djet_ros.cli.terminal import new_table, progress_bar
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.methods import check_names, TITLES
 from djet_ros.lab.sequences import plain_name, readable_frames
-from djet_ros.recordings.outputs import check_file
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 # The 5-point method has no covariance of its own worth the name, and no surfaces.
@@ -32,49 +30,43 @@ them.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser('closure', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE', help='a sequence or a bag')
     parser.add_argument('--methods', default=','.join(CHOICES), metavar='LIST',
                         help='(default: %(default)s)')
     parser.add_argument('--frames', type=int, default=150, metavar='N',
                         help='how many frames to use, from the first (default: %(default)s)')
-    add_json_output(parser, 'triangles')
+    add_json_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Estimate the triangles, write and show them."""
-    check_file(args.output, args.overwrite)
+    check_output(args)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
     methods, name = split(args.methods), plain_name(args.source)
     check_names('method', methods, CHOICES)
     with TemporaryDirectory() as workspace:
         sequence = readable_frames(args.source, Path(workspace))
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        with Progress(console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task('triangles', total=max(min(args.frames, len(sequence)) - 2, 1))
-            found = closures(sequence, methods, args.frames,
-                             lambda done: bar.update(task, completed=done))
+        with progress_bar('triangles', max(min(args.frames, len(sequence)) - 2, 1)) as progress:
+            found = closures(sequence, methods, args.frames, progress)
     summaries = {method: summary(triangles) for method, triangles in found.items()}
-    plot = write_json(args.output, {
-        'source': name, 'summary': summaries,
-        'triangles': {method: [triangle and asdict(triangle) for triangle in triangles]
-                      for method, triangles in found.items()}})
-    draw(found, name, plot)
     Console().print(_table(name, summaries))
     print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '
           'average if true;\noff truth: error of single rotations, median, where there is ground '
           'truth')
-    print(f'triangles: {args.output}\nplot: {plot}')
+    write_json(args.output, {
+        'source': name, 'summary': summaries,
+        'triangles': {method: [triangle and asdict(triangle) for triangle in triangles]
+                      for method, triangles in found.items()}},
+               lambda plot: draw(found, name, plot))
     return 0
 
 
 def _table(title: str, summaries: dict[str, dict[str, Any]]) -> Table:
-    table = Table(title=f'{title}: rotation left by three frames, deg')
-    for heading in ('', 'median', '95 %', 'claimed', 'square (3)', 'triangles', 'off truth'):
-        table.add_column(heading, justify='right' if heading else 'left')
+    table = new_table(f'{title}: rotation left by three frames, deg', '', 'median', '95 %',
+                      'claimed', 'square (3)', 'triangles', 'off truth')
     for method, one in summaries.items():
         table.add_row(
             TITLES[method], f"{one['median_deg']:.4f}", f"{one['p95_deg']:.4f}",

@@ -1,21 +1,14 @@
-"""``djet evaluate``: the paper's Table 1 on any sequences with ground truth."""
+"""``djet lab evaluate``: the paper's Table 1 on any sequences with ground truth."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from djet_ros.cli.pair_runs import (
-    add_run_arguments,
-    evaluated,
-    print_table,
-    shared_values,
-    split,
-)
+from djet_ros.cli.lab.pair_runs import add_run_arguments, evaluated, shared_values, show
+from djet_ros.cli.options import split
 from djet_ros.lab.evo import find_tool
 from djet_ros.lab.methods import default_methods, make_methods, TITLES
 from djet_ros.lab.report import write_report
-from rich.console import Console
 
 DESCRIPTION = """\
 Estimate the relative pose of all neighbouring frames by several methods on the same matches,
@@ -24,9 +17,8 @@ was broken off is taken up where it ended.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser('evaluate', description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     add_run_arguments(parser)
     parser.add_argument('--methods', metavar='LIST',
                         help=f'of {", ".join(TITLES)} (default: all that are installed)')
@@ -42,8 +34,5 @@ def run(args: argparse.Namespace) -> int:
         find_tool('evo_ape')
     with evaluated(args, competing) as (datasets, records):
         tables = write_report(args.output, datasets, competing, records, with_evo=args.evo)
-    console = Console()
-    for table in tables:
-        print_table(console, table)
-    console.print(f'page: {args.output / "index.html"}', soft_wrap=True)
+    show(tables, args.output)
     return 0

@@ -1,10 +1,9 @@
-"""What ``djet evaluate`` and ``djet ablate`` share: arguments, workers, progress, tables."""
+"""What the commands share that estimate pairs: arguments, workers, progress, tables."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 import os
@@ -12,6 +11,8 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+from djet_ros.cli.options import add_frames, add_output
+from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.core.estimator_config import PRESETS
 from djet_ros.errors import DjetError
@@ -23,7 +24,6 @@ from djet_ros.lab.store import RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -37,14 +37,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('sources', nargs='+', type=Path, metavar='SOURCE',
                         help='a KITTI sequence or a folder of them, a bag with ground truth, or a '
                         'folder of TUM RGB-D, EuRoC or VAROS')
-    parser.add_argument('--output', type=Path, required=True, metavar='DIR',
-                        help='folder of the results')
+    add_output(parser, 'folder of the results')
     parser.add_argument('--presets', metavar='LIST', default=','.join(PRESETS),
                         help='parameters to run with (default: %(default)s)')
-    parser.add_argument('--start', type=int, default=0, metavar='N',
-                        help='first frame (default: %(default)s)')
-    parser.add_argument('--end', type=int, metavar='N',
-                        help='frame after the last one (default: all)')
+    add_frames(parser)
     parser.add_argument('--stride', type=int, default=1, metavar='N',
                         help='frames from one to the other of a pair (default: %(default)s)')
     workers = parser.add_mutually_exclusive_group()
@@ -53,14 +49,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     workers.add_argument('--scheduler', metavar='ADDRESS',
                          help='Dask scheduler that spreads the work instead, such as '
                          'tcp://host:8786')
-    parser.add_argument('--overwrite', action='store_true',
-                        help='begin anew where the folder has results of other settings')
     add_flags(parser, SHARED_PARAMETERS)
-
-
-def split(text: str) -> list[str]:
-    """Give the words of a comma-separated list."""
-    return [word.strip() for word in text.split(',') if word.strip()]
 
 
 def shared_values(args: argparse.Namespace) -> dict[str, Any]:
@@ -81,14 +70,24 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
         datasets = open_datasets(args.sources, selection, workspace)
         args.output.mkdir(parents=True, exist_ok=True)
         with RecordStore(args.output, datasets, competing, overwrite=args.overwrite) as store:
-            with _workers(args) as executor, _progress() as progress:
+            workers = (dask_workers(args.scheduler) if args.scheduler
+                       else local_workers(args.workers))
+            with workers as executor, progress_bar('pairs') as progress:
                 records = run(executor, datasets, competing, store, progress)
         yield datasets, records
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
 
 
-def print_table(console: Console, table: ReadableTable) -> None:
+def show(tables: Sequence[ReadableTable], folder: Path) -> None:
+    """Print the tables, and where the page is that has them too."""
+    console = Console()
+    for table in tables:
+        _print(console, table)
+    console.print(f'page: {folder / "index.html"}', soft_wrap=True)
+
+
+def _print(console: Console, table: ReadableTable) -> None:
     """Print a table section by section; figures that are not ours are dim."""
     for section, lines in groupby(table.lines, lambda line: line.cells[:table.sections]):
         printed = Table(title=', '.join(section), title_justify='left', box=SIMPLE_HEAD,
@@ -102,17 +101,3 @@ def print_table(console: Console, table: ReadableTable) -> None:
             printed.add_row(*cells[table.sections:], style='dim' if line.foreign else '')
         console.print(printed)
     console.print(Text(table.caption, 'italic'))
-
-
-@contextmanager
-def _workers(args: argparse.Namespace) -> Iterator[Executor]:
-    with dask_workers(args.scheduler) if args.scheduler else local_workers(args.workers) as pool:
-        yield pool
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
-                  TimeRemainingColumn(), console=Console(stderr=True)) as bar:
-        task = bar.add_task('pairs', total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

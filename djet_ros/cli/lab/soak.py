@@ -1,4 +1,4 @@
-"""``djet soak``: memory and latency over many frames."""
+"""``djet lab soak``: memory and latency over many frames."""
 
 from __future__ import annotations
 
@@ -6,44 +6,40 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.outputs import add_json_output, write_json
+from djet_ros.cli.options import add_json_output, check_output, write_json
+from djet_ros.cli.terminal import progress_bar
 from djet_ros.lab.soak import SIZE, soak
-from djet_ros.recordings.outputs import check_file
-from rich.console import Console
+
+DESCRIPTION = f"""\
+Run many rendered frames of {SIZE[0]}x{SIZE[1]} through the odometry, black ones, gaps and steps
+back in time among them, and record memory and latency. Writes the figures as JSON and a plot
+beside them. The exit code is 1 if memory grows beyond the bound.
+"""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the subcommand to the subparsers of ``djet``."""
-    parser = subparsers.add_parser(
-        'soak', description=f'Run many rendered frames of {SIZE[0]}x{SIZE[1]} through the '
-        'odometry, black ones, gaps and steps back in time among them, and record memory and '
-        'latency. Writes the figures as JSON and a plot beside them. The exit code is 1 if '
-        'memory grows beyond the bound.')
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument('--frames', type=int, default=20_000, metavar='N',
                         help='frames to process (default: %(default)s)')
     parser.add_argument('--max-growth', type=float, default=10.0, metavar='MB',
                         help='resident memory that may come on top of what a fifth of the frames '
                         'took (default: %(default)s)')
-    add_json_output(parser, 'figures')
+    add_json_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Soak, write and show the figures."""
-    check_file(args.output, args.overwrite)
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    with Console(stderr=True).status('soaking ...') as status:
-        figures = soak(args.frames, args.max_growth, lambda done: status.update(
-            f'soaking: {done} of {args.frames} frames ...'))
-    plot = write_json(args.output, figures)
-    draw(figures, plot)
+    check_output(args)
+    with progress_bar('frames', args.frames) as progress:
+        figures = soak(args.frames, args.max_growth, progress)
     latency = figures['latency_ms']
     print(f"{figures['frames']} frames in {figures['seconds']:.0f} s; latency p50 "
           f"{latency['p50_ms']:.1f}, p95 {latency['p95_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
           f"largest {latency['max_ms']:.1f} ms\n"
           f"memory {figures['memory_mb']:.1f} MB, grown by {figures['growth_mb']:.1f} MB "
           f"({figures['most_growth_mb']:g} MB are allowed): "
-          f"{'held' if figures['held'] else 'NOT HELD'}\n"
-          f'figures: {args.output}\nplot: {plot}')
+          f"{'held' if figures['held'] else 'NOT HELD'}")
+    write_json(args.output, figures, lambda plot: draw(figures, plot))
     return 0 if figures['held'] else 1
 
 

@@ -1,26 +1,27 @@
-"""``djet render``: a rendered scene with exact ground truth, in the layout of KITTI."""
+"""``djet lab render``: a rendered scene with exact ground truth, in the layout of KITTI."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 import re
-from typing import Any
 
+from djet_ros.cli.options import add_overwrite
+from djet_ros.cli.terminal import progress_bar
 from djet_ros.lab.scenes import render_sequence, SCENES
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+DESCRIPTION = """\
+Render images, calibration, times and true camera poses into OUT, in the layout of the KITTI
+odometry benchmark.
+"""
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand to the subparsers of ``djet``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     longest = max(map(len, SCENES))
     scenes = '\n'.join(f'  {name:{longest}}  {entry.text}' for name, entry in SCENES.items())
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'render', help='render a scene with exact ground truth as a KITTI sequence',
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Render images, calibration, times and true camera poses into OUT, in the\n'
-                    'layout of the KITTI odometry benchmark.', epilog=f'scenes:\n{scenes}')
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = f'scenes:\n{scenes}'
     parser.add_argument('scene', metavar='SCENE', choices=tuple(SCENES), help='see below')
     parser.add_argument('out', type=Path, metavar='OUT',
                         help='folder that gets sequences/NN and poses/NN.txt')
@@ -31,19 +32,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument('--size', type=_size, metavar='WxH',
                         help='pixels of a picture (default: 1241x376, as KITTI has, and 960x540 '
                              'under water)')
-    parser.add_argument('--overwrite', action='store_true', help='replace an earlier rendering')
-    return parser
+    add_overwrite(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Render, with a progress bar on stderr, and say what was written."""
-    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
-                  TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(args.scene, total=None)
-        folder = render_sequence(
-            args.scene, args.out, args.frames, args.seed, args.size, overwrite=args.overwrite,
-            progress=lambda done, total: bar.update(task, completed=done, total=total))
-        frames = int(bar.tasks[task].completed)
+    with progress_bar(args.scene) as progress:
+        folder = render_sequence(args.scene, args.out, args.frames, args.seed, args.size,
+                                 progress, overwrite=args.overwrite)
+    frames = len(list((folder / 'image_0').iterdir()))
     width, height = args.size or SCENES[args.scene].size
     print(f'{folder}: {frames} frames of {width}x{height} with ground truth')
     return 0

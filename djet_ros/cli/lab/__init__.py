@@ -1,0 +1,1 @@
+"""The ``djet lab`` command: one module per verb."""

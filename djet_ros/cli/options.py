@@ -1,0 +1,65 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import json
+from pathlib import Path
+from typing import Any
+
+from djet_ros.recordings.outputs import check_file, write_whole
+
+
+def add_output(parser: argparse.ArgumentParser, what: str, default: str | None = None,
+               metavar: str = 'DIR') -> None:
+    """Add --output, required unless there is a default, and --overwrite."""
+    parser.add_argument('--output', type=Path, metavar=metavar, required=default is None,
+                        default=default and Path(default),
+                        help=what + (' (default: %(default)s)' if default else ''))
+    add_overwrite(parser)
+
+
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """Add the flag without which nothing is replaced."""
+    parser.add_argument('--overwrite', action='store_true',
+                        help='replace what an earlier run has written there')
+
+
+def add_json_output(parser: argparse.ArgumentParser) -> None:
+    """Add --output for a JSON file of figures, which a plot lies beside, and --overwrite."""
+    add_output(parser, 'where the figures go; the plot goes to FILE.png', metavar='FILE.json')
+
+
+def check_output(args: argparse.Namespace, *suffixes: str) -> None:
+    """Raise DjetError where --output can't be the file that is wanted; make its folder."""
+    check_file(args.output, args.overwrite, *suffixes)
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+
+
+def write_json(path: Path, figures: dict[str, Any], draw: Callable[[Path], None]) -> None:
+    """Write figures as JSON, draw the plot beside them, and say where both are."""
+    write_whole(path, json.dumps(figures, indent=2) + '\n')
+    plot = path.with_suffix('.png')
+    draw(plot)
+    print(f'figures: {path}\nplot: {plot}')
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add --start and --end."""
+    parser.add_argument('--start', type=int, default=0, metavar='N',
+                        help='first frame (default: %(default)s)')
+    parser.add_argument('--end', type=int, metavar='N',
+                        help='frame after the last one (default: all)')
+
+
+def add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add --image-topic and the like."""
+    for name in names:
+        parser.add_argument(f'--{name}-topic', metavar='TOPIC',
+                            help='needed where the bag has several')
+
+
+def split(text: str) -> list[str]:
+    """Give the words of a comma-separated list."""
+    return [word.strip() for word in text.split(',') if word.strip()]

@@ -1,0 +1,63 @@
+"""What commands show in a terminal while they work and in the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+
+class _Rate(ProgressColumn):
+    """Steps per second so far."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f'{task.speed or 0:.1f}/s')
+
+
+@contextmanager
+def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """
+    Show a bar on stderr, if that is a terminal; give the function that moves it.
+
+    That goes on by one without arguments, else to (done) or (done, of how many).
+    """
+    console = Console(stderr=True)
+    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), _Rate(),
+                  TimeRemainingColumn(), console=console, transient=True,
+                  disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=total)
+
+        def move(done: int | None = None, total: int | None = None) -> None:
+            if done is None:
+                bar.advance(task)
+            else:
+                bar.update(task, completed=done, total=total)
+
+        yield move
+
+
+def new_table(title: str, *headings: str) -> Table:
+    """Give a table with a column of names and others of figures; two without headings."""
+    table = Table(title=title, show_header=bool(headings))
+    for index, heading in enumerate(headings or ('', '')):
+        table.add_column(heading, justify='right' if index else 'left')
+    return table
+
+
+def spread(statistics: dict[str, float] | None) -> str:
+    """Statistics of errors as ``mean / median / p95 / max``."""
+    if statistics is None:
+        return 'none'
+    return ' / '.join(f'{statistics[name]:.3f}' for name in ('mean', 'median', 'p95', 'max'))
