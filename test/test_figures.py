@@ -74,14 +74,14 @@ def test_rounds_end_where_the_estimator_ends(road):
         estimator = TwoViewEstimator(preset(name))
         views = [estimator.view(sequence.image(i), sequence.K) for i in (0, 1)]
         x, y = estimator.match(*views)
-        course = follow(*views, x, y, estimator.config)
+        trace = follow(*views, x, y, estimator.config)
         result = estimator.estimate_matched(*views, x, y)
-        assert len(course.rounds) == result.iterations
-        assert np.allclose(course.rounds[-1].optima, result.y_opt)
-        assert np.array_equal(course.inliers, result.inliers)
+        assert len(trace.rounds) == result.iterations
+        assert np.array_equal(trace.rounds[-1].optimum, result.y_opt)
+        assert np.array_equal(trace.result.inliers, result.inliers)
         # The chosen match has moved, but stays in what is shown.
-        match = telling_match(course, estimator.config.window)
-        assert 0 < np.linalg.norm(course.rounds[-1].optima[match] - course.y[match]) < RADIUS
+        match = telling_match(trace)
+        assert 0 < np.linalg.norm(trace.rounds[-1].optimum[match] - trace.y[match]) < RADIUS
 
 
 def test_figures_are_drawn_in_the_size_of_what_they_show(road, tmp_path, capsys):

@@ -27,7 +27,7 @@ from djet_ros.core.surfaces import (
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.tracking import hold, Track, track_jointly
+from djet_ros.core.tracking import hold, Observer, Track, track_jointly
 from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
@@ -82,8 +82,13 @@ class TwoViewEstimator:
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None,
-                         timings: dict[str, float] | None = None) -> RelativePose:
-        """Estimate from given matches x, y (N, 2) in pixels of the two views."""
+                         timings: dict[str, float] | None = None,
+                         observe: Observer | None = None) -> RelativePose:
+        """
+        Estimate from given matches x, y (N, 2) in pixels of the two views.
+
+        timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1.
+        """
         timings = {} if timings is None else timings
         config, K = self.config, current.K
         if len(x) < config.min_matches:
@@ -108,7 +113,7 @@ class TwoViewEstimator:
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
-                     else track_jointly(surface, K, y, starts, config, before))
+                     else track_jointly(surface, K, y, starts, config, before, observe))
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
         with _timed(timings, 'result'):

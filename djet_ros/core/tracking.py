@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -99,14 +100,35 @@ class Track:
         return inliers
 
 
+@dataclass(frozen=True)
+class Round:
+    """
+    One round of Algorithm 1 on N matches, as an observer is shown it.
+
+    keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
+    warp: (N, 2, 2) through which the reference patches were seen, None where they were not warped;
+    pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
+    """
+
+    keypoints: Array
+    fits: Paraboloids
+    warp: Array | None
+    pose: Pose
+    optimum: Array
+
+
+Observer = Callable[[Round], None]
+
+
 def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-                  config: EstimatorConfig, prior: Pose | None = None) -> Track | None:
+                  config: EstimatorConfig, prior: Pose | None = None,
+                  observe: Observer | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
     on; of those that cost the same the one next to the prior, the previous motion. None where too
-    few matches have a usable surface.
+    few matches have a usable surface. observe: is called at the end of each round.
     """
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     alive = np.ones(len(y), bool)
@@ -114,8 +136,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     plausible = np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
-        paraboloids, no_minimum = with_minimum(
-            surface.around(keypoints, warp), config.indefinite)
+        fits = surface.around(keypoints, warp)
+        paraboloids, no_minimum = with_minimum(fits, config.indefinite)
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive &= paraboloids.usable
         voting = alive & plausible & (
@@ -130,6 +152,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
         # Keypoints go towards their optimum on the epipolar line of the new pose.
         optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
         losses[alive] = paraboloids.values(optimum)[alive]
+        if observe is not None:
+            observe(Round(keypoints, fits, warp, pose, optimum))
         converged = len(poses) == 1 and _change(poses[0], pose) < config.epsilon
         poses = [pose]
         if converged or iteration == config.max_iterations:

@@ -15,7 +15,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.sequences import pair_of_frames
 from djet_ros.lab.similarity import read_image
-from djet_ros.lab.surface_steps import animate_course, draw_course, follow, telling_match
+from djet_ros.lab.surface_steps import animate_trace, draw_trace, follow, telling_match
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and say where it is."""
     check_output(args, '.png', '.gif')
-    draw = draw_course if args.output.suffix.lower() == '.png' else animate_course
+    draw = draw_trace if args.output.suffix.lower() == '.png' else animate_trace
     config = from_flat(flag_values(args)).estimator
     first, second, K = _images(args)
     estimator = TwoViewEstimator(config)
@@ -54,10 +54,10 @@ def run(args: argparse.Namespace) -> int:
     x, y = estimator.match(previous, current)
     if len(x) < config.min_matches:
         raise DjetError(f'the two images have {len(x)} matches, {config.min_matches} are needed')
-    course = follow(previous, current, x, y, config)
-    match = telling_match(course, config.window) if args.match is None else args.match
-    draw(args.output, course, match, config.window)
-    print(f'match {match} of {len(course.y)}, {len(course.rounds)} rounds')
+    trace = follow(previous, current, x, y, config)
+    match = telling_match(trace) if args.match is None else args.match
+    draw(args.output, trace, match)
+    print(f'match {match} of {len(trace.y)}, {len(trace.rounds)} rounds')
     print(f'figure: {args.output}')
     return 0
 
