@@ -8,6 +8,8 @@ import subprocess
 import sys
 
 from djet_ros.lab.scenes.sequence import render_sequence
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.kitti import KittiSequence
 import pytest
 
 
@@ -34,6 +36,18 @@ def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(sequenc
         assert figures[name] > 0, name
     assert figures['pairs'] == figures['all_cores']['pairs'] == 2
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, tmp_path):
+    write_kitti_bag(KittiSequence(sequence), tmp_path / 'bag')
+    for name, source in (('folder', sequence), ('bag', tmp_path / 'bag')):
+        run = bench(source, '--output', tmp_path / f'{name}.json', '--pairs', 1)
+        assert run.returncode == 0, run.stderr
+    folder, bag = (json.loads((tmp_path / f'{name}.json').read_text())
+                   for name in ('folder', 'bag'))
+    assert bag.keys() == folder.keys()
+    assert bag['bytes_per_frame'] == folder['bytes_per_frame']
+    assert bag['djet_ms_by_points'].keys() == folder['djet_ms_by_points'].keys()
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [

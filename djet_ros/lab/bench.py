@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, smooth
+from djet_ros.core.hamming import smooth
 from djet_ros.core.orb_pattern import REACH
+from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
-from djet_ros.recordings.bags import is_bag
-from djet_ros.recordings.datasets import open_sequence
+from djet_ros.lab.sequences import readable_frames
 from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +38,22 @@ _REPEATS = 7
 def bench(source: Path, pairs: int,
           progress: Callable[[str], None] = lambda stage: None) -> dict[str, Any]:
     """
-    Measure the first pairs of a sequence with one thread, then with all that OpenCV takes.
+    Measure the first pairs of a recording with one thread, then with all that OpenCV takes.
 
     Gives the figures of the single-threaded run, and those of the other under 'all_cores'.
-    Raises DjetError where the source is no sequence of at least two frames.
+    The frames of a bag are unpacked first, so that decoding one costs what it does in a folder.
+    Raises DjetError where the source is no recording of at least two frames.
     """
-    sequence = _open(source)
-    progress('one thread')
-    cv2.setNumThreads(1)
-    figures = measure(sequence, pairs)
-    progress('all cores')
-    cv2.setNumThreads(-1)
-    figures['all_cores'] = measure_pipeline(sequence, pairs)
+    with TemporaryDirectory(prefix='djet-') as workspace:
+        sequence = readable_frames(source, Path(workspace))
+        if len(sequence) < 2:
+            raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
+        progress('one thread')
+        cv2.setNumThreads(1)
+        figures = measure(sequence, pairs)
+        progress('all cores')
+        cv2.setNumThreads(-1)
+        figures['all_cores'] = measure_pipeline(sequence, pairs)
     return figures
 
 
@@ -57,12 +62,12 @@ def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     figures = measure_pipeline(sequence, pairs)
     previous, current, x, y = _crowded_pair(sequence)
     figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
-    by_points = {n: _stage_ms(previous, current, x[:n], y[:n], 'best')
+    by_points = {n: _stage_ms(previous, current, x[:n], y[:n])
                  for n in POINTS if n <= len(x)}
     figures['djet_ms_by_points'] = by_points
     figures['djet_stage_ms'] = by_points.get(QUOTED_POINTS, float('nan'))
     figures['djet_ms_by_window'] = {
-        w: _stage_ms(previous, current, x[:QUOTED_POINTS], y[:QUOTED_POINTS], 'best', window=w)
+        w: _stage_ms(previous, current, x[:QUOTED_POINTS], y[:QUOTED_POINTS], window=w)
         for w in WINDOWS}
     figures['bytes_per_frame'] = view_bytes(_estimator().view(sequence.image(0), sequence.K))
     return figures
@@ -133,11 +138,12 @@ class _PlainChain:
 
 def kernel_speedup(view: View) -> float:
     """
-    Time per dense descriptor of cv2.ORB.compute over that of our Hamming surfaces (7x7).
+    Time of cv2.ORB.compute over that of our surfaces, as preset best has them, on as many pixels.
 
-    OpenCV's side includes the list of keypoints that it needs, ours the counting of the bits.
+    OpenCV's side includes the list of keypoints that it needs, ours the distances themselves.
     """
-    radius = 3
+    config = preset('best')
+    distances, radius = DescriptorDistances(config), config.window // 2
     height, width = view.gray.shape
     rng = np.random.default_rng(0)
     border = REACH + radius + 20
@@ -153,7 +159,7 @@ def kernel_speedup(view: View) -> float:
 
     def ours() -> None:
         smoothed = smooth(view.gray)
-        hamming_surfaces(descriptor_bits(smoothed, points), smoothed, points, radius)
+        distances.surfaces(distances.reference(smoothed, points), smoothed, points, radius)
 
     return _fastest(opencv) / _fastest(ours)
 
@@ -180,10 +186,9 @@ def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
     return previous, current, x[order], y[order]
 
 
-def _stage_ms(previous: View, current: View, x: Array, y: Array, name: str,
-              **changes: Any) -> float:
+def _stage_ms(previous: View, current: View, x: Array, y: Array, **changes: Any) -> float:
     """Least time in ms of surfaces and optimisation together, on given matches."""
-    estimator = TwoViewEstimator(preset(name, **changes))
+    estimator = _estimator(**changes)
     runs: list[dict[str, float]] = [{} for _ in range(_REPEATS)]
     for timings in runs:
         estimator.estimate_matched(previous, current, x, y, timings=timings)
@@ -197,12 +202,3 @@ def _fastest(action: Callable[[], None]) -> float:
         action()
         times.append(perf_counter() - start)
     return min(times)
-
-
-def _open(source: Path) -> FrameSequence:
-    if is_bag(source):
-        raise DjetError(f'{source} is a bag; the bench reads image files, give a sequence folder')
-    sequence = open_sequence(source)
-    if len(sequence) < 2:
-        raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
-    return sequence
