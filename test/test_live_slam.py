@@ -45,7 +45,7 @@ class Odometry:
         return OdometryResult(
             self.stamp, 'camera', status, self.stamp - PERIOD, None, motion, self.here @ motion,
             covariance, compose(self.here, self.covariance, motion, covariance), 1.0, True,
-            standing)
+            standing, None if status is Status.FIRST_FRAME else self.stamp - PERIOD)
 
     def start(self):
         """Give the Odometry of a first frame, here."""

@@ -46,7 +46,8 @@ def a_result(seed=0, **changes):
     pose[:3, :3], pose[:3, 3] = rotation_exp(rng.normal(size=3)), rng.normal(size=3) * 9
     fields = {
         'stamp_ns': STAMP, 'frame_id': 'cam_optical_frame', 'status': Status.OK,
-        'previous_stamp_ns': STAMP - 250_000_000, 'relative': relative, 'motion': motion,
+        'previous_stamp_ns': STAMP - 250_000_000,
+        'since_ns': STAMP - 250_000_000, 'relative': relative, 'motion': motion,
         'pose': pose, 'motion_covariance': covariance(rng, 0.1),
         'pose_covariance': covariance(rng, 0.2), 'scale': 0.7, 'scale_known': True}
     return OdometryResult(**{**fields, **changes})
@@ -67,7 +68,7 @@ def test_every_message_is_taken_by_the_classes_and_goes_to_the_wire(family):
     picture = np.zeros((4, 6, 3), np.uint8)
     for message in (
             make.relative_pose(result), make.relative_pose_cov(result), make.odometry(result),
-            make.odometry(a_result(previous_stamp_ns=None)), make.transform(result),
+            make.odometry(a_result(since_ns=None)), make.transform(result),
             make.path([make.pose_stamped(result)] * 2),
             make.diagnostics(STAMP, 'WARN', 'summary', {'rate (Hz)': '9.9'}),
             make.picture(STAMP, 'camera', picture)):
@@ -147,7 +148,7 @@ def test_odometry_has_the_pose_in_the_odom_frame_and_the_twist_in_the_camera(fam
 
 
 def test_no_covariance_is_zero_infinite_or_absurd(family):
-    first = a_result(previous_stamp_ns=None, pose_covariance=np.zeros((6, 6)))
+    first = a_result(since_ns=None, pose_covariance=np.zeros((6, 6)))
     message = Messages(family[0], OdometryConfig()).odometry(first)
     for values in (message.pose.covariance, message.twist.covariance):
         diagonal = np.diag(np.reshape(values, (6, 6)))

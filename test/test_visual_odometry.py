@@ -7,6 +7,7 @@ from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.messages import twist
 from djet_ros.odometry.scale import (
     ConstantScale,
     GroundTruthScale,
@@ -102,6 +103,32 @@ def test_a_camera_that_stands_still_has_no_motion_and_keeps_its_reference(cards)
     moved = vo.process(cards.frame(0.4, STEP))
     assert moved.status is Status.OK
     assert moved.previous_stamp_ns == first.stamp_ns
+
+
+def test_the_velocity_after_a_standstill_is_that_of_the_motion_and_not_of_the_wait(cards):
+    scale, step = SpeedScale(), pose(x=0.25)
+    for i in range(-1, 60):
+        # 0.25 m from frame to frame once it drives off
+        scale.add(i * 100_000_000, 0.0 if i < 30 else 2.5)
+    results = drive(odometry(scale), cards, [np.eye(4)] * 31 + [step] * 2)
+    assert all(result.standing for result in results[1:31])
+    # as soon as it stands, it is known to: within 0.3 m/s, and no surer the longer it waits
+    for result in results[1:31]:
+        velocity, covariance = twist(result)
+        assert not velocity.any()
+        assert 1e-3 < np.sqrt(covariance[0, 0]) < 0.3
+    for result in results[31:]:
+        velocity, covariance = twist(result)
+        sigma = np.sqrt(covariance[0, 0])
+        assert abs(velocity[0] - 2.5) < 4 * sigma
+        assert sigma < 1.0
+
+
+def test_the_velocity_across_a_bad_frame_is_the_mean_over_both_steps(cards):
+    bridged = drive(odometry(ConstantScale(0.5)), cards,
+                    [np.eye(4), pose(x=0.25), None, pose(x=0.5)])[-1]
+    velocity, _ = twist(bridged)
+    assert velocity[0] == pytest.approx(0.5 / 0.2, rel=0.02)
 
 
 @pytest.mark.parametrize('method', ['djet', 'pjet', 'rpe', 'five_point'])

@@ -17,8 +17,8 @@ from typing import Any
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
-from djet_ros.odometry.uncertainty import rotated
-from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.odometry.uncertainty import compose, rotated
+from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -249,16 +249,20 @@ def twist(result: OdometryResult) -> tuple[Array, Array]:
     """
     Mean velocity (6,) of a pair along the current camera's axes, and its covariance (6, 6).
 
-    Linear in metres (or units) per second, angular in radians per second. Without a pair the
-    velocity is zero and nothing is known about it: the covariance is huge.
+    Linear in metres (or units) per second, angular in radians per second; the mean over the time
+    in which the motion came about, which begins where a standstill ends. Without a pair, or where
+    its motion could not be told, the velocity is zero and nothing is known about it: the
+    covariance is huge.
     """
-    if result.previous_stamp_ns is None:
+    if result.since_ns is None or result.status not in TRACKED:
         return twist_of_nothing()
-    seconds = (result.stamp_ns - result.previous_stamp_ns) * 1e-9
+    seconds = (result.stamp_ns - result.since_ns) * 1e-9
     R = result.motion[:3, :3]
     velocity = np.concatenate([R.T @ result.motion[:3, 3],
                                Rotation.from_matrix(R).as_rotvec()]) / seconds
-    return velocity, rotated(R.T, result.motion_covariance) / seconds**2
+    covariance = compose(np.eye(4), result.since_covariance, result.motion,
+                         result.motion_covariance)
+    return velocity, rotated(R.T, covariance) / seconds**2
 
 
 def begins_anew(odometry: Any) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
@@ -36,6 +36,11 @@ class OdometryResult:
     the first camera (the last known one where the motion could not be told); motion_covariance,
     pose_covariance: (6, 6) in ROS order; scale: length that a unit translation was given;
     scale_known: whether that is metres; standing: whether the camera stood still.
+
+    since_ns: stamp of the newest frame that was where the reference frame is, which is later
+    where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
+    sure it is that this frame was there. segment: number of the unbroken stretch that the frame
+    belongs to: the motion between two segments is not known.
     """
 
     stamp_ns: int
@@ -50,6 +55,9 @@ class OdometryResult:
     scale: float
     scale_known: bool
     standing: bool = False
+    since_ns: int | None = None
+    since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    segment: int = 0
 
 
 class VisualOdometry:
@@ -83,7 +91,7 @@ class VisualOdometry:
         """Forget everything; the next frame is the first."""
         self._last: Frame | None = None
         self._prior: RelativePose | None = None
-        self._bad_pairs = 0
+        self._bad_pairs = self._segment = 0
         self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
 
     def process(self, frame: Frame) -> OdometryResult:
@@ -117,7 +125,8 @@ class VisualOdometry:
 
     def _length(self, frame: Frame, view: View, relative: RelativePose) -> Length:
         """Length of the translation; what the pair itself shows of it is seen first."""
-        span = self._reference.stamp_ns, frame.stamp_ns
+        # While the camera stood there was no way, whatever a wheel's noise may add up to.
+        span = self._since_ns, frame.stamp_ns
         if isinstance(self._scale, CameraHeightScale):
             self._scale.see(*span, self._view, view, relative)
         return self._scale.between(*span)
@@ -139,32 +148,38 @@ class VisualOdometry:
             self._scale.reset()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
+            self._segment += 1
             self._pose_covariance = compose(self._pose, self._pose_covariance, np.eye(4),
                                             UNKNOWN_MOTION)
         self._refer_to(frame, view)
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
-            UNKNOWN_MOTION, self._pose_covariance, 0.0, False)
+            UNKNOWN_MOTION, self._pose_covariance, 0.0, False, segment=self._segment)
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
         self._bad_pairs = 0
-        return self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
-                            standstill_covariance(relative, length), standing=True)
+        result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
+                              standstill_covariance(relative, length), standing=True)
+        self._since_ns, self._since_covariance = frame.stamp_ns, result.motion_covariance
+        return result
 
     def _lose(self, frame: Frame, view: View, relative: RelativePose,
               length: Length) -> OdometryResult:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
-        result = self._result(frame, relative.status, relative, length, np.eye(4), UNKNOWN_MOTION)
         self._bad_pairs += 1
-        if self._bad_pairs >= self._config.max_lost:
+        given_up = self._bad_pairs >= self._config.max_lost
+        self._segment += given_up
+        result = self._result(frame, relative.status, relative, length, np.eye(4), UNKNOWN_MOTION)
+        if given_up:
             self._refer_to(frame, view)
             self._prior, self._pose_covariance = None, result.pose_covariance
         return result
 
     def _refer_to(self, frame: Frame, view: View) -> None:
         self._reference, self._view = frame, view
+        self._since_ns, self._since_covariance = frame.stamp_ns, np.zeros((6, 6))
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
                 motion: Array, covariance: Array, standing: bool = False) -> OdometryResult:
@@ -172,7 +187,7 @@ class VisualOdometry:
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             self._pose @ motion, covariance,
             compose(self._pose, self._pose_covariance, motion, covariance), length.value,
-            length.known, standing)
+            length.known, standing, self._since_ns, self._since_covariance, self._segment)
 
 
 def camera_motion(relative: RelativePose, length: Length) -> Array:
