@@ -102,7 +102,7 @@ def test_a_composed_covariance_is_symmetric_and_grows(pose, motion, seed):
 
 def result(motion, pose, stamp=5 * SECOND, previous=4 * SECOND):
     return OdometryResult(stamp, 'camera', Status.OK, previous, None, motion, pose,
-                          np.eye(6), np.eye(6), 1.0, True)
+                          np.eye(6), np.eye(6), 1.0, True, since_ns=previous)
 
 
 def on_the_wire(message):
