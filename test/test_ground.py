@@ -191,7 +191,7 @@ def see_pair(scale, floor, i, z, dz, status=Status.OK, gray=None):
     motion = moved(floor_pose(0.0), floor_pose(0.0, z=dz)) if status is Status.OK \
         else RelativePose(status)
     current = view(floor.gray(z=z + dz, seed=i)) if gray is None else view(gray)
-    scale.see(i * 10**8, (i + 1) * 10**8, view(floor.gray(z=z, seed=i + 1)), current, motion)
+    scale.observe(i * 10**8, (i + 1) * 10**8, view(floor.gray(z=z, seed=i + 1)), current, motion)
     return scale.between(i * 10**8, (i + 1) * 10**8)
 
 
@@ -252,8 +252,8 @@ def test_ground_that_leans_all_of_a_sudden_is_none(floor):
         before = see_pair(scale, floor, i, 0.8 * i, 0.8)
     pitch = np.radians(6.0)
     motion = moved(floor_pose(pitch), floor_pose(pitch, z=0.4))
-    scale.see(5 * 10**8, 6 * 10**8, view(floor.gray(pitch)), view(floor.gray(pitch, z=0.4)),
-              motion)
+    scale.observe(5 * 10**8, 6 * 10**8, view(floor.gray(pitch)), view(floor.gray(pitch, z=0.4)),
+                  motion)
     after = scale.between(5 * 10**8, 6 * 10**8)
     assert after.value == pytest.approx(before.value)
     assert after.sigma > before.sigma

@@ -6,7 +6,6 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.messages import camera_frame, in_convention, Messages, stamp_ns, twist
-from djet_ros.odometry.scale import Length
 from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -41,7 +40,7 @@ def a_result(seed=0, **changes):
     rng = np.random.default_rng(seed)
     relative = RelativePose(Status.OK, rotation_exp(rng.normal(size=3) * 0.3),
                             unit(rng.normal(size=3)))
-    motion = camera_motion(relative, Length(0.7, 0.1, True))
+    motion = camera_motion(relative, 0.7)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_exp(rng.normal(size=3)), rng.normal(size=3) * 9
     fields = {

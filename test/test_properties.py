@@ -21,7 +21,7 @@ from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.diagnostics import StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, pose_of, stamp_ns, twist
-from djet_ros.odometry.scale import GroundTruthScale, Length, SpeedScale
+from djet_ros.odometry.scale import GroundTruthScale, SpeedScale
 from djet_ros.odometry.uncertainty import compose
 from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult, VisualOdometry
 from hypothesis import given, settings, strategies as st
@@ -80,8 +80,7 @@ def test_angles_are_distances(A, B, C, a, b):
 
 @given(rotations, directions, st.floats(1e-3, 1e3), vectors)
 def test_a_motion_takes_points_of_the_current_camera_back_to_the_previous_one(R, t, length, X):
-    motion = camera_motion(RelativePose(Status.OK, R=R, t=t),
-                           Length(length, 1.0, known=True))
+    motion = camera_motion(RelativePose(Status.OK, R=R, t=t), length)
     current = R @ X + length * t
     assert np.allclose(motion[:3, :3] @ current + motion[:3, 3], X, atol=1e-9 * (1 + length))
 
@@ -263,7 +262,7 @@ def test_lengths_add_up_and_are_those_of_the_speeds(measured, shares):
     source = SpeedScale()
     stamps = np.cumsum([SECOND, *(step for step, _ in measured)])[1:].tolist()
     for stamp, (_, speed) in zip(stamps, measured):
-        source.add(stamp, speed)
+        source.add_speed(stamp, speed)
     first, last = stamps[0], stamps[-1]
     a, b, c = sorted(first + round(share * (last - first)) for share in shares)
     whole, left, right = (source.between(*ends) for ends in ((a, c), (a, b), (b, c)))
@@ -276,8 +275,8 @@ def test_lengths_add_up_and_are_those_of_the_speeds(measured, shares):
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_no_speed_makes_a_length_that_is_not_finite(speed):
     source = SpeedScale()
-    source.add(SECOND, 3.0)
-    source.add(2 * SECOND, speed)
+    source.add_speed(SECOND, 3.0)
+    source.add_speed(2 * SECOND, speed)
     length = source.between(SECOND, 2 * SECOND)
     assert np.isfinite(length.value**2 + length.sigma**2)
     assert length.value >= 0

@@ -72,7 +72,7 @@ class RelativePose:
     """
     The motion between two frames, ``x_current = R x_previous + t``, and what vouches for it.
 
-    R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be told
+    R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be estimated
     (status NO_PARALLAX and all failures). covariance_5: (5, 5) over (rotation vector in rad,
     two coordinates of t in the basis ``sphere_tangents(t)``); covariance_6: (6, 6) over
     (rotation vector, t), of rank 5 because the length of t is fixed.

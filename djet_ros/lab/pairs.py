@@ -14,6 +14,7 @@ from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.lab import peers
 from djet_ros.lab.methods import Method
 from djet_ros.lab.sequences import Dataset, opened
+from djet_ros.odometry.visual_odometry import camera_motion
 from djet_ros.replay.pair_errors import has_direction, motion_errors
 import numpy as np
 from numpy.typing import NDArray
@@ -184,14 +185,6 @@ def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
         hamming_mean=float(hamming.mean()) if len(hamming) else float('nan'),
         rotation=_triple(Rotation.from_matrix(motion[:3, :3]).as_rotvec()),
         translation=_triple(motion[:3, 3]), milliseconds=seconds * 1e3)
-
-
-def camera_motion(result: RelativePose) -> Array:
-    """Pose (4, 4) of the current camera in the previous one, with a translation of length one."""
-    motion = np.eye(4)
-    motion[:3, :3] = result.R.T
-    motion[:3, 3] = -result.R.T @ result.t
-    return motion
 
 
 def has_failed(rotation_error_deg: float, translation_error_deg: float,

@@ -20,7 +20,7 @@ def debug_image(gray: NDArray[np.uint8], relative: RelativePose) -> NDArray[np.u
     """
     Draw a pair on its current image (H, W): gives (H, W, 3) BGR.
 
-    Green: way of an inlier from x to y; red: of an outlier; yellow: from y towards its place on
+    Green: shift of an inlier from x to y; red: of an outlier; yellow: from y towards its place on
     the epipolar line, 20 times as far.
     """
     picture = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)

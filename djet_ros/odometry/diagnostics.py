@@ -20,7 +20,7 @@ class State(StrEnum):
     STARTED = 'started'
     RESTARTED = 'restarted'
     TRACKING = 'tracking'
-    STANDING = 'standing still'
+    STATIONARY = 'standing still'
     BAD_PAIR = 'bad pair'
     LOST = 'lost'
     REJECTING = 'message rejected'
@@ -29,7 +29,7 @@ class State(StrEnum):
 
 LEVELS = {
     State.WAITING_FOR_CAMERA_INFO: 'WARN', State.WAITING_FOR_IMAGE: 'WARN', State.STARTED: 'OK',
-    State.RESTARTED: 'WARN', State.TRACKING: 'OK', State.STANDING: 'OK', State.BAD_PAIR: 'WARN',
+    State.RESTARTED: 'WARN', State.TRACKING: 'OK', State.STATIONARY: 'OK', State.BAD_PAIR: 'WARN',
     State.LOST: 'ERROR', State.REJECTING: 'ERROR', State.PAUSED: 'WARN',
 }
 
@@ -107,7 +107,7 @@ class StampRate:
         self._stamps: deque[int] = deque(maxlen=frames)
 
     def add(self, stamp_ns: int) -> None:
-        """Count a frame; a step back in time begins anew."""
+        """Count a frame; a step back in time restarts the count."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
             self._stamps.clear()
         self._stamps.append(stamp_ns)

@@ -7,7 +7,9 @@ the covariance of the motion says it.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from bisect import bisect_left, bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -55,27 +57,39 @@ class Length:
 
 
 class ScaleSource(Protocol):
-    """Something that knows how far the camera went."""
+    """
+    Something that knows how far the camera went.
 
+    What it does not use of what it is shown, and what it does not measure, it leaves as it is.
+    """
+
+    def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
+                relative: RelativePose) -> None:
+        """Look at a pair of views and the motion between them, before its length is asked for."""
+        return
+
+    def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
+        """Take a measured speed."""
+        return
+
+    @abstractmethod
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Length of the straight way between two stamps."""
+        """Length of the translation between two stamps."""
 
     def reset(self) -> None:
         """Forget what was measured."""
+        return
 
 
-class UnitScale:
+class UnitScale(ScaleSource):
     """Every translation has length one, and nothing is known."""
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Give one, unknown."""
         return unknown(1.0)
 
-    def reset(self) -> None:
-        """Nothing is kept."""
 
-
-class ConstantScale:
+class ConstantScale(ScaleSource):
     """Every translation has the same known length in metres; uncertainty is a share of it."""
 
     def __init__(self, metres: float, uncertainty: float = 0.05) -> None:
@@ -85,11 +99,8 @@ class ConstantScale:
         """Give the constant length."""
         return self._length
 
-    def reset(self) -> None:
-        """Nothing is kept."""
 
-
-class SpeedScale:
+class SpeedScale(ScaleSource):
     """
     Speed times time, from stamped speeds that come in as the camera moves.
 
@@ -102,7 +113,7 @@ class SpeedScale:
         self._uncertainty = uncertainty
         self.reset()
 
-    def add(self, stamp_ns: int, metres_per_second: float) -> None:
+    def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
         """Take a measured speed; one beyond any sense or earlier than the last is ignored."""
         if not abs(metres_per_second) <= _FASTEST \
                 or (self._stamps and stamp_ns <= self._stamps[-1]):
@@ -133,11 +144,11 @@ class SpeedScale:
         self._speeds: list[float] = []
 
 
-class CameraHeightScale:
+class CameraHeightScale(ScaleSource):
     """
-    Ways over the ground in heights of the camera, which is known in metres, over level ground.
+    Translations over level ground in heights of the camera, which is known in metres.
 
-    Each pair of views gives the way between them and the camera's pitch and roll, with an
+    Each pair of views gives the translation between them and the camera's pitch and roll, with an
     uncertainty; one is often sure only against the other. A Kalman filter over (speed, pitch,
     roll) brings together what pairs say: speed changes as vehicles can, pitch and roll hardly.
     The ground must be seen to fill the lower part of the image, and the camera must not roll.
@@ -153,12 +164,12 @@ class CameraHeightScale:
         self._ground: tuple[Array, tuple[int, ...], Ground] | None = None
         self.reset()
 
-    def see(self, start_ns: int, end_ns: int, previous: View, current: View,
-            relative: RelativePose) -> None:
-        """Look at a pair of views and the motion between them, before its length is asked for."""
+    def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
+                relative: RelativePose) -> None:
+        """Take from a pair of views how far the ground moved."""
         seconds = (end_ns - start_ns) * 1e-9
         x, P = self._predicted(end_ns)
-        # Ways that the filter expects, in heights; four deviations to both sides.
+        # Lengths that the filter expects, in heights; four deviations to both sides.
         expected = (x[0] + np.array([-4, 4]) * np.sqrt(P[0, 0])) * seconds / self._height
         seen = self._ground_of(current).motion(
             previous, current, relative, (float(expected[0]), float(expected[1])))
@@ -218,7 +229,7 @@ class CameraHeightScale:
         self._seen_ns = stamp_ns
 
 
-class GroundTruthScale:
+class GroundTruthScale(ScaleSource):
     """Distances between known positions (N, 3) in metres at increasing stamps (N,)."""
 
     def __init__(self, stamps_ns: NDArray[np.int64], positions: Array,
@@ -236,9 +247,6 @@ class GroundTruthScale:
             return unknown(1.0)
         return Length(metres, max(metres * self._uncertainty, 1e-3), True)
 
-    def reset(self) -> None:
-        """Keep the ground truth: it is given, not measured on the way."""
-
 
 def unknown(guess: float) -> Length:
     """Make a length that is only a guess."""
@@ -247,8 +255,7 @@ def unknown(guess: float) -> Length:
 
 def same_scale(before: OdometryConfig, after: OdometryConfig) -> bool:
     """Tell whether two configurations ask for the same source."""
-    names = ('scale', 'scale_value', 'scale_uncertainty', 'camera_height', 'camera_pitch')
-    return all(getattr(before, name) == getattr(after, name) for name in names)
+    return _made_of(before) == _made_of(after)
 
 
 def scale_source(config: OdometryConfig,
@@ -259,16 +266,23 @@ def scale_source(config: OdometryConfig,
     ground_truth: stamps (N,) and positions (N, 3), needed for scale 'ground_truth'; without them
     DjetError.
     """
-    if config.scale == 'constant':
-        return ConstantScale(config.scale_value, config.scale_uncertainty)
-    if config.scale == 'speed':
-        return SpeedScale(config.scale_uncertainty)
-    if config.scale == 'camera_height':
-        return CameraHeightScale(config.camera_height, np.radians(config.camera_pitch),
-                                 config.scale_uncertainty)
-    if config.scale == 'ground_truth':
-        if ground_truth is None:
-            raise DjetError("odometry.scale is 'ground_truth', and there is no ground truth; "
-                            'give poses, or choose none, constant or speed')
-        return GroundTruthScale(*ground_truth, config.scale_uncertainty)
-    return UnitScale()
+    kind, parameters = _made_of(config)
+    if kind is not GroundTruthScale:
+        return kind(*parameters)
+    if ground_truth is None:
+        raise DjetError("odometry.scale is 'ground_truth', and there is no ground truth; "
+                        'give poses, or choose none, constant or speed')
+    return kind(*ground_truth, *parameters)
+
+
+def _made_of(config: OdometryConfig) -> tuple[Callable[..., ScaleSource], tuple[float, ...]]:
+    """Class of the source, and the parameters that it is made of."""
+    share = config.scale_uncertainty
+    kinds: dict[str, tuple[Callable[..., ScaleSource], tuple[float, ...]]] = {
+        'none': (UnitScale, ()),
+        'constant': (ConstantScale, (config.scale_value, share)),
+        'speed': (SpeedScale, (share,)),
+        'camera_height': (CameraHeightScale, (
+            config.camera_height, np.radians(config.camera_pitch), share)),
+        'ground_truth': (GroundTruthScale, (share,))}
+    return kinds[config.scale]

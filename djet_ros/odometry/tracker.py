@@ -18,7 +18,7 @@ from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
-from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource, SpeedScale
+from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
@@ -38,9 +38,9 @@ class Tracker:
     message_type gives the class for a type name such as 'sensor_msgs/msg/Image'; image_topic is
     the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
 
-    Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was told), odometry
-    (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of state
-    and once per second of the images' stamps).
+    Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
+    odometry (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of
+    state and once per second of the images' stamps).
     """
 
     def __init__(self, config: Config, message_type: MessageType,
@@ -160,10 +160,8 @@ class Tracker:
 
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed, for odometry.scale 'speed'."""
-        if isinstance(self._scale, SpeedScale):
-            linear = (message.twist.twist if hasattr(message.twist, 'twist')
-                      else message.twist).linear
-            self._scale.add(stamp_ns(message.header), math.hypot(linear.x, linear.y, linear.z))
+        linear = (message.twist.twist if hasattr(message.twist, 'twist') else message.twist).linear
+        self._scale.add_speed(stamp_ns(message.header), math.hypot(linear.x, linear.y, linear.z))
 
     def count_dropped(self, reason: str, number: int = 1) -> None:
         """Count images that a face received and did not hand on."""
@@ -226,7 +224,7 @@ class Tracker:
         if status in TRACKED or status in STARTED:
             self._bad_pairs = 0
             if status in TRACKED:
-                return (State.STANDING if result.standing else State.TRACKING), ''
+                return (State.STATIONARY if result.stationary else State.TRACKING), ''
             first = self.counts.processed == 1
             return (State.STARTED, '') if first else (State.RESTARTED, status.value)
         self._bad_pairs += 1

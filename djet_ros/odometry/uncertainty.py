@@ -46,9 +46,9 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
 
 def standstill_covariance(relative: RelativePose, length: Length) -> Array:
     """
-    Covariance (6, 6) of no motion: the rotation's own, and a tenth of a usual way.
+    Covariance (6, 6) of no motion: the rotation's own, and a tenth of a usual translation.
 
-    A way of unknown length is unknown also where it was short.
+    A translation of unknown length is unknown also where it was short.
     """
     sigma = 0.1 * length.value if length.known else UNKNOWN_LENGTH_SIGMA
     rotation = relative.covariance_6[:3, :3]

@@ -9,7 +9,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
-from djet_ros.odometry.scale import CameraHeightScale, Length, scale_source, ScaleSource
+from djet_ros.odometry.scale import Length, scale_source, ScaleSource
 from djet_ros.odometry.uncertainty import (
     compose,
     motion_covariance,
@@ -18,10 +18,10 @@ from djet_ros.odometry.uncertainty import (
 )
 import numpy as np
 
-# Statuses under which the motion of a pair was told.
+# Statuses under which the motion of a pair was estimated.
 TRACKED = (Status.OK, Status.NO_PARALLAX)
 
-# Statuses of a frame that begins anew, without a pair.
+# Statuses of a frame at which the odometry started or restarted, without a pair.
 STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
 
 
@@ -31,11 +31,11 @@ class OdometryResult:
     What became of a frame.
 
     stamp_ns, frame_id: of the frame; status; previous_stamp_ns: of the reference frame that it
-    was related to, None where it began anew; relative: the estimator's answer for that pair;
+    was related to, None where it restarted; relative: the estimator's answer for that pair;
     motion: (4, 4) the current camera in the reference camera; pose: (4, 4) the current camera in
-    the first camera (the last known one where the motion could not be told); motion_covariance,
-    pose_covariance: (6, 6) in ROS order; scale: length that a unit translation was given;
-    scale_known: whether that is metres; standing: whether the camera stood still.
+    the first camera (the last known one where the motion could not be estimated);
+    motion_covariance, pose_covariance: (6, 6) in ROS order; scale: length that a unit translation
+    was given; scale_known: whether that is metres; stationary: whether the camera stood still.
 
     since_ns: stamp of the newest frame that was where the reference frame is, which is later
     where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
@@ -54,7 +54,7 @@ class OdometryResult:
     pose_covariance: Array
     scale: float
     scale_known: bool
-    standing: bool = False
+    stationary: bool = False
     since_ns: int | None = None
     since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     segment: int = 0
@@ -70,7 +70,7 @@ class VisualOdometry:
       The motion in between is missing then, and the pose's covariance says so;
     * while the camera stands still it stays, so that noise does not add up;
     * a gap of more than max_gap, another image size or another camera begin a new reference at
-      the last pose; a step back in time begins everything anew.
+      the last pose; a step back in time restarts everything.
     """
 
     def __init__(self, estimator: EstimatorConfig | None = None,
@@ -116,7 +116,8 @@ class VisualOdometry:
             return self._lose(frame, view, relative, length)
 
         # Integrate the motion and its uncertainty; this frame is the next reference.
-        motion, covariance = camera_motion(relative, length), motion_covariance(relative, length)
+        motion = camera_motion(relative, length.value)
+        covariance = motion_covariance(relative, length)
         result = self._result(frame, relative.status, relative, length, motion, covariance)
         self._pose, self._pose_covariance = result.pose, result.pose_covariance
         self._refer_to(frame, view)
@@ -127,8 +128,7 @@ class VisualOdometry:
         """Length of the translation; what the pair itself shows of it is seen first."""
         # While the camera stood there was no way, whatever a wheel's noise may add up to.
         span = self._since_ns, frame.stamp_ns
-        if isinstance(self._scale, CameraHeightScale):
-            self._scale.see(*span, self._view, view, relative)
+        self._scale.observe(*span, self._view, view, relative)
         return self._scale.between(*span)
 
     def _stands_still(self, relative: RelativePose) -> bool:
@@ -161,7 +161,7 @@ class VisualOdometry:
         """Stand still: no motion, and the reference frame stays."""
         self._bad_pairs = 0
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
-                              standstill_covariance(relative, length), standing=True)
+                              standstill_covariance(relative, length), stationary=True)
         self._since_ns, self._since_covariance = frame.stamp_ns, result.motion_covariance
         return result
 
@@ -182,17 +182,17 @@ class VisualOdometry:
         self._since_ns, self._since_covariance = frame.stamp_ns, np.zeros((6, 6))
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
-                motion: Array, covariance: Array, standing: bool = False) -> OdometryResult:
+                motion: Array, covariance: Array, stationary: bool = False) -> OdometryResult:
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             self._pose @ motion, covariance,
             compose(self._pose, self._pose_covariance, motion, covariance), length.value,
-            length.known, standing, self._since_ns, self._since_covariance, self._segment)
+            length.known, stationary, self._since_ns, self._since_covariance, self._segment)
 
 
-def camera_motion(relative: RelativePose, length: Length) -> Array:
-    """Pose (4, 4) of the current camera in the previous one, (R^T, -s R^T t)."""
+def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:
+    """Pose (4, 4) of the current camera in the previous one, (R^T, -s R^T t), s the length."""
     motion = np.eye(4)
     motion[:3, :3] = relative.R.T
-    motion[:3, 3] = -length.value * relative.R.T @ relative.t
+    motion[:3, 3] = -length * relative.R.T @ relative.t
     return motion

@@ -185,7 +185,7 @@ def _inverse_depths(relative: RelativePose, K: Array) -> tuple[Array, Array]:
 
 
 def _edge(source: int, target: int, relative: RelativePose, length: Length, kind: str) -> Edge:
-    return Edge(source, target, camera_motion(relative, length),
+    return Edge(source, target, camera_motion(relative, length.value),
                 motion_covariance(relative, length) + LEAST_COVARIANCE, kind, length.known)
 
 
