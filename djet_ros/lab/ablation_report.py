@@ -10,7 +10,7 @@ from djet_ros.core.estimator_config import PRESETS
 from djet_ros.lab.methods import Method, TITLES
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.published import TABLE_2
-from djet_ros.lab.report import CAPTION, Picture, write, write_page
+from djet_ros.lab.report import CAPTION, Picture, write_page
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.lab.summary import table_rows, TableRow
@@ -23,6 +23,7 @@ from djet_ros.lab.tables import (
     Table,
     timings_csv,
 )
+from djet_ros.recordings.outputs import write_whole
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
@@ -41,10 +42,10 @@ def write_ablation(folder: Path, datasets: Sequence[Dataset], methods: Sequence[
     rows = table_rows(records)
     caption = f'{_CAPTION} {_GOOD_START}' if methods[0].good_start else _CAPTION
     tables = [ablation_table(caption, rows), published_table(_PUBLISHED, TABLE_2)]
-    write(folder / 'ablation.csv', rows_csv(rows, with_change=True))
-    write(folder / 'ablation.md', '\n'.join(markdown(table) for table in tables))
-    write(folder / 'pairs.csv', pairs_csv(records, with_change=True))
-    write(folder / 'timings.csv', timings_csv(records, with_change=True))
+    write_whole(folder / 'ablation.csv', rows_csv(rows, with_change=True))
+    write_whole(folder / 'ablation.md', '\n'.join(markdown(table) for table in tables))
+    write_whole(folder / 'pairs.csv', pairs_csv(records, with_change=True))
+    write_whole(folder / 'timings.csv', timings_csv(records, with_change=True))
     pictures = {}
     for dataset in datasets:
         path = folder / 'plots' / f'{dataset.name}_ablation.png'

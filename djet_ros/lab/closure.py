@@ -17,9 +17,10 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
+from djet_ros.lab.summary import spread_of
 from djet_ros.odometry.visual_odometry import camera_motion
 from djet_ros.recordings.sequence import FrameSequence
-from djet_ros.replay.pair_errors import motion_errors, statistics
+from djet_ros.replay.pair_errors import motion_errors
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -101,8 +102,7 @@ def summary(triangles: Sequence[Triangle | None]) -> dict[str, Any]:
     closed = [triangle for triangle in triangles if triangle is not None]
 
     def spread(name: str) -> dict[str, float]:
-        found = statistics(np.array([getattr(triangle, name) for triangle in closed]))
-        return found or dict.fromkeys(('mean', 'median', 'p95'), float('nan'))
+        return spread_of([getattr(triangle, name) for triangle in closed])
 
     return {'triangles': len(closed), 'without': len(triangles) - len(closed),
             'median_deg': spread('angle')['median'], 'p95_deg': spread('angle')['p95'],

@@ -36,6 +36,7 @@ from djet_ros.lab.tables import (
     table_csv,
     timings_csv,
 )
+from djet_ros.recordings.outputs import write_whole
 
 CAPTION = ('Errors of relative poses against the ground truth in degrees, of rotation (rot.) and '
            'of the direction of translation (tr.); Hamming distances in bits; milliseconds a '
@@ -55,6 +56,22 @@ thead th { border-bottom: 2px solid #888; }
 tr:has(i) { background: #f4f1ea; }
 .wide { overflow-x: auto; }
 img { max-width: 100%; height: auto; display: block; margin: 1rem 0; }
+"""
+
+_PAGE = """\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{css}</style>
+</head>
+<body>
+{body}
+<p>Written by djet_ros {version}.</p>
+</body>
+</html>
 """
 
 
@@ -77,27 +94,20 @@ def write_report(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Me
     printed = {dataset.name: TABLE_1[dataset.benchmark] for dataset in datasets
                if dataset.benchmark in TABLE_1}
     tables = [results_table(CAPTION + PUBLISHED_NOTE if printed else CAPTION, rows, printed)]
-    write(folder / 'table1.csv', rows_csv(rows, with_change=False))
-    write(folder / 'table1.md', markdown(tables[0]))
-    write(folder / 'table1.tex', latex(tables[0]))
-    write(folder / 'pairs.csv', pairs_csv(records, with_change=False))
-    write(folder / 'timings.csv', timings_csv(records, with_change=False))
+    write_whole(folder / 'table1.csv', rows_csv(rows, with_change=False))
+    write_whole(folder / 'table1.md', markdown(tables[0]))
+    write_whole(folder / 'table1.tex', latex(tables[0]))
+    write_whole(folder / 'pairs.csv', pairs_csv(records, with_change=False))
+    write_whole(folder / 'timings.csv', timings_csv(records, with_change=False))
     files = ['table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv']
     pictures = {dataset.name: list(_pictures(folder, dataset, records)) for dataset in datasets}
     if with_evo:
         tables.append(_evo_table(folder, datasets, methods))
-        write(folder / 'evo.csv', table_csv(tables[1]))
+        write_whole(folder / 'evo.csv', table_csv(tables[1]))
         files.append('evo.csv')
     write_page(folder, 'Relative pose of two frames: evaluation', tables, pictures, methods,
                files)
     return tables
-
-
-def write(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    unfinished = path.with_name(f'.{path.name}.part')
-    unfinished.write_text(text, 'utf-8')
-    os.replace(unfinished, path)
 
 
 def trajectory_file(folder: Path, sequence: str, preset: str, method: str) -> Path:
@@ -167,12 +177,8 @@ def write_page(folder: Path, title: str, tables: Iterable[Table],
         parts.append(f'<h2>{html.escape(section)}</h2>')
         parts += [_image(picture, folder, section) for picture in shown]
     parts.append(_parameters(methods))
-    body = '\n'.join(parts)
-    write(folder / 'index.html',
-          '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-          '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-          f'<title>{html.escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n'
-          f'{body}\n<p>Written by djet_ros {__version__}.</p>\n</body>\n</html>\n')
+    write_whole(folder / 'index.html', _PAGE.format(
+        title=html.escape(title), css=_CSS, body='\n'.join(parts), version=__version__))
 
 
 def _link(name: str) -> str:

@@ -15,12 +15,12 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.evo import trajectory_metrics
+from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.posegraph.graph_files import write_graph
 from djet_ros.posegraph.offline import PARAMETERS, Slam, travelled
-from djet_ros.recordings.trajectories import TumWriter
+from djet_ros.recordings.outputs import write_whole
 import numpy as np
-from numpy.typing import NDArray
 
 PLOT = 'slam.png'
 SUMMARY = 'slam.json'
@@ -42,7 +42,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     frames, graph = slam.frames, slam.solution.graph
     ways = {'before': slam.before(), 'after': slam.after()}
     for which, poses in ways.items():
-        _write_tum(folder / f'{which}_tum.txt', frames.stamps_ns, poses)
+        StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{which}_tum.txt')
     for kind in ('g2o', 'csv'):
         write_graph(graph, folder / f'pose_graph.{kind}', kind)
     values = flat(config)
@@ -57,7 +57,8 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         'version': __version__}
     known = np.isfinite(truth).all(axis=(1, 2))
     if known.sum() > 2:
-        _write_tum(folder / 'truth_tum.txt', frames.stamps_ns[known], truth[known])
+        StampedTrajectory(frames.stamps_ns[known], truth[known]).write_tum(
+            folder / 'truth_tum.txt')
         summary['errors'] = {which: _error(poses, truth, slam.scale_known)
                              for which, poses in ways.items()}
         try:
@@ -67,7 +68,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
             # It is not installed, or refuses a way that is straight.
             summary['evo'] = str(error)
     _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, Path(name).name)
-    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n')
+    write_whole(folder / SUMMARY, json.dumps(summary, indent=2) + '\n')
     return summary
 
 
@@ -115,9 +116,3 @@ def _closed(slam: Slam, way: Array) -> Array:
     closing = [edge.source for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
                if edge.kind == 'loop' and trust >= 0.5]
     return np.asarray(way[first[np.array(closing, np.int64)]])
-
-
-def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
-    with TumWriter(path) as writer:
-        for stamp, pose in zip(stamps_ns.tolist(), poses):
-            writer.write(stamp, pose)

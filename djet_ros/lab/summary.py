@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from djet_ros.lab.pairs import PairRecord
+from djet_ros.replay.pair_errors import statistics
 import numpy as np
 
 
@@ -45,28 +46,18 @@ def table_rows(records: Iterable[PairRecord]) -> list[TableRow]:
 
 def _row(records: Sequence[PairRecord]) -> TableRow:
     first = records[0]
+    rotation, translation, hamming, ms = (
+        spread_of([getattr(record, name) for record in records])
+        for name in ('rotation_error_deg', 'translation_error_deg', 'hamming_mean',
+                     'milliseconds'))
     return TableRow(
         first.sequence, first.method, first.preset, first.change, len(records),
         sum(record.failed for record in records),
-        *_spread([record.rotation_error_deg for record in records]),
-        *_spread([record.translation_error_deg for record in records]),
-        _mean([record.hamming_mean for record in records]),
-        _mean([record.milliseconds for record in records]))
+        rotation['mean'], rotation['median'], rotation['p95'],
+        translation['mean'], translation['median'], translation['p95'],
+        hamming['mean'], ms['mean'])
 
 
-def _spread(values: list[float]) -> tuple[float, float, float]:
-    """Mean, median and 95th percentile of the known values."""
-    known = _known(values)
-    if not len(known):
-        return float('nan'), float('nan'), float('nan')
-    return float(known.mean()), float(np.median(known)), float(np.percentile(known, 95))
-
-
-def _mean(values: list[float]) -> float:
-    known = _known(values)
-    return float(known.mean()) if len(known) else float('nan')
-
-
-def _known(values: list[float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    array = np.array(values, dtype=np.float64)
-    return array[np.isfinite(array)]
+def spread_of(values: Sequence[float]) -> dict[str, float]:
+    """Statistics of those values that are known, by their names; NaN where none is."""
+    return statistics(np.array(values)) or dict.fromkeys(('mean', 'median', 'p95'), float('nan'))
