@@ -62,7 +62,8 @@ class SlamConfig:
     """How loops are closed, offline and live. Raises ValueError like its sisters."""
 
     keyframe_distance: float = parameter(
-        2.0, 'way after which a frame becomes a keyframe, in metres or in units of the trajectory',
+        2.0, 'distance after which a frame becomes a keyframe, in metres or in units of the '
+        'trajectory',
         minimum=1e-6, maximum=1e6)
     keyframe_turn: float = parameter(
         10.0, 'turn after which a frame becomes a keyframe, in degrees', minimum=0.1, maximum=180)

@@ -3,8 +3,9 @@ The ground under a moving camera: how far it went over it, in heights of the cam
 
 Points X of a plane with m.X = 1 have the inverse depth m.x along their ray x, so that two views
 with X' = R X + t see it as y ~ (R + t m^T) x (Faugeras and Lustman, 1988). With t of length one,
-|m| is the way in heights of the camera over the plane, and m / |m| is its normal. All pixels where
-level ground would be are aligned directly, because roads have few corners.
+|m| is the length of the translation in heights of the camera over the plane, and m / |m| is its
+normal. All pixels where level ground would be are aligned directly, because roads have few
+corners.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ class GroundTuning:
     # of an image, from which those are chosen; chosen: the size of a car's camera
     candidates: int = 500_000
 
-    # The search. Ways between two views in heights; chosen, from a crawl to a jump of a car
-    ways: tuple[float, float] = (0.02, 4.0)
-    # of the logarithm of a way: makes steps of a pixel or two
+    # The search. Lengths of a translation in heights; chosen, from a crawl to the fastest car
+    lengths: tuple[float, float] = (0.02, 4.0)
+    # of the logarithm of a length: makes steps of a pixel or two
     step: float = 0.03
     # correlation with which ground is seen again; chosen: walls and cars that are taken for
     # ground have less
     seen: float = 0.6
     # chosen: correlation with which images about whose motion nothing is known are of one place
     same: float = 0.95
-    # chosen: another way must correlate by so much less, if it is no neighbour by so many steps
+    # chosen: another length must correlate by so much less, if it is no neighbour by so many steps
     clearly: float = 0.1
     neighbours: int = 6
     # pixels; chosen: ground that moves by less, while other things show that the camera moves,
@@ -84,8 +85,9 @@ class GroundMotion:
     """
     What a pair of views says of the ground.
 
-    value: (3,) way in heights of the camera, pitch of the camera (down is positive) and roll
-    against the ground in rad; covariance: (3, 3); correlation of the ground in both views.
+    value: (3,) length of the translation in heights of the camera, pitch of the camera (down is
+    positive) and roll against the ground in rad; covariance: (3, 3); correlation of the ground in
+    both views.
     """
 
     value: Array
@@ -141,12 +143,12 @@ class Ground:
                           & (aside < TUNING.aside))
 
     def motion(self, previous: View, current: View, relative: RelativePose,
-               ways: tuple[float, float] = TUNING.ways) -> GroundMotion | None:
+               lengths: tuple[float, float] = TUNING.lengths) -> GroundMotion | None:
         """
         Find how the ground moves between two views, from the motion between them.
 
-        ways: from which to which way, in heights, is searched first. None where no ground is seen,
-        or where it does not tell.
+        lengths: from which to which one, in heights, is searched first. None where no ground is
+        seen, or where it does not tell.
         """
         if not self.is_in_view:
             return None
@@ -154,9 +156,9 @@ class Ground:
         wanted = _sampled(here, self._pixels)
         if relative.status is not Status.OK:
             return self._standing(wanted, there, relative)
-        start = self._search(wanted, there, relative, ways)
+        start = self._search(wanted, there, relative, lengths)
         if start is None:
-            start = self._search(wanted, there, relative, TUNING.ways)
+            start = self._search(wanted, there, relative, TUNING.lengths)
         return None if start is None else self._fit(wanted, there, relative, start)
 
     def _texture(self, view: View) -> Image:
@@ -187,12 +189,13 @@ class Ground:
         return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]), correlation)
 
     def _search(self, wanted: Array, there: Image, relative: RelativePose,
-                ways: tuple[float, float]) -> Array | None:
-        """Plane (3,) of the way under which level ground correlates best, if one stands out."""
-        low, high, step = max(ways[0], TUNING.ways[0]), min(ways[1], TUNING.ways[1]), TUNING.step
+                lengths: tuple[float, float]) -> Array | None:
+        """Plane (3,) of the length at which level ground correlates best, if one stands out."""
+        step, (least, most) = TUNING.step, TUNING.lengths
+        low, high = max(lengths[0], least), min(lengths[1], most)
         tried = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
         found = np.array([_correlation(wanted, _sampled(there, self._seen_again(
-            relative.R, relative.t, way * self._normal))) for way in tried])
+            relative.R, relative.t, length * self._normal))) for length in tried])
         best = int(found.argmax())
         if found[best] < TUNING.seen or best in (0, len(found) - 1):
             return None
@@ -318,7 +321,7 @@ def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
 
 
 def _described(m: Array, covariance: Array, correlation: float) -> GroundMotion:
-    """Way, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
+    """Length, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
     length = float(np.linalg.norm(m))
     x, y, z = (m / length).tolist()
     upright = np.hypot(y, z)

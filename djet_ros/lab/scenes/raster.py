@@ -48,7 +48,7 @@ class Raster:
 
 
 @dataclass(frozen=True)
-class View:
+class PanelsInView:
     """
     The panels in front of a camera, nearest first.
 
@@ -64,7 +64,7 @@ class View:
 
 
 def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
-         reach: float = np.inf) -> View:
+         reach: float = np.inf) -> PanelsInView:
     """
     Project panels into the camera of pose (4, 4), camera to world, and sort them by depth.
 
@@ -86,7 +86,7 @@ def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
     to_panel = inverse / volume[index, None, None] @ np.linalg.inv(K)
     nearest = np.minimum(nearest[index], _corner_maximum(to_panel[:, 2], boxes[index], raster))
     order = np.argsort(-nearest, kind='stable')
-    return View(panels, index[order], to_panel[order], boxes[index][order], nearest[order])
+    return PanelsInView(panels, index[order], to_panel[order], boxes[index][order], nearest[order])
 
 
 def _outline(origin: Array, a: Array, b: Array, triangle: NDArray[np.bool_]) -> Array:
@@ -122,7 +122,7 @@ def _corner_maximum(inverse_depth: Array, boxes: NDArray[np.intp], raster: Raste
     return np.asarray(u.max(1) + v.max(1) + inverse_depth[:, 2])
 
 
-def visible(view: View, raster: Raster) -> tuple[NDArray[np.int16], Gray]:
+def visible(view: PanelsInView, raster: Raster) -> tuple[NDArray[np.int16], Gray]:
     """Which panel (position in the view, or NOTHING) every sample sees, and its inverse depth."""
     ids = np.full(raster.shape, NOTHING, np.int16)
     closest = np.zeros(raster.shape, np.float32)
@@ -135,7 +135,7 @@ def visible(view: View, raster: Raster) -> tuple[NDArray[np.int16], Gray]:
     return ids, closest / np.append(_advantage(view), np.float32(1))[ids]
 
 
-def _advantage(view: View) -> Gray:
+def _advantage(view: PanelsInView) -> Gray:
     """Factors (N,) by which layers seem nearer than the plane they lie in."""
     return np.asarray(1 + _LAYER_STEP * view.panels.layer[view.index], np.float32)
 
@@ -148,7 +148,7 @@ def _bands(box: NDArray[np.intp]) -> Iterator[tuple[slice, slice]]:
         yield slice(first, min(first + height, bottom)), slice(left, right)
 
 
-def _cover(view: View, k: int, raster: Raster, box: tuple[slice, slice], closest: Gray,
+def _cover(view: PanelsInView, k: int, raster: Raster, box: tuple[slice, slice], closest: Gray,
            advantage: np.float32) -> tuple[Gray, NDArray[np.bool_]]:
     """Inverse depth of panel k over a box, and where it hides what is there already."""
     top, left = box[0].start, box[1].start
@@ -174,7 +174,7 @@ def _cover(view: View, k: int, raster: Raster, box: tuple[slice, slice], closest
     return biased, inside
 
 
-def shade(view: View, ids: NDArray[np.int16], raster: Raster, background: float) -> Gray:
+def shade(view: PanelsInView, ids: NDArray[np.int16], raster: Raster, background: float) -> Gray:
     """Brightness of the panel that each sample sees."""
     radiance = np.full(raster.shape, background, np.float32)
     flat = ids.ravel()
@@ -190,7 +190,7 @@ def shade(view: View, ids: NDArray[np.int16], raster: Raster, background: float)
     return radiance
 
 
-def _look_up(view: View, k: int, raster: Raster, rows: NDArray[np.intp],
+def _look_up(view: PanelsInView, k: int, raster: Raster, rows: NDArray[np.intp],
              columns: NDArray[np.intp], ripmap: RipMap, blend: bool) -> Gray:
     """
     Values (N,) of panel k at samples, filtered for the distance between samples.

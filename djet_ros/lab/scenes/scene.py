@@ -9,7 +9,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.camera import Effect, Shot
 from djet_ros.lab.scenes.panel import World
-from djet_ros.lab.scenes.raster import look, Raster, reduce, shade, View, visible
+from djet_ros.lab.scenes.raster import look, PanelsInView, Raster, reduce, shade, visible
 from djet_ros.lab.scenes.route import Trajectory
 from djet_ros.lab.scenes.texture import Gray
 import numpy as np
@@ -71,7 +71,7 @@ class Scene:
     def _from_level(self) -> Array:
         return np.asarray(np.linalg.inv(self._to_level))
 
-    def _look(self, level: Array, index: int, factor: int) -> tuple[View, Raster]:
+    def _look(self, level: Array, index: int, factor: int) -> tuple[PanelsInView, Raster]:
         raster = Raster(self.size, factor)
         return look(self.world.at(index), level, self.K, raster, self.reach), raster
 
