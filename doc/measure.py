@@ -1,9 +1,9 @@
 """
 Measures what doc/results.md and the README's table show, and writes it as JSON.
 
-Every figure is made by commands that a reader can run, ``djet lab evaluate`` above all. Rendered
-scenes are taken with several seeds; real frames are those of $DJET_DATA, if it is set. A run that
-was broken off is taken up where it ended; one of other settings, or of other code, begins anew.
+Rendered scenes are taken with several seeds; real frames are those of $DJET_DATA, if it is set. A
+run that was broken off is taken up where it ended; one of other settings, or of other code, begins
+anew.
 
     python doc/measure.py --frames 21 --seeds 0,1,2,3,4 --workers 2
 """
@@ -11,9 +11,8 @@ was broken off is taken up where it ended; one of other settings, or of other co
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import as_completed, ThreadPoolExecutor
-import csv
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from functools import partial
 import hashlib
@@ -22,31 +21,44 @@ import json
 import os
 from pathlib import Path
 import platform
-import subprocess
 import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import djet_ros
-from djet_ros.lab.scenes import SCENES
+from djet_ros.core.estimator_config import preset
+from djet_ros.core.geometry import sphere_tangents, unit
+from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.errors import DjetError
+from djet_ros.lab.ablation import ablation_methods, PARTS
+from djet_ros.lab.bench import bench
+from djet_ros.lab.closure import closures, summary
+from djet_ros.lab.methods import default_methods, make_methods, Method
+from djet_ros.lab.pairs import camera_motion, evaluate_chunk, has_failed, PairChunk
+from djet_ros.lab.runner import local_workers
+from djet_ros.lab.scenes import render_sequence, SCENES
+from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.replay.pair_errors import motion_errors
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / 'doc' / 'results.json'
 LIBRARIES = ('numpy', 'scipy', 'opencv-python-headless', 'poselib')
-DJET = (sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())')
-LAB = ('lab',)
 
-# An odometry cannot live with these, in degrees: see djet lab evaluate.
-GROSS_ROTATION, GROSS_DIRECTION = 1.0, 10.0
 # The paper's own parameters are compared between its two methods only.
-PAPER_METHODS = 'djet,rpe'
+PAPER_METHODS = ('djet', 'rpe')
+CLOSED = ('djet', 'pjet', 'rpe')
 CLOSURE_FRAMES = 150
-ABLATED = 51
+ABLATED_FRAMES = 51
+ABLATED_WINDOWS = (3, 5, 7, 15)
 BENCH_PAIRS = 40
-
-Row = dict[str, str]
+# An error that a true covariance of five degrees of freedom allows in one pair of a thousand.
+SURPRISING = float(chi2.ppf(0.999, 5))
 
 
 @dataclass(frozen=True)
@@ -65,19 +77,36 @@ class Job:
     cost: int
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What was made of a pair.
+
+    sequence: its name; errors in degrees, NaN where there is none; failed: as djet lab evaluate
+    counts; surprise: squared error over its covariance, NaN where that is not told.
+    """
+
+    sequence: str
+    status: str
+    rotation: float
+    direction: float
+    failed: bool
+    surprise: float = float('nan')
+
+
 def main() -> int:
     args = arguments()
     settings = {'frames': args.frames, 'seeds': list(args.seeds),
                 'real_frames': args.real_frames, 'code': digest_of_the_code()}
     results = begun(args.output, settings)
     failed = False
-    with ThreadPoolExecutor(args.workers) as pool:
+    with local_workers(args.workers) as pool:
         running = {pool.submit(work): name for name, work in missing(results, args)}
         for future in as_completed(running):
             name = running[future]
             try:
                 results['parts'][name] = future.result()
-            except CommandFailed as error:
+            except DjetError as error:
                 print(f'{name}: {error}', file=sys.stderr, flush=True)
                 failed = True
                 continue
@@ -93,29 +122,29 @@ def main() -> int:
     return 0
 
 
-class CommandFailed(Exception):
-    """A command ended with an error, which is what this says."""
-
-
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--frames', type=int, default=21, help='of each rendered scene and seed')
-    parser.add_argument('--real-frames', type=int, help='of each real sequence (default: all)')
-    parser.add_argument('--seeds', default=(0, 1, 2, 3, 4),
-                        type=lambda text: tuple(int(word) for word in text.split(',')))
+    parser = argparse.ArgumentParser(description=str(__doc__).split('\n\n')[0])
+    parser.add_argument('--frames', type=int, default=21, metavar='N',
+                        help='of each rendered scene and seed (default: %(default)s)')
+    parser.add_argument('--real-frames', type=int, metavar='N',
+                        help='of each real sequence (default: all)')
+    parser.add_argument('--seeds', default=(0, 1, 2, 3, 4), metavar='LIST',
+                        type=lambda text: tuple(int(word) for word in text.split(',')),
+                        help='of each rendered scene (default: 0,1,2,3,4)')
     parser.add_argument('--only', type=lambda text: text.split(','), metavar='NAMES',
                         help='measure these parts alone, such as road,underwater')
-    parser.add_argument('--workers', type=int, default=os.cpu_count())
-    parser.add_argument('--output', type=Path, default=OUTPUT)
+    parser.add_argument('--workers', type=int, metavar='N',
+                        help='processes (default: one for each core)')
+    parser.add_argument('--output', type=Path, default=OUTPUT, metavar='FILE')
     data = os.environ.get('DJET_DATA')
-    parser.add_argument('--data', type=Path, default=data and Path(data),
+    parser.add_argument('--data', type=Path, default=Path(data) if data else None, metavar='DIR',
                         help='folder of real sequences (default: $DJET_DATA)')
     return parser.parse_args()
 
 
 def digest_of_the_code() -> str:
-    """Tell one state of the package from another."""
-    digest = hashlib.sha256()
+    """Tell one state of the package, and of this file, from another."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
     folder = Path(djet_ros.__file__).parent
     for path in sorted(folder.rglob('*.py')):
         digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
@@ -157,6 +186,9 @@ def place(item: tuple[str, Any]) -> tuple[bool, int, str]:
     return not known, names.index(item[0]) if known else 0, item[0]
 
 
+# What is measured
+
+
 def missing(results: dict[str, Any], args: argparse.Namespace
             ) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
     """Give the parts that are wanted and not measured yet, the longest first."""
@@ -166,15 +198,12 @@ def missing(results: dict[str, Any], args: argparse.Namespace
         frames = len([*folder.glob('image_0/*'), *folder.glob('rgb/*')])
         used = min(frames, args.real_frames or frames)
         jobs.append(Job(title(folder), (), folder, args.real_frames, used))
-    for job in sorted(jobs, key=lambda job: -job.cost):
-        if wanted(job.name, results, args):
-            yield job.name, partial(measured, job)
-    if wanted('ablation', results, args):
-        yield 'ablation', partial(ablation, args.data)
-
-
-def wanted(name: str, results: dict[str, Any], args: argparse.Namespace) -> bool:
-    return name not in results['parts'] and (not args.only or name in args.only)
+    work: dict[str, Callable[[], dict[str, Any]]] = {
+        job.name: partial(measured, job) for job in sorted(jobs, key=lambda job: -job.cost)}
+    work['ablation'] = partial(ablation, args.data)
+    for name, action in work.items():
+        if name not in results['parts'] and (not args.only or name in args.only):
+            yield name, action
 
 
 def real_sequences(data: Path | None) -> list[Path]:
@@ -191,133 +220,95 @@ def title(folder: Path) -> str:
     return f'{data_set.name} {folder.name}'
 
 
-def djet(*words: object) -> None:
-    """Run a command; its last words are the error if it fails."""
-    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, check=False,
-                          env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'})
-    if done.returncode:
-        raise CommandFailed(f'djet {" ".join(map(str, words))}: {done.stderr.strip()[-500:]}')
-
-
 def measured(job: Job) -> dict[str, Any]:
     """Measure one job with every method, as an odometry, and by its triangles."""
     started = perf_counter()
     with TemporaryDirectory() as name:
-        place = Path(name)
-        folders = [job.folder] if job.folder else list(rendered(job, place))
-        end = ('--end', job.frames) if job.frames else ()
-        djet(*LAB, 'evaluate', *folders, '--output', place / 'best', '--presets', 'best',
-             '--workers', 1, *end)
-        djet(*LAB, 'evaluate', *folders, '--output', place / 'paper', '--presets', 'paper',
-             '--methods', PAPER_METHODS, '--workers', 1, *end)
-        found = {'seeds': list(job.seeds),
-                 'methods': [*by_method(place / 'best'), *by_method(place / 'paper')],
-                 'odometry': odometry(folders, place),
-                 'closure': closure(folders[0], place, job.frames)}
+        datasets = opened_for(job, Path(name))
+        methods = [*make_methods(default_methods(), ['best'], {}),
+                   *make_methods(PAPER_METHODS, ['paper'], {})]
+        sequence, frames = opened(datasets[0]), min(job.frames or CLOSURE_FRAMES, CLOSURE_FRAMES)
+        found = {'seeds': list(job.seeds), 'methods': by_method(datasets, methods),
+                 'odometry': odometry(datasets),
+                 'closure': {method: known_figures(summary(triangles)) for method, triangles
+                             in closures(sequence, CLOSED, frames).items()}}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
-def rendered(job: Job, place: Path) -> Iterator[Path]:
-    """Render a scene with each seed; gives the sequences' folders."""
-    for seed in job.seeds:
-        out = place / f'seed{seed}'
-        djet(*LAB, 'render', job.name, out, '--seed', seed, '--frames', job.frames)
-        folder, = out.glob('sequences/*')
-        yield folder
+def opened_for(job: Job, place: Path) -> list[Dataset]:
+    """Open real frames, or render a scene with each seed."""
+    folders = [job.folder] if job.folder else [
+        render_sequence(job.name, place / f'seed{seed}', job.frames, seed) for seed in job.seeds]
+    return open_datasets(folders, Selection(end=job.frames), place)
 
 
-def by_method(folder: Path) -> list[dict[str, Any]]:
-    """Sum up an evaluation by method, over all of its sequences."""
-    times = read_csv(folder / 'timings.csv')
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row, time in zip(read_csv(folder / 'pairs.csv'), times, strict=True):
-        groups.setdefault((row['method'], row['preset']), []).append({**row, **time})
-    return [{'method': method, 'preset': preset, **summed(rows),
-             'ms': rounded(np.median([float(row['milliseconds']) for row in rows]))}
-            for (method, preset), rows in groups.items()]
+def by_method(datasets: Iterable[Dataset], methods: Sequence[Method]) -> list[dict[str, Any]]:
+    """Estimate all pairs, each by itself, and sum up by method."""
+    records = [record for dataset in datasets
+               for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
+    found = []
+    for method in methods:
+        own = [record for record in records if (record.method, record.preset, record.change)
+               == (method.name, method.preset, method.change)]
+        outcomes = [Outcome(record.sequence, record.status, record.rotation_error_deg,
+                            record.translation_error_deg, record.failed) for record in own]
+        found.append({'method': method.name, 'preset': method.preset, 'change': method.change,
+                      **summed(outcomes),
+                      'ms': rounded(np.median([record.milliseconds for record in own]))})
+    return found
 
 
-def summed(rows: list[Row]) -> dict[str, Any]:
-    """
-    Sum up rows of pairs.
-
-    failed: as djet lab evaluate counts; sure: how many of these called themselves OK; by_seed:
-    mean errors and failures of each sequence.
-    """
-    sequences: dict[str, list[Row]] = {}
-    for row in rows:
-        sequences.setdefault(row['sequence'], []).append(row)
-    return {'pairs': len(rows), 'failed': failures(rows),
-            'sure': sum(row['failed'] == '1' and row['status'] == 'OK' for row in rows),
-            'rotation': spread(errors(rows, 'rotation')),
-            'direction': spread(errors(rows, 'translation')),
-            'by_seed': [{'rotation': mean(errors(one, 'rotation')),
-                         'direction': mean(errors(one, 'translation')), 'failed': failures(one)}
-                        for one in sequences.values()]}
+def odometry(datasets: Iterable[Dataset]) -> dict[str, Any]:
+    """Sum up frames in their order, each pair with the motion before it as a start."""
+    outcomes = [outcome for dataset in datasets for outcome in tracked(dataset)]
+    surprises = np.array([outcome.surprise for outcome in outcomes])
+    surprises = surprises[np.isfinite(surprises)]
+    return {**summed(outcomes), 'surprise': {
+        'pairs': len(surprises), 'beyond': int((surprises > SURPRISING).sum()),
+        **{name: rounded(value(surprises)) if len(surprises) else None
+           for name, value in (('mean', np.mean), ('median', np.median))}}}
 
 
-def failures(rows: Iterable[Row]) -> int:
-    return sum(row['failed'] == '1' for row in rows)
+def tracked(dataset: Dataset) -> Iterator[Outcome]:
+    """Give the outcome of each pair that the odometry makes of a sequence."""
+    sequence, tracker = opened(dataset), VisualOdometry(preset('best'))
+    assert sequence.poses is not None  # datasets without poses are refused
+    stamps = sequence.stamps_ns
+    for index in dataset.frames:
+        result = tracker.process(Frame(sequence.image(index), sequence.K, int(stamps[index])))
+        if result.previous_stamp_ns is None or result.relative is None:
+            continue
+        previous = sequence.poses[np.searchsorted(stamps, result.previous_stamp_ns)]
+        true_motion = np.linalg.inv(previous) @ sequence.poses[index]
+        if not np.isfinite(true_motion).all():
+            continue
+        rotation, direction = motion_errors(result.status, camera_motion(result.relative),
+                                            true_motion)
+        yield Outcome(dataset.name, result.status.value, rotation, direction,
+                      has_failed(rotation, direction, true_motion),
+                      surprise(result.relative, true_motion) if np.isfinite(direction)
+                      else float('nan'))
 
 
-def errors(rows: Iterable[Row], what: str) -> list[float]:
-    """Give the errors in degrees that are known."""
-    return [float(row[f'{what}_error_deg']) for row in rows if row[f'{what}_error_deg']]
-
-
-def spread(values: list[float]) -> dict[str, float | None]:
-    if not values:
-        return dict.fromkeys(('mean', 'median', 'p95', 'max'))
-    return {'mean': mean(values), 'median': rounded(np.median(values)),
-            'p95': rounded(np.percentile(values, 95)), 'max': rounded(max(values))}
-
-
-def mean(values: list[float]) -> float | None:
-    return rounded(np.mean(values)) if values else None
-
-
-def odometry(folders: Iterable[Path], place: Path) -> dict[str, Any]:
-    """
-    Sum up replays: pairs in their order, each with the motion before it as a start.
-
-    Whole sequences are replayed; rendered ones have no more frames than are wanted.
-    """
-    rows: list[Row] = []
-    for index, folder in enumerate(folders):
-        output = place / f'replay{index}'
-        djet('replay', folder, '--output', output)
-        rows += [{**row, 'sequence': str(index), 'failed': str(int(gross(row)))}
-                 for row in read_csv(output / 'errors.csv')]
-    return summed(rows)
-
-
-def gross(row: Row) -> bool:
-    """Tell whether a row of errors.csv is of no use."""
-    rotation, direction = row['rotation_error_deg'], row['translation_error_deg']
-    return (not rotation or float(rotation) > GROSS_ROTATION
-            or bool(direction and float(direction) > GROSS_DIRECTION))
-
-
-def closure(folder: Path, place: Path, frames: int | None) -> dict[str, Any]:
-    """Triangles of three frames of one sequence: what they leave, and what was claimed."""
-    output = place / 'closure.json'
-    djet(*LAB, 'closure', folder, '--output', output, '--frames',
-         min(frames or CLOSURE_FRAMES, CLOSURE_FRAMES))
-    summary: dict[str, dict[str, float]] = json.loads(output.read_text())['summary']
-    return {method: {name: rounded(value) for name, value in one.items()}
-            for method, one in summary.items()}
+def surprise(pose: RelativePose, true_motion: Array) -> float:
+    """Squared error of a pose over its covariance (5, 5); 5 on average if that is true."""
+    R = true_motion[:3, :3].T
+    t = unit(-R @ true_motion[:3, 3])
+    error = np.concatenate([Rotation.from_matrix(R @ pose.R.T).as_rotvec(),
+                            sphere_tangents(pose.t).T @ (t - pose.t)])
+    return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
 def ablation(data: Path | None) -> dict[str, Any]:
     """Measure variants of D-JET on KITTI's frames, or on a street if there are none."""
     started = perf_counter()
     with TemporaryDirectory() as name:
-        place = Path(name)
-        folders = kitti_or_street(data, place)
-        djet(*LAB, 'ablate', *folders, '--output', place / 'ablation', '--presets', 'best',
-             '--end', ABLATED, '--workers', 1)
-        found = {'of': [title(folder) for folder in folders], 'frames': ABLATED,
-                 'variants': variants(place / 'ablation')}
+        jobs = [Job(title(folder), (), folder, ABLATED_FRAMES, 0) for folder in kitti(data)]
+        jobs = jobs or [Job('road', (0,), None, ABLATED_FRAMES, 0)]
+        datasets = [dataset for job in jobs for dataset in opened_for(job, Path(name))]
+        methods = ablation_methods(['best'], PARTS, ABLATED_WINDOWS, {})
+        found = {'of': [job.name for job in jobs], 'frames': ABLATED_FRAMES,
+                 'variants': by_method(datasets, methods)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
@@ -325,31 +316,51 @@ def speed(data: Path | None) -> dict[str, Any]:
     """Measure the time of a pair against OpenCV's plain chain."""
     started = perf_counter()
     with TemporaryDirectory() as name:
-        place = Path(name)
-        folder = kitti_or_street(data, place)[0]
-        djet(*LAB, 'bench', folder, '--output', place / 'bench.json', '--pairs', BENCH_PAIRS)
-        found = {'of': title(folder), **json.loads((place / 'bench.json').read_text())}
+        real = kitti(data)
+        folder = real[0] if real else render_sequence('road', Path(name), BENCH_PAIRS + 1)
+        found = {'of': title(folder) if real else 'road', **bench(folder, BENCH_PAIRS)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
-def kitti_or_street(data: Path | None, place: Path) -> list[Path]:
-    """Folders of KITTI's sequences, or of a rendered street."""
-    real = [folder for folder in real_sequences(data) if title(folder).startswith('kitti')]
-    return real or list(rendered(Job('road', (0,), None, ABLATED, 0), place))
+def kitti(data: Path | None) -> list[Path]:
+    """Folders of KITTI's sequences."""
+    return [folder for folder in real_sequences(data) if title(folder).startswith('kitti')]
 
 
-def variants(folder: Path) -> list[dict[str, Any]]:
-    """Rows of an ablation over all of its sequences."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in read_csv(folder / 'pairs.csv'):
-        groups.setdefault((row['method'], row['change']), []).append(row)
-    return [{'method': method, 'change': change, **summed(rows)}
-            for (method, change), rows in groups.items()]
+# How it is summed up
 
 
-def read_csv(path: Path) -> list[Row]:
-    with path.open(newline='') as file:
-        return list(csv.DictReader(file))
+def summed(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """
+    Sum up the outcomes of pairs.
+
+    sure: how many of the failed ones called themselves OK; by_seed: mean errors and failures of
+    each sequence.
+    """
+    sequences: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        sequences.setdefault(outcome.sequence, []).append(outcome)
+    return {'pairs': len(outcomes), 'failed': sum(one.failed for one in outcomes),
+            'sure': sum(one.failed and one.status == Status.OK.value for one in outcomes),
+            'rotation': spread([one.rotation for one in outcomes]),
+            'direction': spread([one.direction for one in outcomes]),
+            'by_seed': [{'rotation': spread([one.rotation for one in some])['mean'],
+                         'direction': spread([one.direction for one in some])['mean'],
+                         'failed': sum(one.failed for one in some)}
+                        for some in sequences.values()]}
+
+
+def spread(values: Iterable[float]) -> dict[str, float | None]:
+    """Mean, median, 95th percentile and maximum of the values that are known."""
+    known = np.array([value for value in values if np.isfinite(value)])
+    if not len(known):
+        return dict.fromkeys(('mean', 'median', 'p95', 'max'))
+    return {'mean': rounded(known.mean()), 'median': rounded(np.median(known)),
+            'p95': rounded(np.percentile(known, 95)), 'max': rounded(known.max())}
+
+
+def known_figures(figures: dict[str, Any]) -> dict[str, float | None]:
+    return {name: rounded(value) for name, value in figures.items()}
 
 
 def rounded(value: Any) -> float | None:

@@ -28,6 +28,9 @@ TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-poin
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
 # The README's columns, where they were measured.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
+DIGITS = {'rotation': 4, 'direction': 3}
+# Errors below this, in degrees, are as good as none.
+EQUAL = 0.001
 # Scenes in which the camera does not move from its place have no direction to compare.
 NO_WAY = ('rotation', 'standstill')
 
@@ -164,9 +167,11 @@ def comparison(part: Any) -> str:
               'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'ms')
     rows = []
     for one in part['methods']:
-        figures = [figure for what in ('rotation', 'direction')
-                   for figure in (*(number(one[what][name]) for name in ('mean', 'median', 'p95')),
-                                  *(number(worst_seed(one, what)) for _ in worst))]
+        figures = []
+        for what, digits in DIGITS.items():
+            values = [one[what][name] for name in ('mean', 'median', 'p95')]
+            values += [worst_seed(one, what)] if worst else []
+            figures += [number(value, digits) for value in values]
         rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
                      *figures, str(one['failed']), str(one['sure']), f'{one["ms"]:.0f}'))
     return f'{head}.\n\n{table(header, rows)}'
@@ -185,8 +190,8 @@ def against_rpe(results: Any) -> str:
             rows.append((name, preset, *(ratio(ours, theirs, what, kind)
                                          for what in ('rotation', 'direction')
                                          for kind in ('mean', 'median')),
-                         f'{ours["failed"]} / {theirs["failed"]}'))
-    lost = [f'{row[0]} ({row[1]})' for row in rows if '**' in ''.join(row)]
+                         failures(ours, theirs)))
+    lost = [f'{row[0]} (`{row[1]}`)' for row in rows if '**' in ''.join(row)]
     verdict = (f'D-JET is behind in at least one of these figures on: {", ".join(lost)}.' if lost
                else 'D-JET is behind in none of these figures.')
     return (f'D-JET over RP-E with the same matches, starts and loss; below 1 D-JET is better, '
@@ -195,10 +200,16 @@ def against_rpe(results: Any) -> str:
                      'failed, D-JET / RP-E'), rows))
 
 
+def failures(ours: Any, theirs: Any) -> str:
+    text = f'{ours["failed"]} / {theirs["failed"]}'
+    return f'**{text}**' if ours['failed'] > theirs['failed'] else text
+
+
 def ratio(ours: Any, theirs: Any, what: str, kind: str) -> str:
-    if not ours[what][kind] or not theirs[what][kind]:
+    both = ours[what][kind], theirs[what][kind]
+    if None in both or max(both) < EQUAL:
         return '–'
-    value = ours[what][kind] / theirs[what][kind]
+    value = both[0] / max(both[1], 1e-9)
     return f'**{value:.2f}**' if value > 1 else f'{value:.2f}'
 
 
@@ -207,17 +218,31 @@ def odometry(results: Any) -> str:
     for name, part in sequences(results):
         one = part['odometry']
         rows.append((name, str(one['pairs']),
-                     *(number(one[what][kind]) for what in ('rotation', 'direction')
+                     *(number(one[what][kind], DIGITS[what])
+                       for what in ('rotation', 'direction')
                        for kind in ('mean', 'median', 'max')),
                      str(one['failed']), str(one['sure'])))
     return table(('', 'pairs', 'rotation: mean', 'median', 'largest', 'direction: mean', 'median',
                   'largest', 'failed', 'of these `OK`'), rows)
 
 
+def surprise(results: Any) -> str:
+    rows = []
+    for name, part in sequences(results):
+        one = part['odometry']['surprise']
+        if one['pairs']:
+            rows.append((name, str(one['pairs']), number(one['mean'], 1),
+                         number(one['median'], 1), str(one['beyond'])))
+    return table(('', 'pairs', 'mean (5 if true)', 'median (4.4 if true)',
+                  'beyond the 99.9 % bound'), rows)
+
+
 def closure(results: Any) -> str:
     rows = []
     for name, part in sequences(results):
         for method, one in part['closure'].items():
+            if not one['triangles']:
+                continue
             rows.append((name, TITLES[method], number(one['median_deg']), number(one['p95_deg']),
                          number(one['claimed_median_deg']),
                          number(one['normalised_square_mean'], 1),
@@ -285,7 +310,7 @@ def cell_of(one: Any, kind: str) -> str:
 
 
 def pair_of(one: Any, kind: str) -> str:
-    return f'{number(one["rotation"][kind])} / {number(one["direction"][kind], 2)}'
+    return f'{number(one["rotation"][kind], 4)} / {number(one["direction"][kind])}'
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -297,7 +322,8 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'rooms': rooms, 'reports': reports, 'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
     'measured with': measured_with, 'compared': compared, 'against rpe': against_rpe,
-    'odometry': odometry, 'closure': closure, 'ablation': ablation, 'speed': speed,
+    'odometry': odometry, 'surprise': surprise, 'closure': closure,
+    'ablation': ablation, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height')},
 }
