@@ -35,12 +35,13 @@ from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.bench import bench
 from djet_ros.lab.closure import closures, summary
 from djet_ros.lab.methods import default_methods, make_methods, Method
-from djet_ros.lab.pairs import camera_motion, evaluate_chunk, has_failed, PairChunk
+from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk
 from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.recordings.outputs import write_whole
 from djet_ros.replay.pair_errors import motion_errors
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -174,9 +175,7 @@ def versions() -> dict[str, str]:
 def write(output: Path, results: dict[str, Any]) -> None:
     """Write all that is known so far, whole or not at all."""
     ordered = {**results, 'parts': dict(sorted(results['parts'].items(), key=place))}
-    beside = output.with_suffix('.part')
-    beside.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + '\n')
-    beside.replace(output)
+    write_whole(output, json.dumps(ordered, indent=1, ensure_ascii=False) + '\n')
 
 
 def place(item: tuple[str, Any]) -> tuple[bool, int, str]:

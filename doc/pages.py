@@ -12,6 +12,7 @@ import json
 from pathlib import Path
 import re
 import sys
+import textwrap
 from typing import Any
 
 import yaml
@@ -28,6 +29,7 @@ TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-poin
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
 # The README's columns, where they were measured.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
+DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
@@ -55,6 +57,10 @@ def data(name: str) -> Any:
     return yaml.safe_load((DOC / f'{name}.yaml').read_text())
 
 
+def paragraph(text: str) -> str:
+    return textwrap.fill(text, 110, break_long_words=False, break_on_hyphens=False) + '\n\n'
+
+
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [header, ['---'] * len(header), *rows]
     return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
@@ -66,7 +72,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def recorded(name: str) -> Callable[[Any], str]:
     def block(_: Any) -> str:
         one = data('recorded')[name]
-        return (f'Measured with version {one["version"]}. {one["how"]}\n\n'
+        return (paragraph(f'Measured with version {one["version"]}. {one["how"]}')
                 + table(one['header'], one['rows']))
     return block
 
@@ -133,8 +139,8 @@ def summary(results: Any) -> str:
     shown = [name for name in SHOWN if name in methods_of(results)]
     rows = [(name, str(pairs(part)), *(cell(part, method, 'mean') for method in shown))
             for name, part in sequences(results) if name not in NO_WAY]
-    return (f'Mean errors in degrees, rotation / direction of translation, and failed pairs in '
-            f'brackets. {conditions(results)}\n\n'
+    return (paragraph('Mean errors in degrees, rotation / direction of translation, and failed '
+                      f'pairs in brackets. {conditions(results)}')
             + table(('', 'pairs', *(TITLES[name] for name in shown)), rows))
 
 
@@ -149,9 +155,9 @@ def measured_with(results: Any) -> str:
     versions = ', '.join(f'{name} {number}' for name, number in results['versions'].items())
     real = results['settings']['real_frames']
     state = '' if results['complete'] else '**This run is not complete.** '
-    return (f'{state}{conditions(results)} Real sequences are taken '
-            f'{f"to frame {real}" if real else "as far as they are there"}. '
-            f'Measured on {results["cores"]} cores with {versions}.\n')
+    return paragraph(f'{state}{conditions(results)} Real sequences are taken '
+                     f'{f"to frame {real}" if real else "as far as they are there"}. '
+                     f'Measured on {results["cores"]} cores with {versions}.')
 
 
 def compared(results: Any) -> str:
@@ -181,23 +187,26 @@ def worst_seed(one: Any, what: str) -> float | None:
     return max((seed[what] for seed in one['by_seed'] if seed[what] is not None), default=None)
 
 
-def against_rpe(results: Any) -> str:
-    """Say, sequence by sequence, how D-JET does against re-projection error."""
-    rows = []
-    for preset in ('best', 'paper'):
-        for name, part in sequences(results):
-            ours, theirs = find(part, 'djet', preset), find(part, 'rpe', preset)
-            rows.append((name, preset, *(ratio(ours, theirs, what, kind)
-                                         for what in ('rotation', 'direction')
-                                         for kind in ('mean', 'median')),
-                         failures(ours, theirs)))
-    lost = [f'{row[0]} (`{row[1]}`)' for row in rows if '**' in ''.join(row)]
-    verdict = (f'D-JET is behind in at least one of these figures on: {", ".join(lost)}.' if lost
-               else 'D-JET is behind in none of these figures.')
-    return (f'D-JET over RP-E with the same matches, starts and loss; below 1 D-JET is better, '
-            f'above it, in bold, worse. {verdict}\n\n'
-            + table(('', 'preset', 'rotation: mean', 'median', 'direction: mean', 'median',
-                     'failed, D-JET / RP-E'), rows))
+def against(other: str, presets: Sequence[str]) -> Callable[[Any], str]:
+    """Say, sequence by sequence, how D-JET does against another method of ours."""
+    def block(results: Any) -> str:
+        rows = [compared_row(name, part, other, preset)
+                for preset in presets for name, part in sequences(results)]
+        behind = [f'{row[0]} (`{row[1]}`)' for row in rows if '**' in ''.join(row)]
+        return paragraph(
+            f'D-JET over {TITLES[other]} on the same matches, each with the preset that is named: '
+            'below 1 D-JET is better, above it, in bold, worse. '
+            + (f'It is behind in at least one figure on: {", ".join(behind)}.' if behind
+               else 'It is behind in none.')
+        ) + table(('', 'preset', 'rotation: mean', 'median', 'direction: mean', 'median',
+                   f'failed, D-JET / {TITLES[other]}'), rows)
+    return block
+
+
+def compared_row(name: str, part: Any, other: str, preset: str) -> tuple[str, ...]:
+    ours, theirs = find(part, 'djet', preset), find(part, other, preset)
+    return (name, preset, *(ratio(ours, theirs, what, kind) for what in DIGITS
+                            for kind in ('mean', 'median')), failures(ours, theirs))
 
 
 def failures(ours: Any, theirs: Any) -> str:
@@ -209,7 +218,7 @@ def ratio(ours: Any, theirs: Any, what: str, kind: str) -> str:
     both = ours[what][kind], theirs[what][kind]
     if None in both or max(both) < EQUAL:
         return '–'
-    value = both[0] / max(both[1], 1e-9)
+    value = max(both[0], EQUAL) / max(both[1], EQUAL)
     return f'**{value:.2f}**' if value > 1 else f'{value:.2f}'
 
 
@@ -258,7 +267,8 @@ def ablation(results: Any) -> str:
         return 'Not measured yet.\n'
     rows = [(TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
              pair_of(one, 'median')) for one in part['variants']]
-    return (f'Over the first {part["frames"]} frames of {", ".join(part["of"])}.\n\n'
+    return (paragraph(f'Over the first {part["frames"]} frames of '
+                      f'{", ".join(map(known_as, part["of"]))}.')
             + table(('method', 'change', 'mean (failed)', 'median'), rows))
 
 
@@ -274,16 +284,24 @@ def speed(results: Any) -> str:
     growth = [(f'{name} {key}', f'{value:.1f}')
               for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))
               for key, value in part[by].items()]
-    return (f'Of {part["of"]}, {part["pairs"]} pairs, from file to pose.\n\n'
-            + table(('', 'one thread', 'all cores'), rows)
-            + f'\nThe D-JET stage, surfaces and optimisation, in ms. A dense descriptor costs '
-            f'1/{part["kernel_speedup_over_cv2"]:.0f} of one by `cv2.ORB.compute`; a frame that '
-            f'is kept takes {part["bytes_per_frame"] / 1e6:.1f} MB.\n\n'
+    return (paragraph(f'Of {known_as(part["of"])}, {part["pairs"]} pairs, from file to pose.')
+            + table(('', 'one thread', 'all cores'), rows) + '\n'
+            + paragraph('The D-JET stage, surfaces and optimisation, in ms. A pixel of a surface '
+                        f'costs 1/{part["kernel_speedup_over_cv2"]:.0f} of a descriptor by '
+                        '`cv2.ORB.compute`; a frame that is kept takes '
+                        f'{part["bytes_per_frame"] / 1e6:.1f} MB.')
             + table(('', 'ms'), growth))
 
 
 def sequences(results: Any) -> list[tuple[str, Any]]:
-    return [(name, part) for name, part in results['parts'].items() if 'methods' in part]
+    return [(known_as(name), part) for name, part in results['parts'].items()
+            if 'methods' in part]
+
+
+def known_as(name: str) -> str:
+    """Name of a sequence as people know it."""
+    data_set, _, sequence = name.partition(' ')
+    return f'{DATA_SETS.get(data_set, data_set)} {sequence.removeprefix("rgbd_dataset_")}'.strip()
 
 
 def methods_of(results: Any) -> set[str]:
@@ -321,7 +339,8 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'summary': summary, 'short dependencies': short_dependencies, 'dependencies': dependencies,
     'rooms': rooms, 'reports': reports, 'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
-    'measured with': measured_with, 'compared': compared, 'against rpe': against_rpe,
+    'measured with': measured_with, 'compared': compared,
+    'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
     'odometry': odometry, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'speed': speed,
     **{name: recorded(name) for name in (
