@@ -121,7 +121,7 @@ def test_two_images_and_a_camera_are_as_good_as_a_sequence(road, tmp_path, capsy
     (['similarity', 'nowhere.png'], 'nowhere.png could not be read: No such file or directory'),
     (['similarity', 'text'], 'text: compressed image is neither JPEG nor PNG'),
     (['similarity', 'image', '--points', '5,5'], 'point 5,5 is too close to the border'),
-    (['similarity', 'image', '--points', '5'], "point '5' is not of the form X,Y"),
+    (['similarity', 'image', '--points', '5'], "--points is '5'; give X,Y"),
     (['similarity', 'image', '--radius', '500'], 'between 2 and 100'),
     (['similarity', 'image', 'image', '--points', '1,1'], 'no keypoint with a match is within'),
     (['similarity', 'flat'], 'no keypoint has 20 pixels of image around it'),

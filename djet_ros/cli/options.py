@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from djet_ros.errors import DjetError
 from djet_ros.recordings.outputs import check_file, write_whole
 
 
@@ -63,3 +64,14 @@ def add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
 def split(text: str) -> list[str]:
     """Give the words of a comma-separated list."""
     return [word.strip() for word in text.split(',') if word.strip()]
+
+
+def numbers(text: str, option: str, form: str) -> list[float]:
+    """Give the numbers of a list in a form such as X,Y; DjetError if it has another."""
+    try:
+        values = [float(word) for word in split(text)]
+    except ValueError:
+        values = []
+    if len(values) != len(split(form)):
+        raise DjetError(f"{option} is '{text}'; give {form}")
+    return values

@@ -120,8 +120,7 @@ def number(value: float, digits: int) -> str:
 
 def rows_csv(rows: Sequence[TableRow], *, with_change: bool) -> str:
     """Rows as CSV; the column ``change`` only where asked for."""
-    names = [field.name for field in fields(TableRow) if with_change or field.name != 'change']
-    return _csv(names, (asdict(row) for row in rows))
+    return _csv([field.name for field in fields(TableRow)], map(asdict, rows), with_change)
 
 
 # Columns of pairs.csv; times stand in a file of their own, because they alone differ from run
@@ -133,18 +132,16 @@ def pairs_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
     """Give the records of all pairs as CSV, without their times."""
     vectors = {'rotation': ('rx', 'ry', 'rz'), 'translation': ('tx', 'ty', 'tz')}
     names = [column for field in fields(PairRecord)
-             for column in vectors.get(field.name, (field.name,))
-             if column != 'milliseconds' and (with_change or column != 'change')]
+             for column in vectors.get(field.name, (field.name,)) if column != 'milliseconds']
     return _csv(names, ({**asdict(record), 'failed': int(record.failed),
                          **dict(zip(('rx', 'ry', 'rz'), record.rotation)),
                          **dict(zip(('tx', 'ty', 'tz'), record.translation))}
-                        for record in records))
+                        for record in records), with_change)
 
 
 def timings_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
     """Give the times of all pairs as CSV."""
-    names = [name for name in _PAIR_KEY if with_change or name != 'change']
-    return _csv([*names, 'milliseconds'], (asdict(record) for record in records))
+    return _csv((*_PAIR_KEY, 'milliseconds'), map(asdict, records), with_change)
 
 
 def table_csv(table: Table) -> str:
@@ -152,7 +149,8 @@ def table_csv(table: Table) -> str:
     return _csv(table.header, (dict(zip(table.header, line.cells)) for line in table.lines))
 
 
-def _csv(names: Sequence[str], rows: Iterable[dict[str, Any]]) -> str:
+def _csv(names: Sequence[str], rows: Iterable[dict[str, Any]], with_change: bool = True) -> str:
+    names = [name for name in names if with_change or name != 'change']
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(names)

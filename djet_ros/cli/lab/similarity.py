@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from djet_ros.cli.options import add_output, check_output
+from djet_ros.cli.options import add_output, check_output, numbers
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -47,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
     check_output(args, '.png')
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
-    points = None if args.points is None else np.array([_point(text) for text in args.points])
+    points = None if args.points is None else np.array(
+        [numbers(text, '--points', 'X,Y') for text in args.points])
     config = from_flat(flag_values(args)).estimator
     if not config.window // 2 <= args.radius <= _LARGEST_RADIUS or args.count < 1:
         raise DjetError(f'--radius is {args.radius} and --count {args.count}; the radius must lie '
@@ -59,11 +60,3 @@ def run(args: argparse.Namespace) -> int:
     draw_similarity(args.output, gray, other, similarity)
     print(f'figure: {args.output}')
     return 0
-
-
-def _point(text: str) -> tuple[float, float]:
-    try:
-        x, y = (float(word) for word in text.split(','))
-    except ValueError:
-        raise DjetError(f"point '{text}' is not of the form X,Y in pixels") from None
-    return x, y

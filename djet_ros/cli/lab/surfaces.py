@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from djet_ros.cli.options import add_output, check_output
+from djet_ros.cli.options import add_output, check_output, numbers
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
@@ -69,14 +69,8 @@ def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uin
             return pair_of_frames(args.source, args.pair, Path(workspace))
     if args.camera is None:
         raise DjetError('two images need --camera FX,FY,CX,CY')
-    return read_image(args.source), read_image(args.other), _camera(args.camera)
-
-
-def _camera(text: str) -> Array:
-    try:
-        fx, fy, cx, cy = (float(word) for word in text.split(','))
-    except ValueError:
-        raise DjetError(f"--camera is '{text}'; give FX,FY,CX,CY in pixels") from None
+    fx, fy, cx, cy = numbers(args.camera, '--camera', 'FX,FY,CX,CY')
     if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
-        raise DjetError(f"--camera is '{text}'; focal lengths must be positive numbers")
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        raise DjetError(f"--camera is '{args.camera}'; focal lengths must be positive numbers")
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return read_image(args.source), read_image(args.other), K
