@@ -10,7 +10,7 @@ import tracemalloc
 
 from cards import Cards, K, pose
 import cv2
-from djet_ros.config.sections import SlamConfig
+from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
@@ -19,12 +19,12 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
-from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import compose
 from djet_ros.posegraph.graph import Edge, PoseGraph
-from djet_ros.posegraph.images import Seen, SeenFile
-from djet_ros.posegraph.keyframes import choose_keyframes, without_common_length
+from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder, transferred_length
 from djet_ros.posegraph.places import PlaceIndex
+from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 import pytest
@@ -59,6 +59,15 @@ def chain(poses, covariance=None):
     return PoseGraph(10**9 + np.arange(len(poses)) * 10**8, poses, tuple(edges))
 
 
+def steps(poses):
+    """Give the steps of an odometry that took these poses."""
+    graph = chain(poses)
+    return [Step(10**9, Status.FIRST_FRAME, poses[0])] + [
+        Step(int(graph.stamps_ns[edge.target]), Status.OK, poses[edge.target],
+             int(graph.stamps_ns[edge.source]), edge.motion, edge.covariance, True)
+        for edge in graph.edges]
+
+
 def loop(true, source, target):
     return Edge(source, target, np.linalg.inv(true[source]) @ true[target],
                 np.diag(SIGMAS**2), 'loop')
@@ -66,38 +75,53 @@ def loop(true, source, target):
 
 # Keyframes
 
-def test_keyframes_come_by_way_and_by_turn():
+@pytest.fixture(scope='module')
+def keyframes():
+    """Give what keeps keyframes of steps, and where each frame is; GTSAM must be installed."""
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.posegraph.keyframe_map import KeyframeMap
+
+    def grown(steps, **slam):
+        kept, offsets = KeyframeMap(Config(slam=SlamConfig(**slam))), []
+        for step in steps:
+            kept.extend(step, lambda stamp: Frame(np.zeros((64, 64), np.uint8), K, stamp))
+            assert not kept.seek()
+            offsets.append(kept.newest)
+        return kept, offsets
+    return grown
+
+
+def test_keyframes_come_by_length_and_by_turn(keyframes):
     straight = np.array([pose(z=0.5 * i) for i in range(9)])
     turning = np.array([pose(yaw=np.radians(4 * i)) for i in range(9)])
     for poses, expected in ((straight, [0, 4, 8]), (turning, [0, 3, 6])):
-        keyframes = choose_keyframes(chain(poses), SlamConfig())
-        assert keyframes.graph.stamps_ns.tolist() == [10**9 + i * 10**8 for i in expected]
-        assert [(edge.source, edge.target) for edge in keyframes.graph.edges] == [(0, 1), (1, 2)]
+        kept, _ = keyframes(steps(poses))
+        assert [one.stamp_ns for one in kept.keyframes] == [10**9 + i * 10**8 for i in expected]
+        assert [(edge.source, edge.target) for edge in kept.edges] == [(0, 1), (1, 2)]
 
 
-def test_all_frames_hang_on_their_keyframes():
+def test_all_frames_have_offsets_from_their_keyframes(keyframes):
     _, poses = twice_round()
-    keyframes = choose_keyframes(chain(poses), SlamConfig(keyframe_distance=3.0))
-    assert np.allclose(keyframes.all_poses(keyframes.graph.poses), poses, atol=1e-9)
-    moved = pose(x=1.0, yaw=0.3)
-    assert np.allclose(keyframes.all_poses(moved @ keyframes.graph.poses), moved @ poses)
+    kept, offsets = keyframes(steps(poses), keyframe_distance=3.0)
+    assert np.allclose([kept.keyframes[one.keyframe].pose @ one.motion for one in offsets], poses,
+                       atol=1e-9)
 
 
-def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps():
+def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps(keyframes):
     rng = np.random.default_rng(0)
-    steps, samples = [pose(z=1.0, yaw=0.1)] * 3, []
+    motions, samples = [pose(z=1.0, yaw=0.1)] * 3, []
     for _ in range(4000):
         way = np.eye(4)
-        for step in steps:
+        for step in motions:
             noise = rng.normal(size=6) * SIGMAS
             wrong = step.copy()
             wrong[:3, 3] += noise[:3]
             wrong[:3, :3] = rotation_exp(noise[3:]) @ wrong[:3, :3]
             way = way @ wrong
         samples.append(way)
-    poses = np.array([np.eye(4), steps[0], steps[0] @ steps[1], steps[0] @ steps[1] @ steps[2]])
-    config = SlamConfig(keyframe_distance=2.5, keyframe_turn=90)
-    edge, = choose_keyframes(chain(poses), config).graph.edges
+    poses = np.array([np.linalg.matrix_power(motions[0], i) for i in range(4)])
+    kept, _ = keyframes(steps(poses), keyframe_distance=2.5, keyframe_turn=90)
+    edge, = kept.edges
     off = np.array([[*(way[:3, 3] - edge.motion[:3, 3]),
                      *cv2.Rodrigues(way[:3, :3] @ edge.motion[:3, :3].T)[0].ravel()]
                     for way in samples])
@@ -106,36 +130,46 @@ def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps():
 
 
 def test_an_error_common_to_all_lengths_is_no_freedom_of_each():
-    """Lengths known to 5 %, of which 1 % is their own, are as firm as those known to 1 %."""
-    _, poses = twice_round()
+    """A length known to 5 %, of which 1 % is its own, is as firm as one known to 1 %."""
+    motion = pose(x=0.3, z=2.0, yaw=0.1)
 
     def known_to(share):
-        graph = chain(poses)
-        return replace(graph, edges=tuple(
-            replace(edge, covariance=np.diag(SIGMAS**2) + share**2 * np.outer(*[np.pad(
-                edge.motion[:3, 3], (0, 3))] * 2)) for edge in graph.edges))
+        length = np.pad(motion[:3, 3], (0, 3))
+        return Edge(0, 1, motion, np.diag(SIGMAS**2 * 1e-4) + share**2 * np.outer(length, length))
 
-    firm = without_common_length(known_to(0.05), 0.05, 0.01)
-    for edge, other in zip(firm.edges, known_to(0.01).edges, strict=True):
-        assert np.allclose(edge.covariance, other.covariance, atol=1e-15)
-        firm.information(edge)
-    better = known_to(0.01)
-    assert without_common_length(better, 0.01, 0.02) is better
-    unknown = known_to(0.05)
-    unknown = replace(unknown, edges=tuple(
-        replace(edge, scale_known=False) for edge in unknown.edges))
-    for edge, other in zip(without_common_length(unknown, 0.05, 0.01).edges, unknown.edges):
-        assert edge is other
+    firm = replace(known_to(0.05), covariance=known_to(0.05).own_covariance(0.05, 0.01))
+    assert np.allclose(firm.covariance, known_to(0.01).covariance, atol=1e-15)
+    firm.information()
+    assert np.array_equal(known_to(0.01).own_covariance(0.01, 0.02), known_to(0.01).covariance)
 
 
-def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so():
-    graph = chain(np.array([pose(z=0.1 * i) for i in range(4)]))
-    hole = replace(graph.edges[1], kind='unknown', covariance=UNKNOWN_MOTION, scale_known=False)
-    graph = replace(graph, edges=(graph.edges[0], hole, graph.edges[2]))
-    keyframes = choose_keyframes(graph, SlamConfig())
-    edge, = keyframes.graph.edges
+def test_a_length_that_nobody_knows_may_be_another_but_not_any():
+    """Its standard deviation is itself, and that of what is known beside it stays."""
+    motion, direction = pose(z=2.0), np.diag([0, 0, 1.0, 0, 0, 0])
+    edge = Edge(0, 1, motion, np.diag(SIGMAS**2) + 1e6 * direction, scale_known=False)
+    assert np.allclose(edge.own_covariance(0.05, 0.01),
+                       np.diag([*SIGMAS[:2]**2, 2.0**2, *SIGMAS[3:]**2]))
+
+
+def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so(keyframes):
+    told = steps(np.array([pose(z=0.1 * i) for i in range(4)]))
+    told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, told[2].pose)
+    kept, offsets = keyframes(told)
+    edge, = kept.edges
     assert (edge.kind, edge.scale_known) == ('unknown', False)
-    assert keyframes.keyframe.tolist() == [0, 0, 1, 1]
+    assert [one.keyframe for one in offsets] == [0, 0, 1, 1]
+
+
+def test_bad_frames_and_stationary_ones_are_passed_by(keyframes):
+    """A step may be told from the frame before the last; it then has its keyframe."""
+    told = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))
+    told[3] = replace(told[3], previous_stamp_ns=told[1].stamp_ns)
+    kept, offsets = keyframes(told)
+    edge, = kept.edges
+    assert np.allclose(edge.motion, pose(z=2.5))
+    assert [one.keyframe for one in offsets] == [0, 0, 0, 1]
+    assert np.allclose(edge.covariance, compose(pose(z=1.5), told[1].covariance, pose(z=1.0),
+                                                told[3].covariance))
 
 
 @pytest.mark.parametrize(('name', 'value'), [
@@ -198,8 +232,8 @@ def test_votes_come_from_all_keyframes_however_many_there_are(features):
 def test_a_file_gives_back_the_keyframes_that_were_put_there():
     cards, estimator = Cards(), TwoViewEstimator()
     frames = [cards.frame(0.1 * i, pose(x=0.2 * i)) for i in range(4)]
-    seen = [Seen(frame, estimator.features(frame.gray)) for frame in frames]
-    with SeenFile() as file:
+    seen = [KeyframeImage(frame, estimator.features(frame.gray)) for frame in frames]
+    with KeyframeFile() as file:
         file.update(enumerate(seen))
         del file[1]
         assert [*file] == [0, 2, 3]
@@ -215,9 +249,9 @@ def test_a_file_gives_back_the_keyframes_that_were_put_there():
 
 def test_keyframes_in_a_file_take_no_memory():
     gray = np.random.default_rng(0).integers(0, 256, (400, 1000), np.uint8)
-    seen = Seen(Frame(gray, K, 1), TwoViewEstimator().features(gray))
+    seen = KeyframeImage(Frame(gray, K, 1), TwoViewEstimator().features(gray))
     tracemalloc.start()
-    with SeenFile() as file:
+    with KeyframeFile() as file:
         for number in range(50):
             file[number] = seen
         kept, _ = tracemalloc.get_traced_memory()
@@ -228,14 +262,14 @@ def test_keyframes_in_a_file_take_no_memory():
 
 def test_a_folder_without_room_is_said(tmp_path):
     with pytest.raises(DjetError, match='nowhere'):
-        SeenFile(tmp_path / 'nowhere')
-    with SeenFile(tmp_path) as file, pytest.raises(DjetError, match='make room'):
+        KeyframeFile(tmp_path / 'nowhere')
+    with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='make room'):
         # as long as a file may be, as on a full disk
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
             frame = Cards().frame(0.1)
-            file[0] = Seen(frame, TwoViewEstimator().features(frame.gray))
+            file[0] = KeyframeImage(frame, TwoViewEstimator().features(frame.gray))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
@@ -245,7 +279,7 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
     poses = [pose(x=0.5 * i) for i in (*range(4), *range(2, -1, -1))]
     graph = chain(np.array(poses))
     found = []
-    with SeenFile() as file:
+    with KeyframeFile() as file:
         for kept in (None, file):
             finder = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25), kept)
             edges = []

@@ -19,7 +19,7 @@ from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import make_room
 from djet_ros.recordings.recording import open_recording, Recording
-from djet_ros.replay.graph_of_results import read_results
+from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.results import SUMMARY as REPLAY_SUMMARY
 from rich.console import Console
@@ -68,9 +68,9 @@ def run(args: argparse.Namespace) -> int:
     source, name = _source(results, args)
     try:
         config = with_values(load_yaml(results / 'config.yaml'), of_slam)
-        frames = read_results(results)
-        with progress_bar('keyframes') as progress:
-            slam = run_slam(frames, source, config, progress, args.output)
+        steps = read_steps(results)
+        with progress_bar('frames') as progress:
+            slam = run_slam(steps, source, config, progress, args.output)
         truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
     finally:
         source.close()

@@ -39,7 +39,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     truth: (N, 4, 4) of the frames, NaN where it is not known; name: of the recording. The
     optimised graph holds all edges; those that the kernel does not trust are in the csv too.
     """
-    frames, graph = slam.frames, slam.solution.graph
+    frames, graph = slam.frames, slam.optimised.graph
     ways = {'before': slam.before(), 'after': slam.after()}
     for which, poses in ways.items():
         StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{which}_tum.txt')
@@ -52,7 +52,8 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         'source': name, 'scale': config.odometry.scale, 'scale_known': slam.scale_known,
         'scale_uncertainty': config.odometry.scale_uncertainty if slam.scale_known else None,
         'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
-        'rejected': {kind: slam.rejected(kind) for kind in ('link', 'loop') if kinds[kind]},
+        'rejected': {kind: slam.optimised.rejected(kind) for kind in ('link', 'loop')
+                     if kinds[kind]},
         'way': travelled(slam.before()), 'parameters': parameters,
         'version': __version__}
     known = np.isfinite(truth).all(axis=(1, 2))
@@ -112,7 +113,7 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
 
 def _closed(slam: Slam, way: Array) -> Array:
     """Positions (L, 3), among those of all frames (N, 3), from which a trusted loop was closed."""
-    _, first = np.unique(slam.keyframes.keyframe, return_index=True)
-    closing = [edge.source for edge, trust in zip(slam.solution.graph.edges, slam.solution.trust)
+    _, first = np.unique([offset.keyframe for offset in slam.offsets], return_index=True)
+    closing = [edge.source for edge, trust in zip(slam.optimised.graph.edges, slam.optimised.trust)
                if edge.kind == 'loop' and trust >= 0.5]
     return np.asarray(way[first[np.array(closing, np.int64)]])

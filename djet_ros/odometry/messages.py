@@ -265,15 +265,6 @@ def twist(result: OdometryResult) -> tuple[Array, Array]:
     return velocity, rotated(R.T, covariance) / seconds**2
 
 
-def begins_anew(odometry: Any) -> bool:
-    """Tell of an Odometry whether it is of no pair, so that its velocity is unknown."""
-    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
-    if any((linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)):
-        return False
-    unknown = twist_of_nothing()[1] + LEAST_COVARIANCE
-    return np.allclose(np.asarray(odometry.twist.covariance), unknown.ravel(), rtol=1e-9, atol=0)
-
-
 def twist_of_nothing() -> tuple[Array, Array]:
     """Velocity (6,) without a pair, which is zero, and its covariance (6, 6), which is huge."""
     return np.zeros(6), np.eye(6) * UNKNOWN_LENGTH_SIGMA**2

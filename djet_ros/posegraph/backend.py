@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.types import Array
-from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.graph import PoseGraph
 import gtsam
 import numpy as np
 
@@ -16,20 +16,24 @@ _ORDER = [3, 4, 5, 0, 1, 2]
 # The first pose is held where it is.
 _HELD = 1e-6
 
-
 # Kinds of edges that are believed as their covariances say.
 _TRUSTED = ('odometry', 'unknown')
 
 
 @dataclass(frozen=True)
-class Solution:
+class OptimisedGraph:
     """The graph with optimised poses; trust: (E,) its edges' final weights, 0 to 1."""
 
     graph: PoseGraph
     trust: Array
 
+    def rejected(self, kind: str) -> int:
+        """Count the edges of a kind that the robust kernel trusts by less than a half."""
+        return sum(bool(edge.kind == kind and trust < 0.5)
+                   for edge, trust in zip(self.graph.edges, self.trust))
 
-def optimise(graph: PoseGraph) -> Solution:
+
+def optimise(graph: PoseGraph) -> OptimisedGraph:
     """
     Find the poses that fit the edges best.
 
@@ -37,6 +41,7 @@ def optimise(graph: PoseGraph) -> Solution:
     graduated non-convexity (Yang et al., RA-L 2020), which does not depend on how far the
     odometry had drifted. DjetError names an edge whose covariance can't be inverted.
     """
+    graph.check()
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setLossType(gtsam.GncLossType.GM)
     # The first factor holds the first pose.
@@ -46,7 +51,7 @@ def optimise(graph: PoseGraph) -> Solution:
     parameters.setRelativeCostTol(0.0)
     optimizer = gtsam.GncLMOptimizer(factor_graph(graph), initial_values(graph.poses), parameters)
     poses = poses_of(optimizer.optimize(), len(graph.poses))
-    return Solution(replace(graph, poses=poses), np.asarray(optimizer.getWeights())[1:])
+    return OptimisedGraph(replace(graph, poses=poses), np.asarray(optimizer.getWeights())[1:])
 
 
 def factor_graph(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:
@@ -55,15 +60,11 @@ def factor_graph(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:
     factors.add(gtsam.PriorFactorPose3(
         0, gtsam.Pose3(graph.poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
     for edge in graph.edges:
-        factors.add(_factor(graph, edge))
+        information = edge.information()[np.ix_(_ORDER, _ORDER)]
+        factors.add(gtsam.BetweenFactorPose3(
+            edge.source, edge.target, gtsam.Pose3(edge.motion),
+            gtsam.noiseModel.Gaussian.Information(information)))
     return factors
-
-
-def _factor(graph: PoseGraph, edge: Edge) -> gtsam.BetweenFactorPose3:
-    information = graph.information(edge)[np.ix_(_ORDER, _ORDER)]
-    return gtsam.BetweenFactorPose3(
-        edge.source, edge.target, gtsam.Pose3(edge.motion),
-        gtsam.noiseModel.Gaussian.Information(information))
 
 
 def initial_values(poses: Sequence[Array] | Array) -> gtsam.Values:

@@ -39,6 +39,7 @@ def write_graph(graph: PoseGraph, path: Path, kind: str, overwrite: bool = False
     Raises DjetError, also for an edge whose covariance can't be inverted.
     """
     check_file(path, overwrite)
+    graph.check()
     lines = list(FORMATS[kind](graph))
     try:
         write_whole(path, '\n'.join(lines) + '\n')
@@ -51,7 +52,7 @@ def _g2o(graph: PoseGraph) -> Iterator[str]:
         yield f'VERTEX_SE3:QUAT {number} {digits(position_and_quaternion(pose))}'
     yield 'FIX 0'
     for edge in graph.edges:
-        information = graph.information(edge)[_UPPER]
+        information = edge.information()[_UPPER]
         yield (f'EDGE_SE3:QUAT {edge.source} {edge.target} '
                f'{digits((*position_and_quaternion(edge.motion), *information))}')
 
@@ -59,7 +60,6 @@ def _g2o(graph: PoseGraph) -> Iterator[str]:
 def _csv(graph: PoseGraph) -> Iterator[str]:
     yield ','.join(_COLUMNS)
     for edge in graph.edges:
-        graph.body_covariance(edge)
         values = digits((*position_and_quaternion(edge.motion), *edge.covariance[_UPPER]))
         yield ','.join((*_stamps(graph, edge), edge.kind, str(int(edge.scale_known)),
                         *values.split()))

@@ -7,7 +7,6 @@ Its poses come from the odometry, its loops from the images of keyframes.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from dataclasses import replace
 from typing import Any
 
 from djet_ros.config.sections import Config
@@ -18,16 +17,12 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, OPTICAL_TO_BODY, stamp_ns
 from djet_ros.odometry.tracker import Outgoing
-from djet_ros.posegraph.graph import Edge, PoseGraph
-from djet_ros.posegraph.keyframes import without_common_length
-from djet_ros.posegraph.live_map import LiveMap
-from djet_ros.posegraph.steps import Step, Steps
+from djet_ros.posegraph.keyframe_map import KeyframeMap
+from djet_ros.posegraph.step_messages import StepMessages
+from djet_ros.posegraph.steps import Step
 import numpy as np
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
-
-# Where nobody knows them, steps have this length.
-_UNIT = 1.0
 
 
 class LiveSlam:
@@ -62,11 +57,13 @@ class LiveSlam:
         self._begin()
 
     def _begin(self) -> None:
-        self.map = LiveMap(self.config.estimator, self.slam)
+        self.map = KeyframeMap(self.config, max_keyframes=self.slam.max_keyframes)
+        # When it was optimised last (ns), and whether edges were found since.
+        self._optimised_ns, self._changed = 0, False
         # Why the newest message could not be used, for a log; None when it could.
         self.problem: DjetError | None = None
         self.rejected: Counter[str] = Counter()
-        self._steps = Steps(self.config.odometry.frame_convention)
+        self._steps = StepMessages(self.config.odometry.frame_convention)
         self._last: Step | None = None
         self._path_stamp = self._said_stamp = -np.inf
         self._said = ''
@@ -118,8 +115,14 @@ class LiveSlam:
 
         To be called when nothing else waits. at_once: also where it is not yet time.
         """
-        if not self.map.work(at_once=at_once) or self._last is None:
+        self._changed |= self.map.seek()
+        if not self._changed or self._last is None:
             return []
+        waited = self._last.stamp_ns - self._optimised_ns
+        if not at_once and waited < self.slam.optimise_period * 1e9:
+            return []
+        self.map.optimise()
+        self._optimised_ns, self._changed = self._last.stamp_ns, False
         return [self._path(self._last)]
 
     @property
@@ -164,8 +167,6 @@ class LiveSlam:
         outgoing = []
         for step in steps:
             self.problem = None
-            if step.edge is not None:
-                step = replace(step, edge=self._with_own_length(step.edge))
             self.map.extend(step, self._frame)
             self._last = step
             if self.slam.publish_tf and self.map.keyframes:
@@ -177,29 +178,6 @@ class LiveSlam:
                 outgoing.append(self._path(step))
             outgoing += self._diagnostics_if_due(step.stamp_ns)
         return outgoing
-
-    def _with_own_length(self, edge: Edge) -> Edge:
-        """
-        Give an edge whose length is as sure as it is among those of the map.
-
-        Without what is common to all known lengths, but no more than the edge has of it. A length
-        that nobody knows is in the odometry's units, which the map shares: were it free within
-        the map, loops of a few keyframes could turn motions round.
-        """
-        way = float(np.linalg.norm(edge.motion[:3, 3]))
-        if edge.kind == 'unknown':
-            return edge
-        if not edge.scale_known:
-            covariance = edge.covariance.copy()
-            covariance[:3, :3] = _clipped(covariance[:3, :3], (way or _UNIT)**2)
-            return replace(edge, covariance=covariance)
-        if not way:
-            return edge
-        along = edge.motion[:3, 3] / way
-        variance = float(along @ edge.covariance[:3, :3] @ along)
-        uncertainty = min(np.sqrt(variance) / way, self.config.odometry.scale_uncertainty)
-        graph = PoseGraph(np.zeros(2, np.int64), np.array([np.eye(4), edge.motion]), (edge,))
-        return without_common_length(graph, uncertainty, self.slam.length_noise).edges[0]
 
     def _frame(self, stamp: int) -> Frame | None:
         """Frame of the image with a stamp, which waits no longer, nor do those before it."""
@@ -234,12 +212,6 @@ class LiveSlam:
             return []
         self._said, self._said_stamp = self.state[1], stamp
         return [self.diagnostics(stamp)]
-
-
-def _clipped(covariance: Array, variance: float) -> Array:
-    """Give a covariance with no direction less sure than a variance."""
-    values, axes = np.linalg.eigh(covariance)
-    return np.asarray(axes * np.minimum(values, variance) @ axes.T)
 
 
 class _Messages(Messages):

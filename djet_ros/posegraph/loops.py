@@ -19,7 +19,7 @@ from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
 from djet_ros.posegraph.graph import Edge
-from djet_ros.posegraph.images import Seen
+from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.places import PlaceIndex
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +39,17 @@ class EdgeFinder:
     """
     Estimates edges between keyframes from their images, which are kept until they are forgotten.
 
-    Keyframes have the numbers in which they come: 0, 1 and so on. seen: where their images and
+    Keyframes have the numbers in which they come: 0, 1 and so on. kept: where their images and
     features are kept; in memory unless said otherwise.
     """
 
     def __init__(self, estimator: EstimatorConfig, config: SlamConfig,
-                 seen: MutableMapping[int, Seen] | None = None) -> None:
+                 kept: MutableMapping[int, KeyframeImage] | None = None) -> None:
         self._config = config
         self._near = TwoViewEstimator(estimator)
         self._wide = TwoViewEstimator(replace(
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
-        self._seen: MutableMapping[int, Seen] = {} if seen is None else seen
+        self._kept: MutableMapping[int, KeyframeImage] = {} if kept is None else kept
         self._stamps: list[int] = []
         self._places = PlaceIndex()
         # The neighbour before each keyframe: the motion to it has a length.
@@ -60,7 +60,7 @@ class EdgeFinder:
         """Take the next keyframe, later than all others, and the edge from its neighbour."""
         number = self._first + len(self._stamps)
         features = self._near.features(frame.gray)
-        self._seen[number] = Seen(frame, features)
+        self._kept[number] = KeyframeImage(frame, features)
         self._stamps.append(frame.stamp_ns)
         self._places.add(features)
         if before is not None and before.kind == 'odometry':
@@ -69,7 +69,7 @@ class EdgeFinder:
     def forget(self, first: int) -> None:
         """Forget the keyframes before one; nothing is found between them and others any more."""
         for number in range(self._first, first):
-            self._seen.pop(number, None)
+            self._kept.pop(number, None)
             self._before.pop(number, None)
         del self._stamps[:first - self._first]
         self._first = first
@@ -84,7 +84,7 @@ class EdgeFinder:
         motion, previous = np.eye(4), current
         for step in range(self._config.links):
             before = self._before.get(previous)
-            if before is None or before.source not in self._seen:
+            if before is None or before.source not in self._kept:
                 return
             motion, previous = before.motion @ motion, before.source
             if step:
@@ -100,7 +100,7 @@ class EdgeFinder:
         config, here = self._config, current - self._first
         latest = self._stamps[here] - config.loop_gap * 1e9
         before = self._first + bisect_left(self._stamps, latest, hi=here)
-        votes = self._places.votes(self._seen[current].features, before)
+        votes = self._places.votes(self._kept[current].features, before)
         votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
         for place in best[votes[best] >= config.loop_votes].tolist():
@@ -119,7 +119,7 @@ class EdgeFinder:
         """Length of a loop's translation, by the points that the last step of the way saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
-        if step is None or step.source not in self._seen or not step.scale_known or not guess:
+        if step is None or step.source not in self._kept or not step.scale_known or not guess:
             return unknown(guess)
         if relative.status is Status.NO_PARALLAX:
             # The same place again: nearer than any step, in whatever direction.
@@ -136,7 +136,7 @@ class EdgeFinder:
                 and inliers >= self._config.loop_share * len(relative.x))
 
     def _view(self, keyframe: int) -> View:
-        seen = self._seen[keyframe]
+        seen = self._kept[keyframe]
         frame = seen.frame
         return View(frame.gray, frame.K, seen.features, smooth(frame.gray))
 

@@ -1,18 +1,18 @@
-"""From the results of a replay to an optimised trajectory: the offline SLAM on one screen."""
+"""From the results of a replay to an optimised trajectory: the map, fed from results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
-from djet_ros.posegraph.backend import optimise, Solution
+from djet_ros.posegraph.backend import OptimisedGraph
 from djet_ros.posegraph.graph import PoseGraph
-from djet_ros.posegraph.images import frames_at, SeenFile
-from djet_ros.posegraph.keyframes import choose_keyframes, Keyframes, without_common_length
-from djet_ros.posegraph.loops import EdgeFinder
+from djet_ros.posegraph.keyframe_images import frame_finder, KeyframeFile
+from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
+from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.recording import Recording
 import numpy as np
 
@@ -27,13 +27,13 @@ class Slam:
     """
     What came of a run.
 
-    frames: graph of all frames, as the odometry made it; keyframes; solution: the graph of the
-    keyframes with links and loops, optimised.
+    frames: graph of all frames, as the odometry made it; offsets: of each frame from its keyframe;
+    optimised: the graph of the keyframes with links and loops.
     """
 
     frames: PoseGraph
-    keyframes: Keyframes
-    solution: Solution
+    offsets: Sequence[KeyframeOffset]
+    optimised: OptimisedGraph
 
     @property
     def scale_known(self) -> bool:
@@ -46,40 +46,34 @@ class Slam:
 
     def after(self) -> Array:
         """Poses (N, 4, 4) of all frames, each moved with its keyframe."""
-        return self.keyframes.all_poses(self.solution.graph.poses)
-
-    def rejected(self, kind: str) -> int:
-        """Count the edges of a kind that the robust kernel trusts by less than a half."""
-        return sum(bool(edge.kind == kind and trust < 0.5)
-                   for edge, trust in zip(self.solution.graph.edges, self.solution.trust))
+        keyframes = self.optimised.graph.poses
+        return np.array([keyframes[offset.keyframe] @ offset.motion for offset in self.offsets])
 
 
-def run_slam(frames: PoseGraph, recording: Recording, config: Config,
+def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
              progress: Callable[[int, int], None] | None = None,
              scratch: Path | None = None) -> Slam:
     """
     Choose keyframes, find links and loops in the recording's images, and optimise.
 
-    frames: the graph of the recording's replay with the configuration; progress is called with
-    (keyframes done, keyframes in all); scratch: a folder with room for the images of the
-    keyframes, while it lasts. Raises DjetError.
+    steps: at least one, of the recording's replay with the configuration; progress is called with
+    (frames done, frames in all); scratch: a folder with room for the images of the keyframes,
+    while it lasts. Raises DjetError.
     """
-    # Composed with others, what is wrong with an edge would no longer be seen.
+    frames, offsets = graph_of(steps), []
+    # Composed with others, what is wrong with a motion would no longer be seen.
     frames.check()
-    slam = config.slam
-    keyframes = choose_keyframes(without_common_length(
-        frames, config.odometry.scale_uncertainty, slam.length_noise), slam)
-    graph = keyframes.graph
-    edges = [*graph.edges]
-    images = frames_at(recording, config, graph.stamps_ns)
-    with SeenFile(scratch) as seen:
-        finder = EdgeFinder(config.estimator, slam, seen)
-        for number, (frame, before) in enumerate(zip(images, (None, *graph.edges))):
-            finder.add(frame, before)
-            edges += [*finder.links(number), *finder.loops(number)]
+    frame_at = frame_finder(recording, config)
+    with KeyframeFile(scratch) as kept:
+        growing = KeyframeMap(config, kept)
+        for number, step in enumerate(steps, 1):
+            growing.extend(step, frame_at)
+            growing.seek()
+            assert growing.newest is not None
+            offsets.append(growing.newest)
             if progress is not None:
-                progress(number + 1, len(graph.poses))
-    return Slam(frames, keyframes, optimise(replace(graph, edges=tuple(edges))))
+                progress(number, len(steps))
+        return Slam(frames, offsets, growing.optimise())
 
 
 def travelled(poses: Array) -> float:

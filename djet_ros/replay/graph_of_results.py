@@ -1,4 +1,4 @@
-"""The pose graph of a replay, read from its results folder."""
+"""The steps of a replay, and their pose graph, read from its results folder."""
 
 from __future__ import annotations
 
@@ -14,30 +14,22 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
-from djet_ros.odometry.uncertainty import rotated, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import rotated
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
-from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.graph import PoseGraph
+from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.results import BAG
 import numpy as np
 
 
-class _Row(NamedTuple):
-    """Of a frame, what a graph needs."""
-
-    stamp_ns: int
-    status: str
-    previous_stamp_ns: int | None
-    scale_known: bool
-
-
-def read_results(folder: Path) -> PoseGraph:
+def read_steps(folder: Path) -> list[Step]:
     """
-    Read the graph of a results folder of ``djet replay``.
+    Read the steps of a results folder of ``djet replay``.
 
-    Vertices are the frames that a motion was told to or from. Where the odometry began anew, an
-    edge of kind 'unknown' keeps the graph in one piece. Raises DjetError.
+    They are those of the frames that a motion was told to or from, and of those at which the
+    odometry began anew. Raises DjetError.
     """
     if not (folder / 'frames.csv').is_file():
         raise DjetError(f"{folder} holds no results; give a folder that 'djet replay' wrote")
@@ -48,11 +40,24 @@ def read_results(folder: Path) -> PoseGraph:
     if [row.stamp_ns for row in rows] != stamps[:len(rows)].tolist():
         raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run')
     motions = _motions(folder / BAG, load_yaml(folder / 'config.yaml'))
-    edges = list(_edges(rows, poses, motions, folder))
-    if not edges:
+    steps = list(_steps(rows, poses, motions, folder))
+    if len(steps) < 2:
         raise DjetError(f'{folder}: no motion was told between any two frames; there is no graph')
-    kept = sorted({end for edge in edges for end in (edge.source, edge.target)})
-    return PoseGraph(stamps[kept], poses[kept], tuple(_renumbered(edges, kept)))
+    return steps
+
+
+def read_results(folder: Path) -> PoseGraph:
+    """Read the graph of a results folder; see ``read_steps`` and ``graph_of``."""
+    return graph_of(read_steps(folder))
+
+
+class _Row(NamedTuple):
+    """Of a frame, what a step needs."""
+
+    stamp_ns: int
+    status: Status
+    previous_stamp_ns: int | None
+    scale_known: bool
 
 
 def _rows(path: Path) -> list[_Row]:
@@ -63,7 +68,7 @@ def _rows(path: Path) -> list[_Row]:
             if row['status'] == 'UNUSED':
                 continue
             previous = row['previous_stamp_ns']
-            rows.append(_Row(int(row['stamp_ns']), Status(row['status']).value,
+            rows.append(_Row(int(row['stamp_ns']), Status(row['status']),
                              int(previous) if previous else None, row['scale_known'] == '1'))
         except (KeyError, TypeError, ValueError) as error:
             raise DjetError(f'{path} line {number} is no row of a replay: {error}') from error
@@ -85,32 +90,17 @@ def _motions(bag: Path, config: Config) -> dict[int, tuple[Array, Array]]:
     return motions
 
 
-def _edges(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array]],
-           folder: Path) -> Iterator[Edge]:
-    """Edges between rows: told motions, and unknown ones to where the odometry began anew."""
+def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array]],
+           folder: Path) -> Iterator[Step]:
     references = {row.previous_stamp_ns for row in rows if row.status in TRACKED}
-    at: dict[int, int] = {}
-    last: int | None = None
-    for i, row in enumerate(rows):
-        at[row.stamp_ns] = i
+    come: set[int | None] = set()
+    for row, pose in zip(rows, poses):
+        come.add(row.stamp_ns)
         if row.status in TRACKED:
-            if row.stamp_ns not in motions or row.previous_stamp_ns not in at:
+            if row.stamp_ns not in motions or row.previous_stamp_ns not in come:
                 raise DjetError(f'{folder}: the motion to the frame of {row.stamp_ns} ns is '
                                 'missing from the bag; replay the recording once more')
-            motion, covariance = motions[row.stamp_ns]
-            yield Edge(at[row.previous_stamp_ns], i, motion, covariance,
-                       scale_known=row.scale_known)
+            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
+                       *motions[row.stamp_ns], row.scale_known)
         elif row.status in STARTED or row.stamp_ns in references:
-            if last is not None:
-                yield Edge(last, i, np.linalg.inv(poses[last]) @ poses[i], UNKNOWN_MOTION,
-                           'unknown', False)
-        else:
-            continue
-        last = i
-
-
-def _renumbered(edges: list[Edge], kept: list[int]) -> Iterator[Edge]:
-    number = {row: vertex for vertex, row in enumerate(kept)}
-    for edge in edges:
-        yield Edge(number[edge.source], number[edge.target], edge.motion, edge.covariance,
-                   edge.kind, edge.scale_known)
+            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, MutableMapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, MutableMapping
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Features
@@ -18,18 +18,16 @@ from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.recording import Recording
 import numpy as np
-from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class Seen:
+class KeyframeImage(NamedTuple):
     """A keyframe's image and its features."""
 
     frame: Frame
     features: Features
 
 
-class SeenFile(MutableMapping[int, Seen], Closing):
+class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
     """
     Keyframes in a file without a name, so that thousands of them take no memory.
 
@@ -48,13 +46,13 @@ class SeenFile(MutableMapping[int, Seen], Closing):
             raise DjetError(f'no temporary file could be made in {folder}: '
                             f'{error.strerror}') from error
 
-    def __setitem__(self, number: int, seen: Seen) -> None:
+    def __setitem__(self, number: int, image: KeyframeImage) -> None:
         """Write a keyframe at the end of the file."""
-        frame = seen.frame
+        frame = image.frame
         try:
             offset = self._file.seek(0, 2)
             for array in (frame.gray, frame.K,
-                          *(getattr(seen.features, name) for name in self._features)):
+                          *(getattr(image.features, name) for name in self._features)):
                 np.save(self._file, array, allow_pickle=False)
         except OSError as error:
             raise DjetError('the images of keyframes could not be written to a temporary file: '
@@ -63,14 +61,14 @@ class SeenFile(MutableMapping[int, Seen], Closing):
         nothing = np.empty((0, 0), np.uint8)
         self._kept[number] = _Kept(offset, replace(frame, gray=nothing))
 
-    def __getitem__(self, number: int) -> Seen:
+    def __getitem__(self, number: int) -> KeyframeImage:
         """Read a keyframe."""
         offset, frame = self._kept[number]
         self._file.seek(offset)
         gray, K, *features = (np.load(self._file, allow_pickle=False)
                               for _ in range(2 + len(self._features)))
-        return Seen(replace(frame, gray=gray, K=K),
-                    Features(**dict(zip(self._features, features))))
+        return KeyframeImage(replace(frame, gray=gray, K=K),
+                             Features(**dict(zip(self._features, features))))
 
     def __contains__(self, number: object) -> bool:
         """Tell whether there is such a keyframe, without reading it."""
@@ -100,27 +98,30 @@ class _Kept(NamedTuple):
     frame: Frame
 
 
-def frames_at(recording: Recording, config: Config, stamps_ns: NDArray[np.int64]
-              ) -> Iterator[Frame]:
+def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]:
     """
-    Yield the frames of some stamps (N,), in the order of recording, as the odometry had them.
+    Give the function from stamps, in the order of recording, to frames as the odometry had them.
 
-    DjetError where the recording does not hold them all.
+    It raises DjetError for a stamp of which the recording has no image, or not in this order.
     """
-    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
-    wanted = iter(stamps_ns.tolist())
-    stamp = next(wanted, None)
-    camera: Camera | None = None
-    for message in recording.messages({recording.image_topic, recording.info_topic}):
-        if message.topic == recording.info_topic:
-            camera = Camera.from_info(message.message, rectified)
-        elif message.topic == recording.image_topic and camera is not None \
-                and stamp_ns(message.message.header) == stamp:
-            gray = camera.undistort(gray_image(message.message))
-            yield Frame(gray, camera.K, stamp, message.message.header.frame_id)
-            stamp = next(wanted, None)
-        if stamp is None:
-            return
-    if stamp is not None:
+    images = _images(recording, config)
+
+    def frame_at(stamp: int) -> Frame:
+        for camera, message in images:
+            if stamp_ns(message.header) == stamp:
+                return Frame(camera.undistort(gray_image(message)), camera.K, stamp,
+                             message.header.frame_id)
         raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
                         'give the recording that was replayed')
+    return frame_at
+
+
+def _images(recording: Recording, config: Config) -> Iterator[tuple[Camera, Any]]:
+    """Images of a recording, each with its camera."""
+    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
+    camera: Camera | None = None
+    for topic, _, message in recording.messages({recording.image_topic, recording.info_topic}):
+        if topic == recording.info_topic:
+            camera = Camera.from_info(message, rectified)
+        elif topic == recording.image_topic and camera is not None:
+            yield camera, message
