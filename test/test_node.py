@@ -296,9 +296,10 @@ def test_each_bad_image_is_said_once_and_the_next_good_pair_is_tracked(
         node, publisher, subscriber, drive):
     one = node(**EVERY)
     camera(publisher)
-    for reason, make in BAD_IMAGES.items():
+    for round_, (reason, make) in enumerate(BAD_IMAGES.items()):
         subscriber.heard.clear()
-        # The bag begins anew each time.
+        # The camera begins anew each time.
+        assert publisher.call('reset')['success'], round_
         play(publisher, drive[:3])
         for _ in range(3):
             publisher.send(IMAGE, make(drive[3]))
@@ -355,12 +356,35 @@ def test_bad_camera_infos_are_said_and_a_good_one_ends_that(
 def test_a_bag_that_loops_begins_anew(node, publisher, subscriber, drive):
     node(**EVERY)
     camera(publisher)
-    play(publisher, drive[:4])
-    play(publisher, drive[:4])
-    subscriber.wait('two rounds', lambda heard: len(heard[f'{NODE}/odometry']) == 8)
+    play(publisher, drive[:8])
+    play(publisher, drive[:8])
+    subscriber.wait('two rounds', lambda heard: len(heard[f'{NODE}/odometry']) == 16)
     odometry = [serialised(m) for m in subscriber.heard[f'{NODE}/odometry']]
-    assert odometry[:4] == odometry[4:]
+    assert odometry[:8] == odometry[8:]
     assert said('restarted: TIME_JUMP')(subscriber.heard)
+
+
+def test_a_late_image_leaves_the_odometry_where_it_is(node, publisher, subscriber, drive):
+    one = node(**EVERY)
+    camera(publisher)
+    play(publisher, drive[:6])
+    publisher.send(IMAGE, image(drive[3], stamp_ns=stamp(5) - PERIOD // 2))
+    play(publisher, drive[6:8], first=6)
+    subscriber.wait('a pair', paired(7))
+    last = subscriber.wait('tracking', lambda heard: (said('tracking')(heard) or {}).get(
+        'frames received') == '9' and said('tracking')(heard))
+    assert last['frames dropped: late'] == '1'
+    assert 'restarted' not in one.log
+
+
+def test_a_camera_that_stamps_nothing_is_said(node, publisher, subscriber, drive):
+    one = node(**EVERY)
+    camera(publisher)
+    for gray in drive:
+        publisher.send(IMAGE, image(gray, stamp_ns=0))
+    last = subscriber.wait('the complaint', said('started; stamps stand still'))
+    assert 'the camera driver has to stamp' in last['to mend: stamps stand still']
+    wait_for_log(one, 'stamps stand still: ')
 
 
 def test_stamps_are_the_images_and_diagnostics_follow_simulated_time(

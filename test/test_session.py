@@ -281,6 +281,26 @@ def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(l
     assert one.graph.lines == [line]
 
 
+def test_what_there_is_to_mend_is_said_once_in_the_log_with_the_remedy(live, drive):
+    one = live()
+    for gray in [*drive, *drive]:
+        one.session.image(image(gray, stamp_ns=0, frame_id='odom'))
+    one.wait_for_images(24)
+    found = [line for line in one.graph.lines if 'rejected' not in line]
+    assert len(found) == 2
+    assert found[0].startswith("warning: frame_id is odom_frame: the camera's frame is called")
+    assert found[1].startswith('warning: stamps stand still: 5 images in a row have the stamp 0.0')
+
+
+def test_a_new_beginning_is_explained_in_the_log(live, drive):
+    one = live()
+    one.send(drive[:3], first=100)
+    one.send(drive[:3])
+    one.wait_for_images(6)
+    line, = one.graph.lines
+    assert line.startswith('warning: restarted: TIME_JUMP: the stamps went back by 10.200 s')
+
+
 def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatch):
     one = live()
     one.session.camera_info(None)

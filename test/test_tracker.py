@@ -1,5 +1,7 @@
 """The tracker: messages in, messages out, and every image accounted for."""
 
+import re
+
 from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.config.flat import from_flat, with_values
@@ -172,13 +174,42 @@ def test_an_equal_stamp_drops_the_image(drive):
 
 def test_a_bag_that_loops_begins_anew(drive):
     one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.0})
-    first = play(one, drive[:4], start=50.0)
-    again = play(one, drive[:4], start=50.0)
-    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 6, 'TIME_JUMP': 1}
+    first = play(one, drive[:8], start=50.0)
+    again = play(one, drive[:8], start=50.0)
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 14, 'TIME_JUMP': 1}
     assert again[0]['/diagnostics'].status[0].message == 'restarted: TIME_JUMP'
     for before, after in zip(first, again, strict=True):
         assert serialised(before['odometry']) == serialised(after['odometry'])
         assert len(before['path'].poses) == len(after['path'].poses)
+
+
+@pytest.mark.parametrize('late', [0.05, 0.1, 0.45])
+def test_a_late_image_is_dropped_and_counted_and_changes_no_pose(drive, late):
+    one, undisturbed = tracker(), tracker()
+    play(undisturbed, drive[:8])
+    play(one, drive[:6])
+    assert by_topic(one.image(image(drive[3], stamp_ns=ns(0.5 - late)))) == {}
+    play(one, drive[6:8], start=0.6)
+    assert one.counts.dropped == {'late': 1}
+    assert np.array_equal(one.last.pose, undisturbed.last.pose)
+
+
+def test_stamps_that_went_back_a_little_and_stay_there_begin_anew(drive):
+    one = tracker(**{'odometry.max_backwards': 3.0})
+    play(one, drive[:3], start=50.0)
+    play(one, drive[:12], start=48.0)
+    assert one.counts.dropped == {'late': 9}
+    assert one.counts.status == {'FIRST_FRAME': 1, 'TIME_JUMP': 1, 'OK': 4}
+
+
+def test_a_new_beginning_is_explained(drive):
+    one = tracker()
+    play(one, drive[:2], start=50.0)
+    play(one, drive[:1], start=20.0)
+    assert one.remark.startswith('the stamps went back by 30.100 s')
+    assert one.remark.endswith('everything begins anew, and odom jumps to the origin')
+    play(one, drive[:1], start=25.0)
+    assert one.remark.startswith('5.000 s without an image')
 
 
 def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
@@ -191,6 +222,107 @@ def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
     assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 3, 'TIME_JUMP': 1}
     covariance = np.reshape(out[0]['odometry'].pose.covariance, (6, 6))
     assert covariance[0, 0] > 1e5
+
+
+# What would go wrong in silence
+
+def mended(one):
+    """Give level and summary of the diagnosis, and what it says there is to mend."""
+    said = one.diagnosis()
+    return said.level, said.summary, {name.removeprefix('to mend: '): text for name, text
+                                      in said.values.items() if name.startswith('to mend: ')}
+
+
+def test_a_healthy_drive_has_nothing_to_mend(drive):
+    one = tracker()
+    play(one, drive)
+    assert mended(one) == ('OK', 'tracking', {})
+
+
+@pytest.mark.parametrize('stamp', [0, ns(12.5)])
+def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp):
+    one = tracker()
+    out = [by_topic(one.image(image(gray, stamp_ns=stamp))) for gray in drive]
+    level, summary, found = mended(one)
+    assert (level, summary) == ('ERROR', 'started; stamps stand still')
+    assert f'have the stamp {stamp // 10**9}.{stamp % 10**9:09d}' in found['stamps stand still']
+    assert 'the camera driver has to stamp each image' in found['stamps stand still']
+    # said when it is found, and not with each image
+    assert sum('/diagnostics' in messages for messages in out) == 2
+    play(one, drive[:2], start=20.0)
+    assert mended(one)[2] == {}
+
+
+def test_one_image_that_comes_twice_is_nothing_to_mend(drive):
+    one = tracker()
+    for i, gray in enumerate(drive):
+        play(one, [gray, gray], start=0.1 * i, period=0.0)
+    assert one.counts.dropped == {'equal_stamp': 12}
+    assert mended(one) == ('OK', 'tracking', {})
+
+
+def speed(seconds, metres_per_second=3.0):
+    vector = message_type('geometry_msgs/msg/Vector3')
+    return message_type('geometry_msgs/msg/TwistStamped')(
+        header=header(ns(seconds)), twist=message_type('geometry_msgs/msg/Twist')(
+            linear=vector(x=metres_per_second, y=0.0, z=0.0),
+            angular=vector(x=0.0, y=0.0, z=0.0)))
+
+
+@pytest.mark.parametrize(('off', 'seen'), [
+    (None, 'no speed has come; publish it on speed or speed_odometry'),
+    (100.0, r'the newest speed is stamped 100\.\d s after the newest image'),
+    (-100.0, r'the newest speed is stamped 100\.\d s before the newest image')])
+def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(drive, off, seen):
+    one = tracker(**{'odometry.scale': 'speed'})
+    for i, gray in enumerate(drive):
+        if off is not None:
+            one.speed(speed(200 + 0.1 * i + off))
+        play(one, [gray], start=200 + 0.1 * i)
+    level, summary, found = mended(one)
+    assert (level, summary) == ('WARN', 'tracking; no metric length')
+    assert re.search(seen, found['no metric length'])
+    for i, gray in enumerate(drive):
+        one.speed(speed(201.2 + 0.1 * i if off != 100.0 else 301.2 + 0.1 * i))
+        play(one, [gray], start=201.2 + 0.1 * i if off != 100.0 else 301.2 + 0.1 * i)
+    assert mended(one) == ('OK', 'tracking', {})
+
+
+def test_ground_that_is_never_seen_is_said_too(drive):
+    one = tracker(**{'odometry.scale': 'camera_height'})
+    play(one, [np.rot90(gray, 2) for gray in drive])
+    assert 'no level ground' in mended(one)[2]['no metric length']
+
+
+def test_many_images_dropped_under_load_are_a_warning_and_few_are_none(drive):
+    one = tracker()
+    play(one, drive)
+    one.count_dropped('queue_full', 1)
+    assert mended(one) == ('OK', 'tracking', {})
+    one.count_dropped('queue_full', 8)
+    level, summary, found = mended(one)
+    assert (level, summary) == ('WARN', 'tracking; images dropped under load')
+    assert '43% of the newest 21 images' in found['images dropped under load']
+
+
+@pytest.mark.parametrize(('frame', 'parameters', 'name', 'remedy'), [
+    ('', {}, 'no frame_id', 'set it in the camera driver, or odometry.camera_frame'),
+    ('odom', {}, 'frame_id is odom_frame', 'set odometry.camera_frame or odometry.odom_frame'),
+    ('map', {'odometry.odom_frame': 'map'}, 'frame_id is odom_frame', 'set odometry.camera_frame'),
+])
+def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
+        drive, frame, parameters, name, remedy):
+    one = tracker(**{'ros.publish_tf': True, **parameters})
+    out = [by_topic(one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=frame)))
+           for i, gray in enumerate(drive[:3])]
+    assert not any('/tf' in messages for messages in out)
+    level, _, found = mended(one)
+    assert level in ('WARN', 'ERROR')
+    assert remedy in found[name]
+    one.configure(with_values(one.config, {'odometry.camera_frame': 'cam'}))
+    named = by_topic(one.image(image(drive[3], stamp_ns=ns(0.3), frame_id=frame)))
+    assert named['/tf'].transforms[0].child_frame_id == 'cam'
+    assert mended(one)[2] == {}
 
 
 # Bad images

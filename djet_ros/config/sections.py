@@ -17,6 +17,10 @@ class OdometryConfig:
     max_gap: float = parameter(
         1.0, 'seconds between two frames beyond which they are not related to one another',
         minimum=1e-3, maximum=3600.0)
+    max_backwards: float = parameter(
+        0.5, 'seconds by which an image may be older than the newest one and count as late: it is '
+        'dropped; where the stamps go back further, as in a bag that loops, or stay back, '
+        'everything begins anew', minimum=0.0, maximum=3600.0)
     max_lost: int = parameter(
         3, 'bad pairs in a row after which the reference frame is given up for the newest frame',
         minimum=1, maximum=1000)

@@ -26,7 +26,8 @@ class OdometryFace(Face):
         for_a_live_graph(config)
         image, info = self.image_topics(config.ros)
         self.session: Session = Session(
-            Tracker(config, middleware.message_type, image_topic=image), self,
+            Tracker(config, middleware.message_type, image_topic=image,
+                    speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES))), self,
             {'image': image, 'camera_info': info})
         self._hears_speed = False
         self._connect(config)

@@ -134,6 +134,7 @@ class Session:
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
         self._log = Throttle(wiring)
+        self._complained: set[str] = set()
         self._stopping = False
         self._worker = Thread(target=self._work, name='odometry', daemon=True)
 
@@ -306,8 +307,19 @@ class Session:
 
     def _log_trouble(self) -> None:
         """Put into the log, now and then, what is wrong for as long as it is."""
+        self._log_complaints()
         tracker = self._tracker
         if tracker.state in _SAID_ELSEWHERE or LEVELS[tracker.state] == 'OK':
             return
-        summary = tracker.diagnosis().summary
-        self._log.warn(summary, f'{summary}: {tracker.problem}' if tracker.problem else summary)
+        said = ': '.join(filter(None, [tracker.state.value, tracker.detail,
+                                       str(tracker.problem or tracker.remark)]))
+        self._log.warn(f'{tracker.state} {tracker.detail}', said)
+
+    def _log_complaints(self) -> None:
+        """Put what there is to mend into the log, once for as long as it is."""
+        complaints = self._tracker.complaints
+        for one in complaints:
+            # The queue's drops are said as they come.
+            if one.name not in self._complained and not one.name.endswith('under load'):
+                self._log.warn(one.name, f'{one.name}: {one.text}')
+        self._complained = {one.name for one in complaints}

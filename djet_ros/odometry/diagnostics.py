@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 
 from djet_ros.core.types import RelativePose
+from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.visual_odometry import OdometryResult
 import numpy as np
 
@@ -34,12 +36,15 @@ LEVELS = {
 }
 
 
+_RANKING = ('OK', 'WARN', 'ERROR')
+
+
 @dataclass
 class Counts:
     """
     Every image that came in is counted once more: processed, dropped or rejected.
 
-    dropped: by why nothing was wrong with it (equal_stamp, waiting_for_camera_info, queue_full …);
+    dropped: by why it was of no use (equal_stamp, late, waiting_for_camera_info, queue_full …);
     rejected: by what was wrong with an image; rejected_infos: the same for CameraInfo messages;
     status: of the processed frames.
     """
@@ -62,12 +67,12 @@ class Diagnosis:
 
 
 def diagnose(state: State, detail: str, counts: Counts, last: OdometryResult | None,
-             rate: float | None) -> Diagnosis:
+             rate: float | None, complaints: Sequence[Complaint] = ()) -> Diagnosis:
     """
     Say how the odometry is doing.
 
     detail: what the state is about, such as a status or a reason; last: the last result; rate:
-    processed frames per second of their stamps.
+    processed frames per second of their stamps; complaints: what else there is to mend.
     """
     values = {
         'state': state.value,
@@ -86,8 +91,11 @@ def diagnose(state: State, detail: str, counts: Counts, last: OdometryResult | N
         values['scale'] = 'known' if last.scale_known else 'unknown'
         if last.relative is not None:
             values.update(_pair(last.relative))
-    summary = f'{state.value}: {detail}' if detail else state.value
-    return Diagnosis(LEVELS[state], summary, values)
+    values.update({f'to mend: {one.name}': one.text for one in complaints})
+    summary = '; '.join([f'{state.value}: {detail}' if detail else state.value,
+                         *(one.name for one in complaints)])
+    level = max([LEVELS[state], *(one.level for one in complaints)], key=_RANKING.index)
+    return Diagnosis(level, summary, values)
 
 
 def _pair(relative: RelativePose) -> dict[str, str]:

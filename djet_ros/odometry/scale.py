@@ -113,6 +113,11 @@ class SpeedScale(ScaleSource):
         self._uncertainty = uncertainty
         self.reset()
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest speed; None before the first."""
+        return self._stamps[-1] if self._stamps else None
+
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
         """Take a measured speed; one beyond any sense or earlier than the last is ignored."""
         if not abs(metres_per_second) <= _FASTEST \

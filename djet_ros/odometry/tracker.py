@@ -16,12 +16,16 @@ from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.health import Complaint, has_frame, Health, why_restarted
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
+
+# Late images in a row that are no accident: the stamps have gone back, and stay there.
+_LATE_IN_A_ROW = 10
 
 
 class Outgoing(NamedTuple):
@@ -36,7 +40,8 @@ class Tracker:
     Pairs images with their CameraInfo, runs the odometry on them, and words what comes of it.
 
     message_type gives the class for a type name such as 'sensor_msgs/msg/Image'; image_topic is
-    the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
+    the resolved name of the images' topic, by which odometry.rectified 'auto' goes; speed_topics
+    are where speeds are heard, for people.
 
     Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
     odometry (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of
@@ -44,12 +49,14 @@ class Tracker:
     """
 
     def __init__(self, config: Config, message_type: MessageType,
-                 scale: ScaleSource | None = None, image_topic: str = '') -> None:
+                 scale: ScaleSource | None = None, image_topic: str = '',
+                 speed_topics: str = 'speed or speed_odometry') -> None:
         self.config = config
         # What a face adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
         self._message_type = message_type
         self._image_topic = image_topic
+        self._speed_topics = speed_topics
         self._scale = scale or scale_source(config.odometry)
         self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale)
         self._messages = Messages(message_type, config.odometry)
@@ -76,13 +83,17 @@ class Tracker:
         self.verdict = ''
         # Why the newest message could not be used, for a log; None when it could.
         self.problem: BadMessage | None = None
+        # What the newest frame without a pair means, for a log.
+        self.remark = ''
         self._frame: Frame | None = None
+        self._health = Health(self.config.odometry, self._speed_topics)
+        self._late_in_a_row = 0
         self._path: deque[Any] = deque(maxlen=self.config.ros.path_length)
         self._path_stamp: int | None = None
         self._rate = StampRate()
         self._bad_pairs = 0
         self._await()
-        self._said: tuple[State, str, int] | None = None
+        self._said: tuple[tuple[str, ...], int] | None = None
 
     def configure(self, config: Config) -> None:
         """
@@ -96,6 +107,7 @@ class Tracker:
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
         self._messages = Messages(self._message_type, after)
+        self._health.configure(after)
         self._path = deque(self._path if before == after else (),
                            maxlen=config.ros.path_length)
         if before.rectified != after.rectified and self._info is not None:
@@ -128,9 +140,9 @@ class Tracker:
             return self._diagnostics_if_due(stamp)
         if self._camera is None:
             return self._without_camera(stamp)
-        if self._frame is not None and self._frame.stamp_ns == stamp:
-            self._drop('equal_stamp')
-            return []
+        if self._frame is not None and (reason := self._out_of_order(stamp, self._frame)):
+            self._drop(reason)
+            return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
             gray = self._camera.undistort(gray_image(message))
         except BadMessage as problem:
@@ -158,6 +170,11 @@ class Tracker:
         """Tell what the odometry is doing."""
         return State.PAUSED if self._paused else self._state
 
+    @property
+    def detail(self) -> str:
+        """What the state is about, such as a status or a reason."""
+        return '' if self._paused else self._detail
+
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed, for odometry.scale 'speed'."""
         linear = (message.twist.twist if hasattr(message.twist, 'twist') else message.twist).linear
@@ -167,11 +184,17 @@ class Tracker:
         """Count images that a face received and did not hand on."""
         self.counts.received += number
         self.counts.dropped[reason] += number
+        self._health.dropped(reason, number)
+
+    @property
+    def complaints(self) -> list[Complaint]:
+        """What there is to mend beside the state: what is seen, and what helps."""
+        return self._health.complaints(self._scale)
 
     def diagnosis(self) -> Diagnosis:
         """Say how the odometry is doing."""
-        diagnosis = diagnose(self.state, '' if self._paused else self._detail, self.counts,
-                             self.last, self._rate.hertz)
+        diagnosis = diagnose(self.state, self.detail, self.counts,
+                             self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
         diagnosis.values.update(self.face_values)
         return diagnosis
@@ -196,8 +219,19 @@ class Tracker:
         self._await()
         return self._diagnostics_if_due(stamp)
 
+    def _out_of_order(self, stamp: int, newest: Frame) -> str:
+        """Why an image is of no use beside the newest one: equal_stamp, late, or nothing."""
+        if stamp > newest.stamp_ns:
+            return ''
+        if stamp == newest.stamp_ns:
+            return 'equal_stamp'
+        self._late_in_a_row += 1
+        late = newest.stamp_ns - stamp <= self.config.odometry.max_backwards * 1e9
+        return 'late' if late and self._late_in_a_row < _LATE_IN_A_ROW else ''
+
     def _drop(self, reason: str) -> None:
         self.counts.dropped[reason] += 1
+        self._health.dropped(reason)
         self.verdict = reason
 
     def _reject(self, problem: BadMessage, stamp: int) -> list[Outgoing]:
@@ -210,7 +244,11 @@ class Tracker:
             self._path.clear()
             self._path_stamp = None
         result = self._odometry.process(frame)
+        self.remark = why_restarted(result, self._frame.stamp_ns if self._frame else None,
+                                    self.config.odometry)
         self.last, self._frame, self.problem = result, frame, None
+        self._late_in_a_row = 0
+        self._health.processed(result)
         self.counts.processed += 1
         self.verdict = result.status.value
         self.counts.status[self.verdict] += 1
@@ -239,7 +277,7 @@ class Tracker:
                          Outgoing('relative_pose_cov', make.relative_pose_cov(result))]
         if result.status in TRACKED or result.status in STARTED:
             outgoing.append(Outgoing('odometry', make.odometry(result)))
-            if self.config.ros.publish_tf:
+            if self.config.ros.publish_tf and has_frame(self.config.odometry, result.frame_id):
                 outgoing.append(Outgoing('/tf', make.transform(result)))
             if self.config.ros.publish_path:
                 outgoing += self._path_if_due(result)
@@ -264,10 +302,10 @@ class Tracker:
         self._state, self._detail = state, detail
 
     def _diagnostics_if_due(self, stamp: int) -> list[Outgoing]:
+        what = self.state.value, self._detail, *(one.name for one in self.complaints)
         if self._said is not None:
-            state, detail, said = self._said
-            if (state, detail) == (self.state, self._detail) \
-                    and 0 <= stamp - said < _DIAGNOSTICS_PERIOD_NS:
+            before, said = self._said
+            if before == what and 0 <= stamp - said < _DIAGNOSTICS_PERIOD_NS:
                 return []
-        self._said = self.state, self._detail, stamp
+        self._said = what, stamp
         return [self.diagnostics(stamp)]

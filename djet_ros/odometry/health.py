@@ -1,0 +1,147 @@
+"""What goes wrong in silence: images that are of no use, and lengths that nobody knows."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import NamedTuple
+
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.types import Status
+from djet_ros.odometry.messages import camera_frame, seconds_and_rest
+from djet_ros.odometry.scale import ScaleSource, SpeedScale
+from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
+
+# Images over which shares are taken, and of which they say nothing yet.
+_WINDOW, _FEW = 100, 20
+
+# Share of the images from which on it matters that they were of no use.
+_SHARE = 0.1
+
+# Images or pairs in a row from which on something is no accident.
+_IN_A_ROW = 5
+
+
+class Complaint(NamedTuple):
+    """Something to mend: a short name of it, level WARN or ERROR, and what is seen and helps."""
+
+    name: str
+    level: str
+    text: str
+
+
+class Health:
+    """Watches the images of one camera; speed_topics: where speeds are heard, for people."""
+
+    def __init__(self, config: OdometryConfig, speed_topics: str) -> None:
+        self._config = config
+        self._speed_topics = speed_topics
+        self._fates: deque[str] = deque(maxlen=_WINDOW)
+        self._equal = self._unknown_lengths = 0
+        self._last: OdometryResult | None = None
+        self._stamp_ns = 0
+
+    def configure(self, config: OdometryConfig) -> None:
+        """Take another configuration; what was seen of lengths is about the last one."""
+        self._config, self._unknown_lengths = config, 0
+
+    def dropped(self, reason: str, number: int = 1) -> None:
+        """Take images that were dropped for a reason."""
+        self._fates.extend([reason] * min(number, _WINDOW))
+        self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
+
+    def processed(self, result: OdometryResult) -> None:
+        """Take the result of an image."""
+        self._fates.append('')
+        self._equal, self._last = 0, result
+        if self._config.scale == 'none' or result.scale_known:
+            self._unknown_lengths = 0
+        elif result.status in TRACKED:
+            self._unknown_lengths += 1
+
+    def complaints(self, scale: ScaleSource) -> list[Complaint]:
+        """Say what there is to mend now."""
+        return [one for one in (self._stamps(), self._frame(), self._length(scale),
+                                self._load(), self._order()) if one is not None]
+
+    def _stamps(self) -> Complaint | None:
+        if self._equal < _IN_A_ROW or self._last is None:
+            return None
+        seconds, rest = seconds_and_rest(self._last.stamp_ns)
+        return Complaint('stamps stand still', 'ERROR', (
+            f'{self._equal} images in a row have the stamp {seconds}.{rest:09d} and are dropped; '
+            'the camera driver has to stamp each image with the time of its exposure'))
+
+    def _frame(self) -> Complaint | None:
+        if self._last is None:
+            return None
+        frame, odom = camera_frame(self._config, self._last.frame_id), self._config.odom_frame
+        if not self._last.frame_id and not self._config.camera_frame:
+            return Complaint('no frame_id', 'WARN', (
+                'the images have no frame_id, so that nobody knows what the poses are of, and '
+                'none goes to tf; set it in the camera driver, or odometry.camera_frame here'))
+        if frame == odom:
+            return Complaint('frame_id is odom_frame', 'ERROR', (
+                f"the camera's frame is called '{frame}' like odometry.odom_frame, and no pose "
+                'goes to tf; set odometry.camera_frame or odometry.odom_frame'))
+        return None
+
+    def _length(self, scale: ScaleSource) -> Complaint | None:
+        if self._unknown_lengths < _IN_A_ROW or self._last is None:
+            return None
+        return Complaint('no metric length', 'WARN', (
+            f'odometry.scale is {self._config.scale}, and no length is known: '
+            + self._why_unknown(scale, self._last.stamp_ns)))
+
+    def _why_unknown(self, scale: ScaleSource, stamp: int) -> str:
+        if isinstance(scale, SpeedScale):
+            if scale.newest_ns is None:
+                return (f'no speed has come; publish it on {self._speed_topics}, or choose '
+                        'another odometry.scale')
+            off = (scale.newest_ns - stamp) * 1e-9
+            return (f'the newest speed is stamped {abs(off):.1f} s '
+                    f'{"after" if off > 0 else "before"} the newest image; do both sides go by '
+                    'one clock (use_sim_time), and does the speed still come?')
+        if self._config.scale == 'camera_height':
+            return ('the images show no level ground that fits odometry.camera_height and '
+                    'odometry.camera_pitch')
+        return 'there is no ground truth about the time of these images'
+
+    def _share(self, reason: str) -> float:
+        few = len(self._fates) < _FEW
+        return 0.0 if few else Counter(self._fates)[reason] / len(self._fates)
+
+    def _load(self) -> Complaint | None:
+        if (share := self._share('queue_full')) < _SHARE:
+            return None
+        return Complaint('images dropped under load', 'WARN', (
+            f'{share:.0%} of the newest {len(self._fates)} images were dropped: they come faster '
+            'than they are worked on; lower their rate, their size or estimator.max_features'))
+
+    def _order(self) -> Complaint | None:
+        if (share := self._share('late')) < _SHARE:
+            return None
+        return Complaint('images out of order', 'WARN', (
+            f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
+            'and dropped; do two cameras publish on one topic?'))
+
+
+def has_frame(config: OdometryConfig, image_frame: str) -> bool:
+    """Tell whether a camera has a name that can stand on tf."""
+    named = bool(image_frame or config.camera_frame)
+    return named and camera_frame(config, image_frame) != config.odom_frame
+
+
+def why_restarted(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:
+    """Word why a frame has no pair, and what that means."""
+    if result.status is Status.SIZE_CHANGED:
+        return ('another image size or another camera; it goes on at the last pose, and the '
+                'motion in between is unknown')
+    if result.status is not Status.TIME_JUMP or before_ns is None:
+        return ''
+    seconds = (result.stamp_ns - before_ns) * 1e-9
+    if seconds < 0:
+        return (f'the stamps went back by {-seconds:.3f} s, which is more than '
+                f'odometry.max_backwards ({config.max_backwards:g} s), or stayed back; everything '
+                f'begins anew, and {config.odom_frame} jumps to the origin')
+    return (f'{seconds:.3f} s without an image (odometry.max_gap is {config.max_gap:g} s); it '
+            'goes on at the last pose, and the motion in between is unknown')
