@@ -72,6 +72,10 @@ class ScaleSource(Protocol):
         """Take a measured speed."""
         return
 
+    def why_unknown(self, stamp_ns: int) -> str:
+        """Say what is seen of the reason why a length up to a stamp is not known."""
+        return 'nothing is measured'
+
     @abstractmethod
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Length of the translation between two stamps."""
@@ -113,10 +117,13 @@ class SpeedScale(ScaleSource):
         self._uncertainty = uncertainty
         self.reset()
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest speed; None before the first."""
-        return self._stamps[-1] if self._stamps else None
+    def why_unknown(self, stamp_ns: int) -> str:
+        """Say how far the newest speed is off."""
+        if not self._stamps:
+            return 'no speed has come'
+        off = (self._stamps[-1] - stamp_ns) * 1e-9
+        return (f'the newest speed is stamped {abs(off):.1f} s '
+                f'{"after" if off > 0 else "before"} the newest image')
 
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
         """Take a measured speed; one beyond any sense or earlier than the last is ignored."""
