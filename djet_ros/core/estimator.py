@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
+from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
@@ -20,6 +21,7 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.parallel import both
+from djet_ros.core.prediction import predict
 from djet_ros.core.starts import five_point, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorSurface,
@@ -55,7 +57,9 @@ class TwoViewEstimator:
         return View(gray, K, self.features(gray), smooth(gray))
 
     def features(self, gray: NDArray[np.uint8]) -> Features:
-        """Detect the ORB features of a gray image (H, W) uint8."""
+        """Detect the features of a gray image (H, W) uint8."""
+        if self.config.detector == 'corners':
+            return detect_corners(gray, self.config.max_features, self.config.corner_contrast)
         return detect_orb(gray, self.config.max_features, self.config.fast_threshold)
 
     def estimate(self, previous: View, current: View,
@@ -68,17 +72,22 @@ class TwoViewEstimator:
         """
         timings: dict[str, float] = {}
         with _timed(timings, 'matching'):
-            x, y = self.match(previous, current)
+            x, y = self.match(previous, current, prior)
         return replace(self.estimate_matched(previous, current, x, y, prior, timings),
                        timings=timings)
 
-    def match(self, previous: View, current: View) -> tuple[Array, Array]:
-        """Match the features of two views: pixels x and y (N, 2) in the one and the other."""
-        share = self.config.search_radius
-        matches = (match_everywhere(previous.features, current.features) if share >= 1 else
-                   match_nearby(previous.features, current.features,
-                                share * max(current.gray.shape)))
-        return previous.features.points[matches[:, 0]], current.features.points[matches[:, 1]]
+    def match(self, previous: View, current: View,
+              prior: RelativePose | None = None) -> tuple[Array, Array]:
+        """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
+        there, here = previous.features, current.features
+        if self.config.search_radius >= 1:
+            matches = match_everywhere(there, here)
+        else:
+            radius = self.config.search_radius * max(current.gray.shape)
+            known = [prior.R] if prior is not None else []
+            turned = replace(there, points=predict(there, here, current.K, known, radius))
+            matches = match_nearby(turned, here, radius)
+        return there.points[matches[:, 0]], here.points[matches[:, 1]]
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None,

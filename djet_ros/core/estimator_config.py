@@ -24,13 +24,19 @@ class EstimatorConfig:
         'djet', 'residual surface: djet (descriptors), pjet (intensities), rpe (re-projection), '
         'or five_point (the start alone)', choices=METHODS)
     max_features: int = parameter(
-        2000, 'ORB features detected per image', minimum=8, maximum=20000)
+        2000, 'features detected per image', minimum=8, maximum=20000)
+    detector: str = parameter(
+        'corners', "features: corners (spread, of three sizes, with unrotated descriptors), or orb "
+        '(with rotated ones)', choices=('corners', 'orb'))
+    corner_contrast: float = parameter(
+        1.0, 'slope in its weakest direction that makes a corner, in gray levels per pixel; lower '
+        'it for dim images', minimum=0.01, maximum=100.0)
     fast_threshold: int = parameter(
-        20, 'contrast in gray levels that makes a corner; lower it for dim images',
+        20, 'contrast in gray levels that makes a feature of the detector orb',
         minimum=1, maximum=255)
     search_radius: float = parameter(
-        0.15, 'how far a feature is sought from its place in the previous image, as a share of '
-        'the longer image side, among those of like size; 1 matches all with all',
+        0.15, 'how far a feature is sought from where the turn of the camera brings it, as a share '
+        'of the longer image side, among those of like size; 1 matches all with all',
         minimum=0.01, maximum=1.0)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)
@@ -61,6 +67,8 @@ class EstimatorConfig:
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
     cull_outside: bool = parameter(
         True, 'leave out matches whose surface has its minimum outside the sampled window')
+    weigh_by_fit: bool = parameter(
+        True, 'take the noise of a match from what is left of its residual at its best place')
     loss: str = parameter(
         'geman_mcclure', 'robust loss over matches',
         choices=('none', 'huber', 'cauchy', 'geman_mcclure'))
@@ -73,7 +81,7 @@ class EstimatorConfig:
     step_share: float = parameter(
         0.3, "share of the way that a keypoint moves with step 'share'", minimum=0.01, maximum=1.0)
     max_iterations: int = parameter(
-        2, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
+        3, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
     epsilon: float = parameter(
         1e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
         minimum=1e-12, maximum=1.0)
@@ -90,9 +98,10 @@ class EstimatorConfig:
 # The paper does not say what becomes of surfaces without a minimum. Kept as they are, their loss
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
-    'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
+    'detector': 'orb', 'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
     'grading': 0.0, 'binary_tests': 256, 'snap_reference': False, 'warp_reference': False,
-    'indefinite': 'drop', 'cull_outside': False, 'loss': 'none',
+    'indefinite': 'drop', 'cull_outside': False,
+    'weigh_by_fit': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
 }
 

@@ -60,7 +60,7 @@ def match_nearby(previous: Features, current: Features,
     """
     Match by Hamming distance with cross-check, among features at most search_radius pixels apart.
 
-    Gives (M, 2) indices into the previous and the current features, in the order of the former.
+    Gives (M, 2) indices into the previous and the current features, the most similar ones first.
     Only features of like size are compared, and the nearer of two that look alike is preferred.
     Matrix products of +-1/2 bits, in strips of the image, give the distances: several times
     faster than brute force over all pairs, and with fewer chances to be wrong.
@@ -81,9 +81,10 @@ def match_nearby(previous: Features, current: Features,
         np.maximum(best_here[near], highest_here, out=best_here[near])
     apart = np.linalg.norm(here[claim] - there, axis=1)
     mutual = np.isfinite(best_there) & (best_there == best_here[claim]) & (apart <= search_radius)
-    matches = np.stack([rows[mutual], columns[claim[mutual]]], axis=1)
+    best = np.flatnonzero(mutual)[np.argsort(-best_there[mutual], kind='stable')]
+    matches = np.stack([rows[best], columns[claim[best]]], axis=1)
     _, first = np.unique(matches[:, 1], return_index=True)  # twins claim the same feature
-    return matches[first][np.argsort(matches[first, 0])]
+    return matches[np.sort(first)]
 
 
 def _compare(left: NDArray[np.float32], right: NDArray[np.float32],
@@ -112,16 +113,22 @@ def _comparable(previous: Features, rows: NDArray[np.int64], current: Features,
             for f, order in ((previous, rows), (current, columns)))
     one_a, one_b = np.ones((len(a), 1)), np.ones((len(b), 1))
     square_a, square_b = ((p * p).sum(1, keepdims=True) for p in (a, b))
-    return both(lambda: _factor(previous.descriptors[rows], [2 * a, -square_a, -one_a]),
-                lambda: _factor(current.descriptors[columns], [b, one_b, square_b]))
+    return both(lambda: factor(previous.descriptors[rows], 2 * a, -square_a, -one_a),
+                lambda: factor(current.descriptors[columns], b, one_b, square_b))
 
 
-def _factor(descriptors: NDArray[np.uint8], places: list[Array]) -> NDArray[np.float32]:
-    """Bits as +-1/2, so that their products count the differing ones; then four more columns."""
-    factor = np.empty((len(descriptors), 260), np.float32)
-    np.subtract(np.unpackbits(descriptors, axis=1), np.float32(0.5), out=factor[:, :256])
-    np.concatenate(places, axis=1, out=factor[:, 256:], casting='same_kind')
-    return factor
+def factor(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32]:
+    """
+    Bits (N, 256) as +-1/2, so that their products count the differing ones; then other columns.
+
+    The product of two is 64 - Hamming distance / 2.
+    """
+    columns = 256 + sum(place.shape[1] for place in places)
+    whole = np.empty((len(descriptors), columns), np.float32)
+    np.subtract(np.unpackbits(descriptors, axis=1), np.float32(0.5), out=whole[:, :256])
+    if places:
+        np.concatenate(places, axis=1, out=whole[:, 256:], casting='same_kind')
+    return whole
 
 
 def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,

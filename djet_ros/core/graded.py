@@ -9,46 +9,51 @@ graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all 
 
 from __future__ import annotations
 
+import cv2
 from djet_ros.core.hamming import Image, Pixels, sum_over_tests
 import numpy as np
 from numpy.typing import NDArray
 
-Grades = NDArray[np.int8]
+Grades = NDArray[np.int16]
+
+# Steps in a gray level: whole gray levels draw the minima of weak surfaces to whole pixels.
+_STEPS = 4
 
 
-def grades(p: Image, q: Image, grading: float) -> Grades:
-    """Grades of tests with intensities p and q, both (T, N), in steps of two gray levels."""
+def smooth_finely(gray: Image) -> Grades:
+    """Smooth an (H, W) uint8 image as ORB does, to quarters of a gray level."""
+    kernel = cv2.getGaussianKernel(7, 2)
+    return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _STEPS * kernel, kernel), np.int16)
+
+
+def grades(p: Grades, q: Grades, grading: float) -> Grades:
+    """Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level."""
     reach = _reach(grading)
-    return np.asarray(np.clip(_halved(p) - _halved(q), -reach, reach), np.int8)
+    return np.asarray(np.clip(p - q, -reach, reach))
 
 
-def graded_surfaces(reference: Grades, smoothed: Image, centres: Pixels, radius: int,
+def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,
                     grading: float) -> NDArray[np.float32]:
     """
     Graded match residual, in bits, for all |v_x|, |v_y| <= radius around centres y_k.
 
     reference: (T, N) grades at x_k, of the first T tests; centres: (N, 2) whole pixels in the
-    smoothed image B; grading in gray levels. Gives (P, P, N) with P = 2 radius + 1, indexed
+    finely smoothed image B; grading in gray levels. Gives (P, P, N) with P = 2 radius + 1, indexed
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
     reach = _reach(grading)
 
-    def differ(outcomes: Grades, reference: Grades) -> NDArray[np.uint8]:
-        np.clip(outcomes, np.int8(-reach), np.int8(reach), out=outcomes)
+    def differ(outcomes: Grades, reference: Grades) -> NDArray[np.uint16]:
+        np.clip(outcomes, np.int16(-reach), np.int16(reach), out=outcomes)
         np.subtract(outcomes, reference, out=outcomes)
         np.abs(outcomes, out=outcomes)
-        return outcomes.view(np.uint8)
+        return outcomes.view(np.uint16)
 
-    sums = sum_over_tests(reference, _halved(smoothed), centres, radius, np.subtract, differ,
+    sums = sum_over_tests(reference, fine, centres, radius, np.subtract, differ,
                           most=2 * reach)
     return np.divide(sums, 2 * reach, dtype=np.float32)
 
 
-def _halved(intensities: Image) -> Grades:
-    """Half of intensities, whose differences fit into bytes."""
-    return np.asarray(intensities >> 1, np.int8)
-
-
 def _reach(grading: float) -> int:
-    """Largest grade: the grading in steps of two gray levels."""
-    return max(1, round(grading / 2))
+    """Largest grade: the grading in quarters of a gray level."""
+    return max(1, round(_STEPS * grading))

@@ -58,7 +58,8 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
     return p < q
 
 
-def intensities(smoothed: Image, points: Pixels, count: int = len(TESTS)) -> tuple[Image, Image]:
+def intensities(smoothed: NDArray[Any], points: Pixels,
+                count: int = len(TESTS)) -> tuple[NDArray[Any], NDArray[Any]]:
     """
     Intensities at both ends p and q of the first tests around (N, 2) whole pixels, (count, N).
 
@@ -70,8 +71,8 @@ def intensities(smoothed: Image, points: Pixels, count: int = len(TESTS)) -> tup
     return patches[py, px], patches[qy, qx]
 
 
-def intensities_through(warp: Array, smoothed: Image, points: Pixels,
-                        count: int = len(TESTS)) -> tuple[Image, Image]:
+def intensities_through(warp: Array, smoothed: NDArray[Any], points: Pixels,
+                        count: int = len(TESTS)) -> tuple[NDArray[Any], NDArray[Any]]:
     """
     Intensities at both ends of the first tests, (count, N), on patches seen through a warp.
 
@@ -80,7 +81,7 @@ def intensities_through(warp: Array, smoothed: Image, points: Pixels,
     """
     inverse = np.linalg.inv(warp).astype(np.float32)
     ends = np.concatenate([TESTS[:count, :2], TESTS[:count, 2:]]).astype(np.float32)
-    values = np.empty((2 * count, len(points)), np.uint8)
+    values = np.empty((2 * count, len(points)), smoothed.dtype)
     for start in range(0, len(points), _WARPED_BLOCK):
         block = slice(start, start + _WARPED_BLOCK)
         x, y = (points[block, axis].astype(np.float32) + ends @ inverse[block, axis].T
@@ -103,24 +104,25 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
         np.not_equal(outcomes, reference, out=outcomes)
         return outcomes.view(np.uint8)
 
-    return sum_over_tests(bits, smoothed, centres, radius, np.less, differ, most=1)
+    sums = sum_over_tests(bits, smoothed, centres, radius, np.less, differ, most=1)
+    return sums.astype(np.uint16)
 
 
 def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels, radius: int,
-                   outcome: np.ufunc, differ: Callable[..., NDArray[np.uint8]],
-                   most: int) -> NDArray[np.uint16]:
+                   outcome: np.ufunc, differ: Callable[..., NDArray[Any]],
+                   most: int) -> NDArray[np.uint32]:
     """
     Sum up, at every pixel of a window, by how much the tests differ from those at a reference.
 
     reference: (T, N) of the first T tests; image: (H, W); centres: (N, 2) whole pixels in it.
     outcome(I(p), I(q)) is a test, of the type of the reference; differ(outcomes, reference), which
-    may write over the outcomes, is at most `most`. Gives (P, P, N) with P = 2 radius + 1, indexed
+    may write over the outcomes, is unsigned and at most `most`. Gives (P, P, N) with P = 2 radius + 1, indexed
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
     require_describable(centres, image, radius)
-    sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint16)
-    # As many at once as can be summed in bytes.
-    at_once = min(_TESTS_AT_ONCE, 255 // most)
+    sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
+    # As many at once as can be summed in the type of the differences.
+    at_once = min(_TESTS_AT_ONCE, np.iinfo(f'u{reference.itemsize}').max // most)
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
         patches = gather_patches(image, centres[block], REACH + radius)
@@ -131,9 +133,9 @@ def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels
 
 
 def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, outcome: np.ufunc,
-            differ: Callable[..., NDArray[np.uint8]], at_once: int) -> NDArray[np.uint16]:
+            differ: Callable[..., NDArray[Any]], at_once: int) -> NDArray[np.uint32]:
     side = 2 * radius + 1
-    total = np.zeros((side, side, patches.shape[2]), np.uint16)
+    total = np.zeros((side, side, patches.shape[2]), np.uint32)
     buffer = np.empty((at_once, *total.shape), reference.dtype)
     tests = (TESTS[:len(reference)] + REACH).tolist()
     for first in range(0, len(tests), at_once):
@@ -143,7 +145,7 @@ def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, outcome
             outcome(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
                     out=one)
         differences = differ(outcomes, reference[some, None, None])
-        total += np.add.reduce(differences, axis=0, dtype=np.uint8)
+        total += np.add.reduce(differences, axis=0, dtype=differences.dtype)
     return total
 
 
@@ -175,7 +177,7 @@ def gather_patches(image: NDArray[Any], centres: Pixels, reach: int) -> NDArray[
     return points_last.reshape(side, side, len(centres))
 
 
-def require_describable(points: Pixels, image: Image, radius: int) -> None:
+def require_describable(points: Pixels, image: NDArray[Any], radius: int) -> None:
     """Raise ValueError unless all (N, 2) points are `describable`."""
     inside = describable(points, image.shape, radius)
     if not inside.all():

@@ -26,6 +26,9 @@ _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good 
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
 
+# What is left over at a minimum is noise itself: a match has at least this share of the usual.
+_LEAST_LEFT = 0.25
+
 
 @dataclass(frozen=True)
 class JetProblem:
@@ -105,16 +108,19 @@ class Loss:
         return np.where(u <= 1, 1.0, 0.0) if self.name == 'huber' else np.ones_like(squared)
 
 
-def jet_problem(K: Array, x: Array, paraboloids: Paraboloids,
-                epipole_blur: float = 0.0) -> JetProblem:
+def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: float = 0.0,
+                by_fit: bool = False) -> JetProblem:
     """
     Pose the problem for matches x (N, 2) with their paraboloids around y.
 
     Paraboloids are divided by their typical (median) curvature, which leaves the optimum where
     it is and gives residuals in pixels, so that losses compare across surfaces. epipole_blur:
     distance from the epipole, in pixels, within which lines are not trusted; 0 is as printed.
+    by_fit: take the variance of a match to be in proportion to what is left at its minimum.
     """
     S = inverse_2x2(paraboloids.A)
+    if by_fit and len(S):
+        S = S * _left_over(paraboloids)[:, None, None]
     widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
     S = S / max(float(np.median(widths)), 1e-12) if len(S) else S
     G = np.linalg.inv(K)[:2, :2]
@@ -123,6 +129,17 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids,
     blur = epipole_blur**2 * np.linalg.det(G) * np.abs(M[:, 0, 0] + M[:, 1, 1]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, paraboloids.minima()).T.copy(),
                       np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]]), blur)
+
+
+def _left_over(paraboloids: Paraboloids) -> Array:
+    """
+    Give the values (N,) at the minima, none of them much less than is usual.
+
+    As in any least squares, what the best fit leaves over tells the noise.
+    """
+    values = paraboloids.values(paraboloids.minima())
+    usual = float(np.median(values))
+    return np.maximum(values, _LEAST_LEFT * usual) if usual > 0 else np.ones(len(values))
 
 
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
@@ -173,6 +190,26 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
             if damping > _MAX_DAMPING or np.linalg.norm(step) < _STEP_TOLERANCE:
                 break
     return Solution(R, t, cost, residuals)
+
+
+def cost_in_front(problem: JetProblem, solution: Solution, loss: Loss) -> float:
+    """
+    Sum up the loss where points also have to lie in front of both cameras.
+
+    Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
+    before that pay for their way to it. Taken is the sign of t that costs less.
+    """
+    R, t = solution.R, solution.t
+    m = R @ problem.rays_x
+    ahead = m[2] > 0
+    infinite = m[:2] / np.where(ahead, m[2], 1.0)
+    a1, a2 = along = t[:2, None] - infinite * t[2]
+    s11, s12, s22 = problem.spread
+    variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
+    way = ((problem.rays_y[:2] - infinite) * along).sum(0) / np.sqrt(np.maximum(variance, 1e-24))
+    r, sign = solution.residuals.r, solution.residuals.sign
+    return min(float((sign * loss(r**2 + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum())
+               for w in (way, -way))
 
 
 def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:

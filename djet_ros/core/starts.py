@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 # Translation X_B = X_A + t of a camera that drives straight ahead.
 FORWARD = np.array([0.0, 0.0, -1.0])
 
-# As many matches tell a motion from the false ones; all of them are for the optimisation.
-_RANSAC_MATCHES = 600
+# As many matches, the most similar ones, tell a motion from the false ones; all of them are for
+# the optimisation.
+_RANSAC_MATCHES = 300
 
 
 def five_point(K: Array, x: Array, y: Array, threshold: float,
@@ -41,10 +42,10 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
     """
     Collect all starting poses of the preset ``best``.
 
-    x, y: (N, 2) pixels; threshold in pixels; prior: the previous motion, if there is one.
+    x, y: (N, 2) pixels, the surest matches first; threshold in pixels; prior: the previous
+    motion, if there is one.
     """
-    some = thinned(len(x), _RANSAC_MATCHES)
-    x, y = x[some], y[some]
+    x, y = x[:_RANSAC_MATCHES], y[:_RANSAC_MATCHES]
     found = five_point(K, x, y, threshold, robust=True)
     return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
 

@@ -12,11 +12,10 @@ from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.graded import graded_surfaces, grades
+from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import (
     describable,
     hamming_surfaces,
-    Image,
     intensities,
     intensities_through,
     Pixels,
@@ -65,11 +64,11 @@ class DescriptorSurface:
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
         pixels = np.rint(x).astype(np.int64)
         self._distances = DescriptorDistances(config)
-        self._has_reference = describable(pixels, previous.smoothed.shape)
+        self._previous, self._current = (self._distances.seen(v) for v in (previous, current))
+        self._has_reference = describable(pixels, self._previous.shape)
         self._reference = np.zeros((config.binary_tests, len(x)), self._distances.dtype)
         self._reference[:, self._has_reference] = self._distances.reference(
-            previous.smoothed, pixels[self._has_reference])
-        self._previous, self._smoothed = previous.smoothed, current.smoothed
+            self._previous, pixels[self._has_reference])
         self._pixels, self._warp = pixels, np.repeat(np.eye(2)[None], len(x), axis=0)
         self._radius = config.window // 2
         self._sigma = config.window_sigma
@@ -80,10 +79,10 @@ class DescriptorSurface:
         """Fit paraboloids to the surfaces around the whole pixels next to y."""
         anew = np.zeros(len(y), bool) if warp is None else self._see_through(warp)
         centres = np.rint(y).astype(np.int64)
-        usable = self._has_reference & describable(centres, self._smoothed.shape, self._radius)
+        usable = self._has_reference & describable(centres, self._current.shape, self._radius)
         # Most windows stay on their pixel from one round to the next, and so does their fit.
         stale = usable & (anew | (centres != self._latest.centres).any(1))
-        surfaces = self._distances.surfaces(self._reference[:, stale], self._smoothed,
+        surfaces = self._distances.surfaces(self._reference[:, stale], self._current,
                                             centres[stale], self._radius)
         fitted = fit_paraboloids(surfaces, centres[stale].astype(float), self._sigma)
         self._latest = replace(_put(self._latest, fitted, stale), usable=usable)
@@ -106,9 +105,13 @@ class DescriptorDistances:
 
     def __init__(self, config: EstimatorConfig) -> None:
         self._grading, self._count = config.grading, config.binary_tests
-        self.dtype: type[np.generic] = np.int8 if self._grading else np.bool_
+        self.dtype: type[np.generic] = np.int16 if self._grading else np.bool_
 
-    def reference(self, smoothed: Image, points: Pixels,
+    def seen(self, view: View) -> NDArray[Any]:
+        """Image (H, W) of a view as the tests see it, that `reference` and `surfaces` take."""
+        return smooth_finely(view.gray) if self._grading else view.smoothed
+
+    def reference(self, seen: NDArray[Any], points: Pixels,
                   warp: Array | None = None) -> NDArray[Any]:
         """
         Descriptors (T, N) at (N, 2) whole pixels, perhaps seen through a warp (N, 2, 2).
@@ -116,16 +119,16 @@ class DescriptorDistances:
         Raises ValueError where a point is too close to the border for a descriptor, and there is
         no warp.
         """
-        p, q = (intensities(smoothed, points, self._count) if warp is None else
-                intensities_through(warp, smoothed, points, self._count))
+        p, q = (intensities(seen, points, self._count) if warp is None else
+                intensities_through(warp, seen, points, self._count))
         return grades(p, q, self._grading) if self._grading else p < q
 
-    def surfaces(self, reference: NDArray[Any], smoothed: Image, centres: Pixels,
+    def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:
         """Distances (P, P, N) in bits between references (T, N) and all pixels of windows."""
         if self._grading:
-            return graded_surfaces(reference, smoothed, centres, radius, self._grading)
-        return hamming_surfaces(reference, smoothed, centres, radius)
+            return graded_surfaces(reference, seen, centres, radius, self._grading)
+        return hamming_surfaces(reference, seen, centres, radius)
 
 
 class PhotometricSurface:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
@@ -16,6 +16,7 @@ from djet_ros.core.geometry import (
     stretches,
 )
 from djet_ros.core.jet import (
+    cost_in_front,
     epipolar_residuals,
     jet_problem,
     JetProblem,
@@ -146,7 +147,7 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
             return None
         # Step 2: global pose optimisation.
         problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting),
-                              TUNING.epipole_blur)
+                              TUNING.epipole_blur, config.weigh_by_fit)
         solution, loss = _cheapest(problem, poses, config, prior)
         pose = _pose(solution)
         # Keypoints go towards their optimum on the epipolar line of the new pose.
@@ -182,9 +183,8 @@ def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
     scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
     tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
     if len(starts) > 1 and len(problem.blur) > TUNING.few_matches:
-        starts = _promising([minimise(some, s.R, s.t, tight, TUNING.steps_to_sketch)
-                             for s in starts])
-    refined = [minimise(problem, s.R, s.t, tight, TUNING.steps_to_compare) for s in starts]
+        starts = _promising([_refined(some, s, tight, TUNING.steps_to_sketch) for s in starts])
+    refined = [_refined(problem, s, tight, TUNING.steps_to_compare) for s in starts]
     best = min(refined, key=lambda solution: solution.cost)
     if prior is not None:
         undecided = best.cost + TUNING.undecided * _scale(best.residuals)**2
@@ -192,6 +192,12 @@ def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
                    key=lambda solution: _apart(prior, _pose(solution)))
     loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
     return minimise(problem, best.R, best.t, loss), loss
+
+
+def _refined(problem: JetProblem, start: Pose, loss: Loss, steps: int) -> Solution:
+    """Make some steps; the cost of where they end is that of points in front of the cameras."""
+    solution = minimise(problem, start.R, start.t, loss, steps)
+    return replace(solution, cost=cost_in_front(problem, solution, loss))
 
 
 def _promising(sketched: list[Solution]) -> list[Pose]:

@@ -28,10 +28,10 @@ class Status(StrEnum):
 @dataclass(frozen=True)
 class Features:
     """
-    ORB features of one image.
+    Features of one image.
 
-    points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) pyramid levels;
-    angles: (N,) degrees; responses: (N,); descriptors: (N, 32) uint8, rotated (for matching only).
+    points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) sizes;
+    angles: (N,) degrees; responses: (N,); descriptors: (N, 32) uint8 (for matching only).
     """
 
     points: Array
@@ -49,7 +49,7 @@ class View:
     """
     One image as the estimator wants it.
 
-    gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix; features: its ORB
+    gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix; features: its
     features; smoothed: (H, W) uint8, gray as ORB's binary tests see it.
     """
 

@@ -144,9 +144,10 @@ def _draw_reference(axes: Axes, trace: Trace, match: int) -> None:
 def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     step, y, distances = trace.rounds[index], trace.y[match], DescriptorDistances(trace.config)
     pixels, centre = (np.rint(points[match]).astype(np.int64) for points in (trace.x, trace.y))
-    reference = distances.reference(trace.previous.smoothed, pixels[None],
+    reference = distances.reference(distances.seen(trace.previous), pixels[None],
                                     None if step.warp is None else step.warp[[match]])
-    surface = distances.surfaces(reference, trace.current.smoothed, centre[None], RADIUS)[:, :, 0]
+    surface = distances.surfaces(reference, distances.seen(trace.current), centre[None],
+                                 RADIUS)[:, :, 0]
     draw_patch(axes, trace.current.gray, centre, RADIUS)
     draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:

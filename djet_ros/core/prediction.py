@@ -1,0 +1,72 @@
+"""Where features are to be looked for in the next image: as a turn of the camera brings them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from djet_ros.core.features import factor
+from djet_ros.core.geometry import rays, unit
+from djet_ros.core.types import Array, Features
+import numpy as np
+from numpy.typing import NDArray
+
+# Features of the largest size that are compared with all of their size, wherever they are.
+_COMPARED = 400
+
+# Rotations that are tried, each from two of their matches.
+_SAMPLES = 300
+
+
+def predict(previous: Features, current: Features, K: Array, known: Sequence[Array],
+            reach: float) -> Array:
+    """
+    Tell where the previous features would be seen in the current image, were they far away.
+
+    Gives pixels (N, 2). known: rotations (3, 3) that are likely, such as that of the motion
+    before; reach: pixels by which near things may move otherwise.
+    """
+    R = likely_rotation(previous, current, K, known, reach)
+    turned = rays(K, previous.points) @ (K @ R).T
+    # What is turned to behind the camera is far out of the image.
+    return np.asarray(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3))
+
+
+def likely_rotation(previous: Features, current: Features, K: Array, known: Sequence[Array],
+                    reach: float) -> Array:
+    """
+    Find the rotation (3, 3) after which most matches of the largest features are within reach.
+
+    Known rotations, none at all, and those of pairs of matches are tried; see `predict`.
+    """
+    x, y = _large_matches(previous, current)
+    x, y = unit(rays(K, x)), unit(rays(K, y))
+    tried = np.stack([*known, np.eye(3)])
+    if len(x) >= 2:
+        one, other = np.random.default_rng(0).integers(0, len(x), (2, _SAMPLES))
+        turned = _frames(y[one], y[other]) @ _frames(x[one], x[other]).transpose(0, 2, 1)
+        tried = np.concatenate([tried, turned])
+    cosines = (y * (x @ tried.transpose(0, 2, 1))).sum(2)
+    agreement = 1 - 2 * (1 - cosines) * (K[0, 0] / reach)**2
+    return np.asarray(tried[np.maximum(agreement, 0).sum(1).argmax()])
+
+
+def _large_matches(previous: Features, current: Features) -> tuple[Array, Array]:
+    """Mutual matches (M, 2) and (M, 2) among the features of the largest size there is."""
+    there, here = _largest(previous), _largest(current)
+    if not len(there) or not len(here):
+        return np.empty((0, 2)), np.empty((0, 2))
+    similarity = factor(previous.descriptors[there]) @ factor(current.descriptors[here]).T
+    nearest = similarity.argmax(1)
+    mutual = similarity.argmax(0)[nearest] == np.arange(len(there))
+    return previous.points[there[mutual]], current.points[here[nearest[mutual]]]
+
+
+def _largest(features: Features) -> NDArray[np.int64]:
+    largest = features.octaves == features.octaves.max(initial=0)
+    return np.flatnonzero(largest)[:_COMPARED]
+
+
+def _frames(a: Array, b: Array) -> Array:
+    """Frames (S, 3, 3) of pairs of directions (S, 3); of parallel ones, no rotation at all."""
+    first, third = unit(a + b), unit(np.cross(a, b))
+    return np.stack([first, np.cross(third, first), third], axis=2)
