@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.graded import graded_surfaces, grades
+from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, intensities, smooth
 from djet_ros.core.orb_pattern import REACH, TESTS
 from djet_ros.core.surfaces import DescriptorSurface, with_minimum
@@ -16,7 +16,7 @@ SIZE = (160, 120)
 
 
 def smoothed(seed):
-    return smooth(textured(np.random.default_rng(seed), SIZE))
+    return smooth_finely(textured(np.random.default_rng(seed), SIZE))
 
 
 @pytest.mark.parametrize('grading', [2.0, 24.0, 120.0])
@@ -28,22 +28,22 @@ def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count):
     surfaces = graded_surfaces(reference, image_b, y, 2, grading)
 
     def graded(image, place, test):
-        halves = [int(image[place[1] + test[i + 1], place[0] + test[i]]) // 2 for i in (0, 2)]
-        return np.clip(halves[1] - halves[0], -grading / 2, grading / 2)
+        levels = [image[place[1] + test[i + 1], place[0] + test[i]] / 4 for i in (0, 2)]
+        return np.clip(levels[1] - levels[0], -grading, grading)
 
     for k in range(2):
         for v_y in range(-2, 3):
             for v_x in range(-2, 3):
                 expected = sum(abs(graded(image_a, x[k], test)
                                    - graded(image_b, y[k] + (v_x, v_y), test))
-                               for test in TESTS[:count]) / grading
+                               for test in TESTS[:count]) / (2 * grading)
                 assert surfaces[v_y + 2, v_x + 2, k] == pytest.approx(expected, rel=1e-6)
 
 
 def test_where_all_tests_are_decided_the_distance_is_hammings():
     # With two levels a test is decided or undecided; undecided ones are 0 here and a bit there.
     rng = np.random.default_rng(72)
-    image = np.where(rng.uniform(size=SIZE[::-1]) < 0.5, 0, 255).astype(np.uint8)
+    image = np.where(rng.uniform(size=SIZE[::-1]) < 0.5, 0, 1020).astype(np.int16)
     x, y = np.array([[60, 50]]), np.array([[62, 49]])
     p, q = intensities(image, x)
     decided = (p != q)[:, 0]
@@ -67,7 +67,7 @@ def test_many_points_at_once_are_as_one_at_a_time():
 
 
 def test_without_grading_all_of_orbs_bits_are_compared():
-    image_a, image_b = smoothed(76), smoothed(77)
+    image_a, image_b = (textured(np.random.default_rng(seed), SIZE) for seed in (76, 77))
     estimator = TwoViewEstimator()
     views = [estimator.view(image, K) for image in (image_a, image_b)]
     x = np.array([[60.0, 50.0], [90.0, 61.0]])
@@ -97,3 +97,11 @@ def test_graded_tests_find_a_place_in_noise_nearer_to_the_truth_than_bits(noise)
         fitted, _ = with_minimum(surface.around(x), 'project')
         errors[grading] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
     assert errors[24.0] < 0.8 * errors[0.0]
+
+
+def test_a_gray_level_is_seen_in_quarters_as_orb_sees_it_in_whole_ones():
+    image = textured(np.random.default_rng(76), SIZE)
+    fine = smooth_finely(image)
+    assert fine.dtype == np.int16 and fine.max() <= 4 * 255
+    assert np.abs(fine / 4 - smooth(image)).max() <= 0.75
+    assert len(np.unique(fine % 4)) == 4

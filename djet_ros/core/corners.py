@@ -8,6 +8,8 @@ beside the larger one there is an edge, whose stair steps pass for corners at on
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.types import Features
@@ -50,13 +52,23 @@ def detect_corners(gray: Image, max_features: int, contrast: float) -> Features:
 def corner_slopes(image: Image) -> NDArray[np.float32]:
     """Mean square slope (H, W) of a block in its weakest direction, per pixel; 0 on edges."""
     dx, dy = cv2.spatialGradient(image)
-    xx, xy, yy = (cv2.boxFilter(cv2.multiply(a, b, dtype=cv2.CV_32F), -1, (_BLOCK, _BLOCK))
+    # Into as little new memory as can be: fresh pages cost more than the sums.
+    xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))
                   for a, b in ((dx, dx), (dx, dy), (dy, dy)))
-    mean = (xx + yy) / 2
-    spread = cv2.magnitude((xx - yy) / 2, xy)
-    least = (mean - spread) / np.float32(_SOBEL**2)
-    least[mean - spread < _LEAST_RATIO * (mean + spread)] = 0
+    trace = xx + yy
+    xx -= yy
+    xy *= 2
+    spread = cv2.magnitude(xx, xy, xx)
+    least = np.subtract(trace, spread, out=yy)
+    most = np.add(trace, spread, out=trace)
+    most *= np.float32(_LEAST_RATIO)
+    least *= least >= most
+    least *= np.float32(0.5 / _SOBEL**2)
     return np.asarray(least, np.float32)
+
+
+def _over_block(products: NDArray[Any]) -> NDArray[np.float32]:
+    return np.asarray(cv2.boxFilter(products, -1, (_BLOCK, _BLOCK), products), np.float32)
 
 
 def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int) -> NDArray[np.int64]:

@@ -26,8 +26,8 @@ class EstimatorConfig:
     max_features: int = parameter(
         2000, 'features detected per image', minimum=8, maximum=20000)
     detector: str = parameter(
-        'corners', "features: corners (spread, of three sizes, with unrotated descriptors), or orb "
-        '(with rotated ones)', choices=('corners', 'orb'))
+        'corners', 'features: corners (well spread, of three sizes, descriptors unrotated) or orb '
+        '(as OpenCV detects them, descriptors rotated)', choices=('corners', 'orb'))
     corner_contrast: float = parameter(
         1.0, 'slope in its weakest direction that makes a corner, in gray levels per pixel; lower '
         'it for dim images', minimum=0.01, maximum=100.0)
@@ -35,8 +35,8 @@ class EstimatorConfig:
         20, 'contrast in gray levels that makes a feature of the detector orb',
         minimum=1, maximum=255)
     search_radius: float = parameter(
-        0.15, 'how far a feature is sought from where the turn of the camera brings it, as a share '
-        'of the longer image side, among those of like size; 1 matches all with all',
+        0.15, 'how far a feature is sought from where the turn of the camera brings it, as a '
+        'share of the longer image side, among those of like size; 1 matches all with all',
         minimum=0.01, maximum=1.0)
     min_matches: int = parameter(
         20, 'fewer matches than this give status TOO_FEW_MATCHES', minimum=8, maximum=10000)
@@ -98,7 +98,8 @@ class EstimatorConfig:
 # The paper does not say what becomes of surfaces without a minimum. Kept as they are, their loss
 # has no lower bound and tears the pose away, so they are dropped.
 _PAPER: dict[str, Any] = {
-    'detector': 'orb', 'search_radius': 1.0, 'starts': 'five_point', 'window': 7, 'window_sigma': 0.0,
+    'detector': 'orb', 'search_radius': 1.0, 'starts': 'five_point',
+    'window': 7, 'window_sigma': 0.0,
     'grading': 0.0, 'binary_tests': 256, 'snap_reference': False, 'warp_reference': False,
     'indefinite': 'drop', 'cull_outside': False,
     'weigh_by_fit': False, 'loss': 'none',

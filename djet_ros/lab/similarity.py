@@ -129,7 +129,7 @@ def _matches(gray: Gray, other: Gray, config: EstimatorConfig) -> tuple[Array, A
     estimator = TwoViewEstimator(config)
     # The camera does not matter for matching.
     views: Sequence[View] = [estimator.view(image, np.eye(3)) for image in (gray, other)]
-    x, y = estimator.match(*views)
+    x, y = estimator.match(views[0], views[1])
     if not len(x):
         raise DjetError('the two images have no match; do they show the same place?')
     strength = {tuple(point): response for point, response

@@ -1,0 +1,93 @@
+"""Corners are spread, real and at whole pixels, whatever the image."""
+
+import cv2
+from djet_ros.core.corners import corner_slopes, detect_corners, spread_out
+from djet_ros.core.hamming import describable
+import numpy as np
+import pytest
+from two_view import textured
+
+
+@pytest.fixture(scope='module')
+def image():
+    return textured(np.random.default_rng(80), (400, 300))
+
+
+def squares(contrast):
+    """Give an image of 6 x 4 squares and their 96 corners."""
+    image = np.full((300, 400), 100, np.uint8)
+    corners = []
+    for left in range(40, 340, 50):
+        for top in range(40, 240, 50):
+            cv2.rectangle(image, (left, top), (left + 24, top + 24), 100 + contrast, -1)
+            corners += [(left, top), (left + 24, top), (left, top + 24), (left + 24, top + 24)]
+    return image, np.array(corners)
+
+
+def test_corners_of_squares_are_found_and_nothing_but_corners():
+    image, corners = squares(100)
+    features = detect_corners(image, 2000, 1.0)
+    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    fine = features.octaves == 0
+    assert ways[fine].min(0).max() <= 5
+    assert ways.min(1).max() <= 10
+
+
+def test_a_stair_stepped_edge_has_no_corners():
+    image = np.full((300, 400), 60, np.uint8)
+    rows, columns = np.mgrid[:300, :400]
+    image[columns > 150 + rows // 4] = 180
+    features = detect_corners(image, 2000, 1.0)
+    # It has where it leaves the image.
+    inside = (features.points[:, 1] > 60) & (features.points[:, 1] < 240)
+    assert not inside.any()
+
+
+def test_slopes_are_told_in_gray_levels_per_pixel():
+    rows, columns = np.mgrid[:60, :60]
+    # Along x it climbs by 3 for each pixel, along y by 4, in quarters of the image in turn.
+    saw = np.where((rows // 2 + columns // 2) % 2 == 0, 3 * columns, 4 * rows) % 200
+    assert corner_slopes(saw.astype(np.uint8)).max() > 1
+    ramp = (3 * columns).astype(np.uint8)
+    assert corner_slopes(ramp)[10:50, 10:50].max() == 0
+
+
+def test_points_are_whole_pixels_with_room_for_a_descriptor(image):
+    features = detect_corners(image, 2000, 1.0)
+    assert len(features) > 200
+    assert (features.points == np.rint(features.points)).all()
+    assert describable(features.points[features.octaves == 0].astype(int), image.shape).all()
+    assert (np.diff(np.unique(features.octaves)) == 1).all()
+    assert not features.angles.any()
+    assert (features.responses >= 1.0).all()
+
+
+def test_a_weak_corner_is_taken_only_where_there_is_nothing_better():
+    image, _ = squares(100)
+    image[:, 215:] = np.minimum(image[:, 215:], 112)
+    every, some = detect_corners(image, 2000, 0.5), detect_corners(image, 60, 0.5)
+    assert (every.points[:, 0] < 210).sum() > 60 >= len(some)
+    weak = some.points[:, 0] > 220
+    assert some.responses[weak].max() < some.responses[~weak].min()
+    assert weak.any()
+
+
+def test_each_cell_gives_its_best_before_any_gives_its_second():
+    points = np.array([(5, 5), (8, 8), (12, 12), (85, 5), (88, 30)])
+    strengths = np.array([5, 9, 7, 1, 2], np.float32)
+    assert spread_out(points, strengths, 2).tolist() == [1, 4]
+    assert spread_out(points, strengths, 3).tolist() == [1, 2, 4]
+    assert spread_out(points, strengths, 9).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_flat_and_tiny_images_have_no_corners():
+    for shape in ((200, 300), (1, 1), (20, 30), (36, 36)):
+        features = detect_corners(np.full(shape, 90, np.uint8), 500, 1.0)
+        assert len(features) == 0
+        assert features.descriptors.shape == (0, 32)
+
+
+def test_the_same_image_gives_the_same_bytes(image):
+    one, other = (detect_corners(image, 500, 1.0) for _ in range(2))
+    for name in ('points', 'octaves', 'responses', 'descriptors'):
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()

@@ -1,0 +1,52 @@
+"""A turn of the camera is found before its features are matched one by one."""
+
+from dataclasses import replace
+
+import cv2
+from djet_ros.core.corners import detect_corners
+from djet_ros.core.geometry import rotation_angle, rotation_exp
+from djet_ros.core.prediction import likely_rotation, predict
+import numpy as np
+import pytest
+from two_view import textured
+
+K = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+
+
+def turned_pair(degrees):
+    image = textured(np.random.default_rng(81), (400, 300))
+    R = rotation_exp(np.deg2rad(np.asarray(degrees, float)))
+    H = K @ R @ np.linalg.inv(K)
+    turned = cv2.warpPerspective(image, H, (400, 300))
+    return R, H, detect_corners(image, 1000, 1.0), detect_corners(turned, 1000, 1.0)
+
+
+@pytest.mark.parametrize('degrees', [(0, 0, 0), (0, 4, 0), (2, -12, 1), (0, 0, 6), (-8, 3, 0)])
+def test_big_turns_are_told_without_any_motion_before(degrees):
+    R, H, previous, current = turned_pair(degrees)
+    found = likely_rotation(previous, current, K, [], 30.0)
+    assert np.rad2deg(rotation_angle(R, found)) < 2
+    there = predict(previous, current, K, [], 30.0)
+    truth = cv2.perspectiveTransform(previous.points[None], H)[0]
+    assert np.median(np.linalg.norm(there - truth, axis=1)) < 15
+
+
+def test_a_wrong_motion_before_does_no_harm():
+    R, _, previous, current = turned_pair((0, 5, 0))
+    wrong = rotation_exp(np.deg2rad([0.0, -20.0, 0.0]))
+    assert np.rad2deg(rotation_angle(R, likely_rotation(previous, current, K, [wrong], 30.0))) < 2
+
+
+def test_where_there_is_nothing_to_match_nothing_turns():
+    _, _, previous, _ = turned_pair((0, 0, 0))
+    none = detect_corners(np.zeros((300, 400), np.uint8), 100, 1.0)
+    assert (likely_rotation(previous, none, K, [], 30.0) == np.eye(3)).all()
+    assert predict(none, previous, K, [], 30.0).shape == (0, 2)
+
+
+def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
+    _, _, previous, _ = turned_pair((0, 0, 0))
+    none = replace(previous, descriptors=previous.descriptors[:0], points=previous.points[:0],
+                   octaves=previous.octaves[:0])
+    behind = predict(previous, none, K, [rotation_exp(np.array([0.0, 3.0, 0.0]))], 30.0)
+    assert np.isfinite(behind).all()
