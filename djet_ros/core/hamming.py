@@ -117,8 +117,8 @@ def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels
     reference: (T, N) of the first T tests; image: (H, W); centres: (N, 2) whole pixels in it.
     outcome(I(p), I(q)) is a test, of the type of the reference; differ(outcomes, reference), which
     may write over the outcomes, is unsigned, as wide, and at most `most`. Gives (P, P, N) with
-    P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k]. Raises ValueError where a window does
-    not fit into the image.
+    P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k]. Raises ValueError where a window
+    does not fit into the image.
     """
     require_describable(centres, image, radius)
     sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
