@@ -21,6 +21,7 @@ from djet_ros.core.geometry import (
     sphere_tangents,
     unit,
 )
+from djet_ros.core.hamming import dense_descriptors
 from djet_ros.core.starts import five_point, planar, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
@@ -34,7 +35,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from two_view import (
     BACKWARD,
-    dense_descriptors,
     FORWARD,
     K,
     project,

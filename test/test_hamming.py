@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 from djet_ros.core.hamming import (
+    dense_descriptors,
     describable,
     descriptor_bits,
     hamming_surfaces,
@@ -16,7 +17,7 @@ from djet_ros.core.hamming import (
 from djet_ros.core.orb_pattern import REACH, TESTS
 import numpy as np
 import pytest
-from two_view import dense_descriptors, textured
+from two_view import textured
 
 SIZE = (160, 120)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.hamming import smooth
+from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.surfaces import (
@@ -17,7 +17,7 @@ from djet_ros.core.surfaces import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_view import dense_descriptors, K, textured
+from two_view import K, textured
 
 SIZE = (160, 120)
 

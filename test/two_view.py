@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import unit
-from djet_ros.core.hamming import descriptor_bits
 from djet_ros.core.types import View
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -82,8 +81,3 @@ def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
 def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:
     """View of a wall without any texture."""
     return TwoViewEstimator().view(np.full(size[::-1], gray, np.uint8), K)
-
-
-def dense_descriptors(smoothed: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Unrotated descriptors, packed as (N, 32) uint8 like those of ``cv2.ORB.compute``."""
-    return np.packbits(descriptor_bits(smoothed, points), axis=0, bitorder='little').T

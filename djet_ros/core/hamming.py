@@ -91,6 +91,11 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Pixels,
     return values[:count], values[count:]
 
 
+def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
+    """Unrotated descriptors, packed as (N, 32) uint8 like those of ``cv2.ORB.compute``."""
+    return np.packbits(descriptor_bits(smoothed, points), axis=0, bitorder='little').T
+
+
 def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
                      radius: int) -> NDArray[np.uint16]:
     """

@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.hamming import smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
