@@ -270,7 +270,7 @@ def speed(seconds, metres_per_second=3.0):
 
 
 @pytest.mark.parametrize(('off', 'seen'), [
-    (None, 'no speed has come; publish it on speed or speed_odometry'),
+    (None, 'no speed has come; publish it on speed or speed_odometry, stamped by the clock'),
     (100.0, r'the newest speed is stamped 100\.\d s after the newest image'),
     (-100.0, r'the newest speed is stamped 100\.\d s before the newest image')])
 def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(drive, off, seen):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Status
 from djet_ros.odometry.messages import camera_frame, seconds_and_rest
-from djet_ros.odometry.scale import ScaleSource, SpeedScale
+from djet_ros.odometry.scale import ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
 
 # Images over which shares are taken, and of which they say nothing yet.
@@ -19,6 +19,13 @@ _SHARE = 0.1
 
 # Images or pairs in a row from which on something is no accident.
 _IN_A_ROW = 5
+
+# What helps where a scale source does not know a length.
+_REMEDIES = {
+    'speed': 'publish it on {topics}, stamped by the clock of the images (use_sim_time on both '
+             'sides or on none), or choose another odometry.scale',
+    'camera_height': 'check odometry.camera_height and odometry.camera_pitch, or choose another '
+                     'odometry.scale'}
 
 
 class Complaint(NamedTuple):
@@ -88,23 +95,11 @@ class Health:
     def _length(self, scale: ScaleSource) -> Complaint | None:
         if self._unknown_lengths < _IN_A_ROW or self._last is None:
             return None
+        remedy = _REMEDIES.get(self._config.scale, 'choose another odometry.scale')
         return Complaint('no metric length', 'WARN', (
             f'odometry.scale is {self._config.scale}, and no length is known: '
-            + self._why_unknown(scale, self._last.stamp_ns)))
-
-    def _why_unknown(self, scale: ScaleSource, stamp: int) -> str:
-        if isinstance(scale, SpeedScale):
-            if scale.newest_ns is None:
-                return (f'no speed has come; publish it on {self._speed_topics}, or choose '
-                        'another odometry.scale')
-            off = (scale.newest_ns - stamp) * 1e-9
-            return (f'the newest speed is stamped {abs(off):.1f} s '
-                    f'{"after" if off > 0 else "before"} the newest image; do both sides go by '
-                    'one clock (use_sim_time), and does the speed still come?')
-        if self._config.scale == 'camera_height':
-            return ('the images show no level ground that fits odometry.camera_height and '
-                    'odometry.camera_pitch')
-        return 'there is no ground truth about the time of these images'
+            f'{scale.why_unknown(self._last.stamp_ns)}; '
+            + remedy.format(topics=self._speed_topics)))
 
     def _share(self, reason: str) -> float:
         few = len(self._fates) < _FEW

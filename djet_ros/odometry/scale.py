@@ -200,6 +200,10 @@ class CameraHeightScale(ScaleSource):
         sigma = np.hypot(np.sqrt(P[0, 0]) * seconds, self._uncertainty * metres)
         return Length(metres, max(float(sigma), 1e-3), True)
 
+    def why_unknown(self, stamp_ns: int) -> str:
+        """Say that no ground was seen."""
+        return 'the images show no level ground as far below as it should be'
+
     def reset(self) -> None:
         """Forget speed, pitch and roll."""
         self._x, self._P = np.array([0.0, self._pitch, 0.0]), np.diag(_AT_FIRST**2)
@@ -249,6 +253,10 @@ class GroundTruthScale(ScaleSource):
         known = np.isfinite(positions).all(axis=1)
         self._stamps, self._positions = stamps_ns[known], positions[known]
         self._uncertainty = uncertainty
+
+    def why_unknown(self, stamp_ns: int) -> str:
+        """Say that this time is not covered."""
+        return 'the ground truth does not cover the time of the newest image'
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Give the distance, unknown outside the stretch and wherever a gap is too wide."""
