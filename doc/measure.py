@@ -199,7 +199,7 @@ def missing(results: dict[str, Any], args: argparse.Namespace
         jobs.append(Job(title(folder), (), folder, args.real_frames, used))
     work: dict[str, Callable[[], dict[str, Any]]] = {
         job.name: partial(measured, job) for job in sorted(jobs, key=lambda job: -job.cost)}
-    work['ablation'] = partial(ablation, args.data)
+    work['ablation'] = partial(ablation, args.data, args.real_frames)
     for name, action in work.items():
         if name not in results['parts'] and (not args.only or name in args.only):
             yield name, action
@@ -298,15 +298,15 @@ def surprise(pose: RelativePose, true_motion: Array) -> float:
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
-def ablation(data: Path | None) -> dict[str, Any]:
+def ablation(data: Path | None, most: int | None) -> dict[str, Any]:
     """Measure variants of D-JET on KITTI's frames, or on a street if there are none."""
-    started = perf_counter()
+    started, frames = perf_counter(), min(most or ABLATED_FRAMES, ABLATED_FRAMES)
     with TemporaryDirectory() as name:
-        jobs = [Job(title(folder), (), folder, ABLATED_FRAMES, 0) for folder in kitti(data)]
-        jobs = jobs or [Job('road', (0,), None, ABLATED_FRAMES, 0)]
+        jobs = [Job(title(folder), (), folder, frames, 0) for folder in kitti(data)]
+        jobs = jobs or [Job('road', (0,), None, frames, 0)]
         datasets = [dataset for job in jobs for dataset in opened_for(job, Path(name))]
         methods = ablation_methods(['best'], PARTS, ABLATED_WINDOWS, {})
-        found = {'of': [job.name for job in jobs], 'frames': ABLATED_FRAMES,
+        found = {'of': [job.name for job in jobs], 'frames': frames,
                  'variants': by_method(datasets, methods)}
     return {'seconds': rounded(perf_counter() - started), **found}
 

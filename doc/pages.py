@@ -240,8 +240,9 @@ def surprise(results: Any) -> str:
     for name, part in sequences(results):
         one = part['odometry']['surprise']
         if one['pairs']:
-            rows.append((name, str(one['pairs']), number(one['mean'], 1),
-                         number(one['median'], 1), str(one['beyond'])))
+            digits = 1 if max(one['mean'], one['median']) < 100 else 0
+            rows.append((name, str(one['pairs']), number(one['mean'], digits),
+                         number(one['median'], digits), str(one['beyond'])))
     return table(('', 'pairs', 'mean (5 if true)', 'median (4.4 if true)',
                   'beyond the 99.9 % bound'), rows)
 
