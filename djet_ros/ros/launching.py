@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from launch import Substitution
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
-
-from launch import Substitution
 
 CONFIG = PathJoinSubstitution([FindPackageShare('djet_ros'), 'config'])
 

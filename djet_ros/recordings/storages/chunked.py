@@ -11,6 +11,7 @@ message that waits for its turn, its place; never the whole file.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 from heapq import heappop, heappush
@@ -64,6 +65,7 @@ class ChunkedFile(ABC):
         self.size = path.stat().st_size
         self.connections: list[Connection] = []
         self._chunks: list[Chunk] = []
+        self._counts: Counter[int] = Counter()
         self._broken: str | None = None
         with path.open('rb') as file:
             if not self._read_index(file):
@@ -73,17 +75,42 @@ class ChunkedFile(ABC):
     def _read_index(self, file: BinaryIO) -> bool:
         """Fill in connections and chunks from the index; False where it is absent or damaged."""
 
-    @abstractmethod
     def _scan(self, file: BinaryIO) -> None:
         """Fill in connections and chunks by walking the file up to its end or break."""
+        self._chunks.clear()
+        self._counts.clear()
+        try:
+            self._scan_records(file)
+        except BrokenFile as error:
+            self._broken = str(error)
+
+    def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
+        """Take a chunk with what it tells of connections."""
+        start = None
+        # The chunk is kept even if the loop meets its break: what lies before that is good.
+        try:
+            for place in self._places(self._unpack(file, chunk), learn=True):
+                self._counts[place.connection] += 1
+                start = place.stamp if start is None else min(start, place.stamp)
+        finally:
+            if start is not None:
+                self._chunks.append(chunk._replace(start=start))
+
+    @abstractmethod
+    def _scan_records(self, file: BinaryIO) -> None:
+        """Walk the file anew, with ``_scan_chunk`` for its chunks; BrokenFile at its break."""
 
     @abstractmethod
     def _unpack(self, file: BinaryIO, chunk: Chunk) -> Records:
         """Unpack as much of a chunk as there is; BrokenFile where there is nothing."""
 
     @abstractmethod
-    def _places(self, records: Records) -> Iterator[Place]:
-        """Find the messages among records; BrokenFile after the last if some are missing."""
+    def _places(self, records: Records, learn: bool = False) -> Iterator[Place]:
+        """
+        Find the messages among records; BrokenFile after the last if some are missing.
+
+        learn: whether to take what the records tell of connections, too.
+        """
 
     def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """

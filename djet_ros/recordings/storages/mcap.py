@@ -39,7 +39,6 @@ class McapFile(ChunkedFile):
         """Read the index, or walk the file where it has none."""
         self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}
-        self._counts: Counter[int] = Counter()
         super().__init__(path)
         self.connections = [self._connection(*item) for item in sorted(self._channels.items())]
 
@@ -85,17 +84,9 @@ class McapFile(ChunkedFile):
         return ((total, schemas, channels)
                 == (indexed, len(self._schemas), len(self._channels)))
 
-    def _scan(self, file: BinaryIO) -> None:
+    def _scan_records(self, file: BinaryIO) -> None:
         self._schemas.clear()
         self._channels.clear()
-        self._chunks.clear()
-        self._counts.clear()
-        try:
-            self._scan_records(file)
-        except BrokenFile as error:
-            self._broken = str(error)
-
-    def _scan_records(self, file: BinaryIO) -> None:
         position = len(MAGIC)
         while True:
             code, length = RECORD.unpack(read_exactly(file, position, RECORD.size))
@@ -114,22 +105,6 @@ class McapFile(ChunkedFile):
             if code == MESSAGE:
                 self._add_loose(Place(*_message(read_exactly(file, begin, MESSAGE_HEAD.size), 0),
                                       begin - RECORD.size, position))
-
-    def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
-        records = self._unpack(file, chunk)
-        start = None
-        # The chunk is kept even if the loop meets its break: what lies before that is good.
-        try:
-            for code, begin, end in split_records(records):
-                if code in (SCHEMA, CHANNEL):
-                    self._learn(code, Fields(bytes(records.data[begin:end])))
-                elif code == MESSAGE:
-                    number, stamp = _message(records.data, begin)
-                    self._counts[number] += 1
-                    start = stamp if start is None else min(start, stamp)
-        finally:
-            if start is not None:
-                self._chunks.append(chunk._replace(start=start))
 
     def _add_loose(self, place: Place) -> None:
         """Let a message outside chunks extend the last stretch, or begin one."""
@@ -168,9 +143,11 @@ class McapFile(ChunkedFile):
             raise BrokenFile(f'the chunk at byte {chunk.offset} does not match its checksum')
         return Records(records)
 
-    def _places(self, records: Records) -> Iterator[Place]:
+    def _places(self, records: Records, learn: bool = False) -> Iterator[Place]:
         for code, begin, end in split_records(records):
-            if code == MESSAGE:
+            if learn and code in (SCHEMA, CHANNEL):
+                self._learn(code, Fields(bytes(records.data[begin:end])))
+            elif code == MESSAGE:
                 yield Place(*_message(records.data, begin), begin + MESSAGE_HEAD.size, end)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 import struct
@@ -25,7 +24,6 @@ class Ros1File(ChunkedFile):
     def __init__(self, path: Path) -> None:
         """Read the index, or walk the file where it has none."""
         self._topics: dict[int, tuple[str, str, str]] = {}
-        self._counts: Counter[int] = Counter()
         super().__init__(path)
         self.connections = [
             Connection(number, topic, ros2_name(msgtype), 'ros1', definition,
@@ -60,16 +58,8 @@ class Ros1File(ChunkedFile):
         for number, count in struct.iter_unpack('<II', counts[:len(counts) // 8 * 8]):
             self._counts[number] += count
 
-    def _scan(self, file: BinaryIO) -> None:
-        self._topics.clear()
-        self._chunks.clear()
-        self._counts.clear()
-        try:
-            self._scan_records(file)
-        except BrokenFile as error:
-            self._broken = str(error)
-
     def _scan_records(self, file: BinaryIO) -> None:
+        self._topics.clear()
         position = len(MAGIC)
         while True:
             header, begin, length = _read_record(file, position)
@@ -82,22 +72,6 @@ class Ros1File(ChunkedFile):
             elif code not in (BAG_HEADER, INDEX):
                 raise BrokenFile(f'there is a record of kind {code} at byte {position}')
             position = end
-
-    def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
-        records = self._unpack(file, chunk)
-        start = None
-        # The chunk is kept even if the loop meets its break: what lies before that is good.
-        try:
-            for header, begin, end in _split_records(records):
-                if _code(header) == CONNECTION:
-                    self._learn(header, records.data[begin:end])
-                elif _code(header) == MESSAGE:
-                    stamp = _time(header, 'time')
-                    self._counts[_field(header, 'conn', '<I')[0]] += 1
-                    start = stamp if start is None else min(start, stamp)
-        finally:
-            if start is not None:
-                self._chunks.append(chunk._replace(start=start))
 
     def _learn(self, header: dict[str, bytes], data: memoryview) -> None:
         number, = _field(header, 'conn', '<I')
@@ -116,9 +90,11 @@ class Ros1File(ChunkedFile):
             return Records(records, f'the chunk at byte {chunk.offset} is cut short')
         return Records(records)
 
-    def _places(self, records: Records) -> Iterator[Place]:
+    def _places(self, records: Records, learn: bool = False) -> Iterator[Place]:
         for header, begin, end in _split_records(records):
-            if _code(header) == MESSAGE:
+            if learn and _code(header) == CONNECTION:
+                self._learn(header, records.data[begin:end])
+            elif _code(header) == MESSAGE:
                 yield Place(_field(header, 'conn', '<I')[0], _time(header, 'time'), begin, end)
 
 
