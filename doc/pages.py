@@ -15,6 +15,7 @@ import sys
 import textwrap
 from typing import Any
 
+from djet_ros.lab.methods import TITLES
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,9 +24,6 @@ PAGES = (ROOT / 'README.md', *sorted(DOC.glob('*.md')))
 BLOCK = re.compile(r'(?<=<!-- generated: )([\w -]+)( -->\n).*?(?=<!-- end -->)', re.DOTALL)
 RESULTS = DOC / 'results.json'
 
-TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-point',
-          'opencv_ransac': 'OpenCV RANSAC', 'usac_magsac': 'OpenCV MAGSAC++',
-          'poselib': 'PoseLib', 'sift_poselib': 'SIFT + PoseLib', 'klt_poselib': 'KLT + PoseLib'}
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
 # The README's columns, where they were measured.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
