@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
@@ -52,14 +52,10 @@ def run(executor: Executor, datasets: Sequence[Dataset], methods: Sequence[Metho
         raise DjetError('a worker died (killed, or out of memory); run the same command again: '
                         f'{store.path} keeps what was done') from error
     finally:
-        _cancel(futures)
+        for future in futures:
+            future.cancel()
         _keep_finished(futures, store)
     return in_order(store, (chunk.name for chunk in chunks))
-
-
-def _cancel(futures: Iterable[Future[list[PairRecord]]]) -> None:
-    for future in futures:
-        future.cancel()
 
 
 def _keep_finished(futures: dict[Future[list[PairRecord]], PairChunk], store: RecordStore) -> None:

@@ -12,14 +12,7 @@ from djet_ros.core.hamming import describable, descriptor_bits, hamming_surfaces
 from djet_ros.core.paraboloid import fit_paraboloids, Paraboloids
 from djet_ros.core.types import Array, View
 from djet_ros.errors import DjetError
-from djet_ros.lab.panels import (
-    add_scale,
-    draw_heat,
-    draw_paraboloid,
-    draw_patch,
-    draw_point,
-    limit,
-)
+from djet_ros.lab import panels
 from djet_ros.lab.style import figure
 from djet_ros.odometry.images import BadMessage, decoded
 import numpy as np
@@ -98,19 +91,19 @@ def draw_similarity(path: Path, gray: Gray, other: Gray, similarity: Similarity)
     """Draw patches of the first image, and below them heat maps over those of the second."""
     count, radius = len(similarity.x), len(similarity.surfaces) // 2
     with figure(path, 2.1 * count + 1.4, 5.3) as drawing:
-        panels = drawing.subplots(2, count, squeeze=False)
+        grid = drawing.subplots(2, count, squeeze=False)
         for index in range(count):
             x, y = similarity.x[index], similarity.y[index]
-            upper, lower = panels[:, index]
-            draw_patch(upper, gray, x, _visible(x, gray, radius))
-            limit(upper, x, radius)
-            draw_point(upper, x, 'o', '#E69F00', 5)
+            upper, lower = grid[:, index]
+            panels.draw_patch(upper, gray, x, _visible(x, gray, radius))
+            panels.limit(upper, x, radius)
+            panels.draw_point(upper, x, 'o', '#E69F00', 5)
             upper.set_title(f'x = {x[0]}, {x[1]}')
-            draw_patch(lower, other, y, radius)
-            draw_heat(lower, similarity.surfaces[:, :, index], y, 0.7)
-            draw_paraboloid(lower, similarity.fits, index, similarity.window)
+            panels.draw_patch(lower, other, y, radius)
+            panels.draw_heat(lower, similarity.surfaces[:, :, index], y, 0.7)
+            panels.draw_paraboloid(lower, similarity.fits, index, similarity.window)
             lower.set_title(f'y = {y[0]}, {y[1]}')
-        add_scale(drawing, panels)
+        panels.add_scale(drawing, grid)
         drawing.suptitle(f'Descriptor similarity within {radius} px\n(contours: fit in '
                          f'{similarity.window}×{similarity.window}, +: its minimum)')
 

@@ -12,8 +12,7 @@ from dataclasses import asdict
 import json
 import math
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import cv2
 from djet_ros import __version__
@@ -21,12 +20,13 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.sequences import Dataset
+from djet_ros.recordings.closing import Closing
 import numpy as np
 
 FILE_NAME = 'records.jsonl'
 
 
-class RecordStore:
+class RecordStore(Closing):
     """
     The records of a run in ``folder/records.jsonl``: those of an earlier run, and new ones.
 
@@ -50,12 +50,7 @@ class RecordStore:
         self.chunks[chunk] = records
         self._write({'chunk': chunk, 'records': [_plain(record) for record in records]})
 
-    def __enter__(self) -> Self:
-        """Give the store itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
+    def close(self) -> None:
         """Close the file."""
         self._file.close()
 

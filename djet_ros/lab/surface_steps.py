@@ -15,15 +15,7 @@ from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.tracking import Round
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.errors import DjetError
-from djet_ros.lab.panels import (
-    add_scale,
-    draw_heat,
-    draw_paraboloid,
-    draw_patch,
-    draw_point,
-    limit,
-    paraboloid_values,
-)
+from djet_ros.lab import panels
 from djet_ros.lab.style import figure, STYLE
 from matplotlib import rc_context
 from matplotlib.animation import PillowWriter
@@ -102,13 +94,13 @@ def draw_trace(path: Path, trace: Trace, match: int) -> None:
     lines = 1 if count <= 4 else 2
     columns = -(-count // lines)
     with figure(path, 3.1 * columns + 1.0, 3.5 * lines + 0.5) as drawing:
-        panels = drawing.subplots(lines, columns, squeeze=False).ravel().tolist()
-        _draw_reference(panels[0], trace, match)
-        for axes, index in zip(panels[1:], shown):
+        grid = drawing.subplots(lines, columns, squeeze=False).ravel().tolist()
+        _draw_reference(grid[0], trace, match)
+        for axes, index in zip(grid[1:], shown):
             _draw_round(axes, trace, match, index)
-        for axes in panels[count:]:
+        for axes in grid[count:]:
             axes.set_visible(False)
-        _describe(drawing, panels)
+        _describe(drawing, grid)
 
 
 def animate_trace(path: Path, trace: Trace, match: int) -> None:
@@ -116,16 +108,16 @@ def animate_trace(path: Path, trace: Trace, match: int) -> None:
     _require_room(trace, match)
     with rc_context(STYLE):
         drawing = Figure(figsize=(7.6, 4.4), layout='constrained')
-        panels = drawing.subplots(1, 2).tolist()
-        _draw_reference(panels[0], trace, match)
-        _draw_round(panels[1], trace, match, 0)
-        _describe(drawing, panels)
+        grid = drawing.subplots(1, 2).tolist()
+        _draw_reference(grid[0], trace, match)
+        _draw_round(grid[1], trace, match, 0)
+        _describe(drawing, grid)
         writer = PillowWriter(fps=1)
         path.parent.mkdir(parents=True, exist_ok=True)
         with writer.saving(drawing, str(path), dpi=100):
             for index in range(len(trace.rounds)):
-                panels[1].clear()
-                _draw_round(panels[1], trace, match, index)
+                grid[1].clear()
+                _draw_round(grid[1], trace, match, index)
                 writer.grab_frame()
 
 
@@ -136,8 +128,8 @@ def _some(count: int) -> Sequence[int]:
 
 def _draw_reference(axes: Axes, trace: Trace, match: int) -> None:
     x = np.rint(trace.x[match]).astype(np.int64)
-    draw_patch(axes, trace.previous.gray, x, RADIUS)
-    draw_point(axes, trace.x[match], 'o', _KEYPOINT)
+    panels.draw_patch(axes, trace.previous.gray, x, RADIUS)
+    panels.draw_point(axes, trace.x[match], 'o', _KEYPOINT)
     axes.set_title(f'previous image, x = {trace.x[match][0]:.1f}, {trace.x[match][1]:.1f}')
 
 
@@ -148,10 +140,10 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
                                     None if step.warp is None else step.warp[[match]])
     surface = distances.surfaces(reference, distances.seen(trace.current), centre[None],
                                  RADIUS)[:, :, 0]
-    draw_patch(axes, trace.current.gray, centre, RADIUS)
-    draw_heat(axes, surface, centre, 0.75)
+    panels.draw_patch(axes, trace.current.gray, centre, RADIUS)
+    panels.draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:
-        draw_paraboloid(axes, step.fits, match, trace.config.window)
+        panels.draw_paraboloid(axes, step.fits, match, trace.config.window)
     line = epipolar_lines(fundamental(trace.current.K, step.pose.R, step.pose.t), trace.x[[match]])
     normal, optimum = line[0, :2], step.optimum[match]
     along = np.array([-normal[1], normal[0]]) / np.linalg.norm(normal)
@@ -159,17 +151,17 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     axes.plot(ends[:, 0], ends[:, 1], color=_LINE, lw=1.8)
     way = np.array([earlier.keypoints[match] for earlier in trace.rounds[:index + 1]])
     axes.plot(way[:, 0], way[:, 1], color=_KEYPOINT, lw=1.5)
-    draw_point(axes, way[-1], 'o', _KEYPOINT)
-    draw_point(axes, optimum, '*', _OPTIMUM, 13)
+    panels.draw_point(axes, way[-1], 'o', _KEYPOINT)
+    panels.draw_point(axes, optimum, '*', _OPTIMUM, 13)
     distance = abs(line_distances(line, y[None])[0])
-    loss = paraboloid_values(step.fits, match, optimum[None])[0]
+    loss = panels.paraboloid_values(step.fits, match, optimum[None])[0]
     axes.set_title(f'round {index + 1}: Q(v_opt) = {loss:.1f} bits,\n'
                    f'line {distance:.2f} px off y')
-    limit(axes, centre.astype(float), RADIUS)
+    panels.limit(axes, centre.astype(float), RADIUS)
 
 
-def _describe(drawing: Figure, panels: Sequence[Axes]) -> None:
-    add_scale(drawing, panels)
+def _describe(drawing: Figure, grid: Sequence[Axes]) -> None:
+    panels.add_scale(drawing, grid)
     drawing.suptitle('Hamming surface around y. Dashed: sampled window with its fit; '
                      '+: minimum of the fit;\nline: epipolar line; dot: keypoint; '
                      'star: y + v_opt')
