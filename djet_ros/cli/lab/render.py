@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', type=int, default=0, metavar='S',
                         help='another seed is another place (default: %(default)s)')
     parser.add_argument('--size', type=_size, metavar='WxH',
-                        help='pixels of a picture (default: 1241x376, as KITTI has, and 960x540 '
-                             'under water)')
+                        help='pixels of a picture (default: as suits the scene: 1241x376, as '
+                             'KITTI has, 960x540 or 640x480)')
     add_overwrite(parser)
 
 

@@ -17,6 +17,7 @@ from djet_ros.lab.scenes.camera import (
     MarineSnow,
     SensorNoise,
 )
+from djet_ros.lab.scenes.excursions import build_forest, build_handheld, build_indoor
 from djet_ros.lab.scenes.panel import Mover, World
 from djet_ros.lab.scenes.route import (
     Dive,
@@ -36,6 +37,7 @@ import numpy as np
 
 _CAR_SIZE = (1241, 376)
 _DIVE_SIZE = (960, 540)
+_HAND_SIZE = (640, 480)
 _SMALLEST, _LARGEST = 64, 4096
 # Metres of road that go on after the last frame, so that there is always something to see.
 _OUTLOOK = 100.0
@@ -48,7 +50,9 @@ class Entry:
     A named scene.
 
     number: the NN of its folder; frames (None: to the end of the way) and size: what is rendered
-    unless asked otherwise; build: from seed and size (width, height); text: what it shows.
+    unless asked otherwise; build: from seed and size (width, height); text: what it shows;
+    parallax: whether the camera moves through it, so that directions of translation mean
+    something.
     """
 
     number: int
@@ -56,6 +60,7 @@ class Entry:
     size: tuple[int, int]
     build: Callable[[int, tuple[int, int]], Scene]
     text: str
+    parallax: bool = True
 
 
 def make_scene(name: str, seed: int = 0, size: tuple[int, int] | None = None) -> Scene:
@@ -225,8 +230,10 @@ SCENES: dict[str, Entry] = {
     'underwater': Entry(1, 60, _DIVE_SIZE, _build_underwater,
                         'a dim, hazy sea floor in the light of a lamp, with drifting particles'),
     'loop': Entry(2, None, _CAR_SIZE, _build_loop, 'twice round a block'),
-    'rotation': Entry(3, 40, _CAR_SIZE, _build_rotation, 'turning on the spot, 1 deg a frame'),
-    'standstill': Entry(4, 20, _CAR_SIZE, _build_standstill, 'standing; only the noise changes'),
+    'rotation': Entry(3, 40, _CAR_SIZE, _build_rotation, 'turning on the spot, 1 deg a frame',
+                      parallax=False),
+    'standstill': Entry(4, 20, _CAR_SIZE, _build_standstill, 'standing; only the noise changes',
+                        parallax=False),
     'sharp_turn': Entry(5, 80, _CAR_SIZE, _build_sharp_turn, 'slow turns of 4 deg a frame'),
     'moving_object': Entry(6, 40, _CAR_SIZE, _build_moving,
                            'behind a lorry that fills half of the picture'),
@@ -235,4 +242,10 @@ SCENES: dict[str, Entry] = {
     'exposure_jump': Entry(8, 40, _CAR_SIZE, _build_exposure,
                            'exposure that jumps every 5 frames'),
     'blur': Entry(9, 40, _CAR_SIZE, _build_blur, '3 of every 8 frames out of focus'),
+    'indoor': Entry(10, 60, _HAND_SIZE, build_indoor,
+                    'a white corridor with a shining floor, edges like stairs'),
+    'handheld': Entry(11, 60, _HAND_SIZE, build_handheld,
+                      'looking round a study with a jerky hand, at times only turning'),
+    'forest': Entry(12, 60, _DIVE_SIZE, build_forest,
+                    'a path through a wood: weak, random texture'),
 }

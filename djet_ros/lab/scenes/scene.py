@@ -25,7 +25,8 @@ class Scene:
 
     K: (3, 3) pixels, pixel centres at integers; size: (width, height); background: gray where
     there is nothing; effects: what the camera does to the light, in this order; reach: metres
-    beyond which nothing is drawn.
+    beyond which nothing is drawn; samples: in each direction of a pixel, 2 for smooth edges or 1
+    for edges like stairs.
     Poses given and taken are camera to first camera, so the first is the identity.
     """
 
@@ -38,6 +39,7 @@ class Scene:
     background: float = 0.0
     effects: tuple[Effect, ...] = ()
     reach: float = np.inf
+    samples: int = _SUPERSAMPLING
 
     def trajectory(self, frames: int) -> Array:
         """Poses (frames, 4, 4), camera to first camera, in metres; DjetError if it is too long."""
@@ -78,7 +80,7 @@ class Scene:
     def _expose(self, pose: Array, index: int) -> Shot:
         """Light that arrives at the camera through clear air."""
         level = self._to_level @ pose
-        view, raster = self._look(level, index, _SUPERSAMPLING)
+        view, raster = self._look(level, index, self.samples)
         ids, inverse = visible(view, raster)
-        radiance = reduce(shade(view, ids, raster, self.background), _SUPERSAMPLING)
-        return Shot(radiance, reduce(inverse, _SUPERSAMPLING), self.K, level, index, self.seed)
+        radiance = reduce(shade(view, ids, raster, self.background), self.samples)
+        return Shot(radiance, reduce(inverse, self.samples), self.K, level, index, self.seed)

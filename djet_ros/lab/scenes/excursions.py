@@ -1,0 +1,71 @@
+"""Scenes through which somebody carries a camera: a corridor, a study, a wood."""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+
+from djet_ros.core.types import Array
+from djet_ros.lab.scenes import corridor as inside
+from djet_ros.lab.scenes.camera import Haze, SensorNoise
+from djet_ros.lab.scenes.forest import forest
+from djet_ros.lab.scenes.panel import Panel, World
+from djet_ros.lab.scenes.reflection import Gloss
+from djet_ros.lab.scenes.route import Route, winding
+from djet_ros.lab.scenes.scene import Scene
+from djet_ros.lab.scenes.shutter import Shutter
+from djet_ros.lab.scenes.study import study
+from djet_ros.lab.scenes.walk import HandHeld, Walk
+import numpy as np
+
+
+def centred_camera(size: tuple[int, int], focal: float) -> Array:
+    """Camera matrix (3, 3) of that focal length in widths, its axis in the picture's middle."""
+    width, height = size
+    return np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2],
+                     [0, 0, 1]])
+
+
+@lru_cache(maxsize=2)
+def _corridor(seed: int) -> tuple[inside.Plan, tuple[Panel, ...], tuple[Panel, ...]]:
+    """Plan, floor, and everything above it."""
+    rng = np.random.default_rng([seed, 10])
+    plan, palette = inside.Plan.draw(rng), inside.make_palette(rng)
+    return (plan, tuple(inside.floor(plan, palette)),
+            tuple(inside.corridor(plan, palette, rng)))
+
+
+def build_indoor(seed: int, size: tuple[int, int]) -> Scene:
+    """Walk along a corridor whose floor shines, by a camera that has no filter before its grid."""
+    plan, floor, above = _corridor(seed)
+    path = Walk(plan.route(), speed=0.11, height=1.5, tilt=0.18, glance=0.16, seed=seed)
+    return Scene('indoor', World((*floor, *above)), path, centred_camera(size, 0.6), size, seed,
+                 effects=(Gloss(World(above), polish=0.09), SensorNoise(0.5, 0.03)), samples=1)
+
+
+@lru_cache(maxsize=2)
+def _study(seed: int) -> World:
+    return World(study(np.random.default_rng([seed, 11])))
+
+
+def build_handheld(seed: int, size: tuple[int, int]) -> Scene:
+    """Look round a cluttered study with a jerky hand."""
+    path = HandHeld((0.0, -1.3, 0.0), np.deg2rad(14), seed)
+    return Scene('handheld', _study(seed), path, centred_camera(size, 0.82), size, seed,
+                 effects=(Shutter(0.12, path.turning), SensorNoise(1.2, 0.1)))
+
+
+@cache
+def _path() -> Route:
+    return winding(30, 0.35, (23, 37))
+
+
+@lru_cache(maxsize=2)
+def _forest(seed: int) -> World:
+    return World(forest(_path(), np.random.default_rng([seed, 12])))
+
+
+def build_forest(seed: int, size: tuple[int, int]) -> Scene:
+    """Walk along a path through a wood."""
+    path = Walk(_path(), speed=0.22, height=1.4, tilt=0.1, glance=0.08, seed=seed)
+    return Scene('forest', _forest(seed), path, centred_camera(size, 0.7), size, seed,
+                 background=225.0, effects=(Haze(70, 190), SensorNoise(1.0, 0.08)))
