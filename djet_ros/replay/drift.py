@@ -1,0 +1,75 @@
+"""
+Drift over 100 to 800 m of a trajectory, as the KITTI odometry benchmark defines it.
+
+From every tenth frame on, and for each length in LENGTHS, the segment ends at the first frame
+that lies further than that along the true path. Its error is what is left of the estimated
+relative pose after the true one, ``E = D_estimate^-1 D_truth``, per nominal length: |t(E)| as a
+percentage, and the angle of R(E) in degrees per 100 m. Both are averaged over all segments
+(A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012, and its
+development kit).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
+_EVERY = 10
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    Mean drift of an estimated trajectory over its segments.
+
+    translation_percent: KITTI's t_rel; it means something only if the estimate has true lengths;
+    rotation_deg_per_100m: KITTI's r_rel; segments: how many there are; longest: the greatest
+    length in metres that any of them has.
+    """
+
+    translation_percent: float
+    rotation_deg_per_100m: float
+    segments: int
+    longest: int
+
+
+def drift(truth: Array, estimate: Array) -> Drift | None:
+    """
+    Compare two trajectories, poses (N, 4, 4) of the camera in metres, frame by frame.
+
+    Each may have axes of its own. None where the true path is not over 100 m long. Raises
+    ValueError on shapes that differ and on poses that are not finite.
+    """
+    if truth.shape != estimate.shape or truth.shape[1:] != (4, 4):
+        raise ValueError(f'trajectories are {truth.shape} and {estimate.shape}; both must be '
+                         '(N, 4, 4)')
+    if not (np.isfinite(truth).all() and np.isfinite(estimate).all()):
+        raise ValueError('a pose is not finite; give the frames that both know')
+    first, last, length = _segments(truth[:, :3, 3])
+    if not len(first):
+        return None
+    error = np.linalg.inv(_between(estimate, first, last)) @ _between(truth, first, last)
+    angle = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+    gap = np.linalg.norm(error[:, :3, 3], axis=1)
+    return Drift(float(100 * (gap / length).mean()), float(100 * (angle / length).mean()),
+                 len(first), int(length.max()))
+
+
+def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
+    """First and last frames (M,) of all segments of a path (N, 3), and their lengths (M,)."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    first, length = (grid.ravel() for grid in np.meshgrid(
+        np.arange(0, len(places), _EVERY), LENGTHS, indexing='ij'))
+    last = np.searchsorted(way, way[first] + length, side='right')
+    there = last < len(places)
+    return first[there], last[there], length[there]
+
+
+def _between(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
+    """Poses (M, 4, 4) of the last frames in the first ones."""
+    return np.asarray(np.linalg.inv(poses[first]) @ poses[last])
