@@ -19,6 +19,7 @@ from time import monotonic, sleep
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.types import Status
+from djet_ros.lab.chains import CHAINS
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.methods import default_methods, Method, TITLES
@@ -102,10 +103,11 @@ def test_the_best_preset_finds_exact_motion_to_a_fraction_of_a_degree(evaluated)
     assert float(best['djet']['hamming_mean']) < float(best['rpe']['hamming_mean'])
 
 
-def test_all_methods_of_a_preset_are_given_the_same_matches(evaluated):
+def test_all_methods_but_whole_chains_are_given_the_same_matches_of_a_preset(evaluated):
     records = rows(evaluated / 'pairs.csv')
     assert len(records) == 2 * len(default_methods()) * (FRAMES - 1)
-    given = {(row['pair'], row['preset'], row['matches']) for row in records}
+    given = {(row['pair'], row['preset'], row['matches']) for row in records
+             if row['method'] not in CHAINS}
     assert len(given) == 2 * (FRAMES - 1)
 
 

@@ -11,12 +11,13 @@ from djet_ros.core.estimator_config import EstimatorConfig, METHODS, preset, PRE
 from djet_ros.errors import DjetError
 
 # Methods of other libraries, and the module that each needs.
-PEERS = {'opencv_ransac': 'cv2', 'usac_magsac': 'cv2', 'poselib': 'poselib'}
+PEERS = {'opencv_ransac': 'cv2', 'usac_magsac': 'cv2', 'poselib': 'poselib',
+         'sift_poselib': 'poselib', 'klt_poselib': 'poselib'}
 
 # All methods in the order of tables, and what people call them.
 TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-P',
           'opencv_ransac': 'RANSAC', 'usac_magsac': 'MAGSAC++',
-          'poselib': 'PoseLib'}
+          'poselib': 'PoseLib', 'sift_poselib': 'SIFT+PL', 'klt_poselib': 'KLT+PL'}
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class Method:
     name: one of TITLES; preset: where the parameters come from; change: what differs from it, in
     words, empty if nothing does; good_start: whether the pose of RP-E, preset best, is given as
     one more start, and only the matches that agree with it. Peers take their matches and their
-    RANSAC threshold from config.
+    RANSAC threshold from config, but for those that are whole chains (see chains), which take
+    nothing.
     """
 
     name: str

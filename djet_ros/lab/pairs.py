@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.lab import peers
+from djet_ros.lab.chains import CHAINS, Points
 from djet_ros.lab.methods import Method
 from djet_ros.lab.sequences import Dataset, opened
 from djet_ros.odometry.visual_odometry import camera_motion
@@ -124,17 +127,33 @@ class _Image:
     """An image and its features, found once for each setting of the detector."""
 
     def __init__(self, gray: NDArray[np.uint8], K: Array) -> None:
-        self._gray, self._K = gray, K
+        self._gray, self.K = gray, K
         self._views: dict[Any, tuple[View, float]] = {}
+        self._points: dict[str, tuple[Points, float]] = {}
 
     def view(self, method: Method) -> tuple[View, float]:
         """Give the view with its features, and the seconds that they took."""
-        key = (method.config.max_features, method.config.fast_threshold)
+        config = method.config
+        key = (config.detector, config.max_features, config.fast_threshold,
+               config.corner_contrast)
         if key not in self._views:
             start = perf_counter()
-            view = TwoViewEstimator(method.config).view(self._gray, self._K)
+            view = TwoViewEstimator(config).view(self._gray, self.K)
             self._views[key] = view, perf_counter() - start
         return self._views[key]
+
+    def points(self, method: str) -> tuple[Points, float]:
+        """Give the points of a chain of that name, and the seconds that they took."""
+        if method not in self._points:
+            start = perf_counter()
+            points = CHAINS[method].detect(self._gray)
+            self._points[method] = points, perf_counter() - start
+        return self._points[method]
+
+    @cached_property
+    def smoothed(self) -> NDArray[np.uint8]:
+        """The image (H, W) as ORB's binary tests see it."""
+        return smooth(self._gray)
 
 
 class _SharedWork:
@@ -143,6 +162,32 @@ class _SharedWork:
     def __init__(self, previous: _Image, current: _Image) -> None:
         self._images = previous, current
         self._given: dict[Any, Given] = {}
+        self._chained: dict[str, tuple[RelativePose, float]] = {}
+
+    def result(self, method: Method) -> tuple[RelativePose, int, float]:
+        """Give what the method finds, of how many matches, and its seconds in all."""
+        if method.name in CHAINS:
+            found, seconds = self._by_chain(method.name)
+            return found, len(found.x), seconds
+        given = self.given(method)
+        start = perf_counter()
+        found = estimate(method, given)
+        return found, len(given.x), given.seconds + perf_counter() - start
+
+    def _by_chain(self, method: str) -> tuple[RelativePose, float]:
+        """Give what a chain finds: the same, whatever preset it stands beside."""
+        if method not in self._chained:
+            (previous, _), (current, seconds) = (image.points(method) for image in self._images)
+            start = perf_counter()
+            found = CHAINS[method].estimate(previous, current, self._images[1].K)
+            seconds += perf_counter() - start
+            if found.status is Status.OK:
+                # What descriptors say of its matches is no part of it, and not of its time.
+                smoothed = [image.smoothed for image in self._images]
+                found = replace(found, hamming=match_distances(smoothed[0], found.x, smoothed[1],
+                                                               found.y_opt))
+            self._chained[method] = found, seconds
+        return self._chained[method]
 
     def given(self, method: Method) -> Given:
         """Give what the method starts from."""
@@ -167,10 +212,7 @@ def _with_good_start(given: Given) -> Given:
 
 def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
             true_motion: Array) -> PairRecord:
-    given = shared.given(method)
-    start = perf_counter()
-    result = estimate(method, given)
-    seconds = given.seconds + perf_counter() - start
+    result, matches, seconds = shared.result(method)
     motion = camera_motion(result)
     rotation_error, translation_error = motion_errors(result.status, motion, true_motion)
     hamming = result.hamming[result.inliers] if len(result.hamming) else result.hamming
@@ -178,7 +220,7 @@ def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
     return PairRecord(
         sequence=dataset.name, pair=pair, previous=dataset.frames[pair],
         current=dataset.frames[pair + 1], method=method.name, preset=method.preset,
-        change=method.change, status=result.status.value, matches=len(given.x),
+        change=method.change, status=result.status.value, matches=matches,
         inliers=int(result.inliers.sum()),
         failed=has_failed(rotation_error, translation_error, true_motion),
         rotation_error_deg=rotation_error, translation_error_deg=translation_error,

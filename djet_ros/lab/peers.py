@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances, unit
@@ -25,15 +26,21 @@ def usac_magsac(K: Array, x: Array, y: Array, threshold: float) -> Found:
     return _opencv(cv2.USAC_MAGSAC, K, x, y, threshold)
 
 
-def poselib(K: Array, x: Array, y: Array, threshold: float) -> Found:
-    """Find the pose by PoseLib's LO-RANSAC with its non-linear refinement, at its defaults."""
+def poselib(K: Array, x: Array, y: Array, threshold: float,
+            loss_scale: float | None = None) -> Found:
+    """
+    Find the pose by PoseLib's LO-RANSAC with its non-linear refinement, at its defaults.
+
+    loss_scale: of the Cauchy loss of that refinement in pixels; by default half the threshold.
+    """
     import poselib as library
 
     # The image size is part of a camera there, but not of this estimate.
     camera = {'model': 'PINHOLE', 'width': int(2 * K[0, 2]), 'height': int(2 * K[1, 2]),
               'params': [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
     pose, info = library.estimate_relative_pose(
-        x, y, camera, camera, {'max_epipolar_error': threshold}, {})
+        x, y, camera, camera, {'max_epipolar_error': threshold},
+        {} if loss_scale is None else {'loss_scale': loss_scale})
     return np.asarray(pose.R), np.asarray(pose.t), np.asarray(info['inliers'], dtype=bool)
 
 
@@ -50,16 +57,23 @@ def estimate(name: str, previous: View, current: View, x: Array, y: Array, thres
     """
     if len(x) < min_matches:
         return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
-    found = ESTIMATORS[name](current.K, x, y, threshold)
+    result = as_relative_pose(ESTIMATORS[name](current.K, x, y, threshold), current.K, x, y)
+    if result.status is not Status.OK:
+        return result
+    return replace(result, hamming=match_distances(previous.smoothed, x, current.smoothed,
+                                                   result.y_opt))
+
+
+def as_relative_pose(found: Found, K: Array, x: Array, y: Array) -> RelativePose:
+    """Say what was found for matches x, y (N, 2) in our words, without Hamming distances."""
     if found is None or not (np.isfinite(found[0]).all() and found[1].any()):
         return RelativePose(Status.DEGENERATE, x=x, y=y)
     R, t, inliers = found[0], unit(found[1]), found[2]
-    lines = epipolar_lines(fundamental(current.K, R, t), x)
+    lines = epipolar_lines(fundamental(K, R, t), x)
     residuals = line_distances(lines, y)
-    y_opt = y - residuals[:, None] * unit(lines[:, :2])
-    return RelativePose(
-        Status.OK, R, t, x=x, y=y, y_opt=y_opt, inliers=inliers, residuals=residuals,
-        hamming=match_distances(previous.smoothed, x, current.smoothed, y_opt))
+    return RelativePose(Status.OK, R, t, x=x, y=y,
+                        y_opt=y - residuals[:, None] * unit(lines[:, :2]),
+                        inliers=inliers, residuals=residuals)
 
 
 def _opencv(method: int, K: Array, x: Array, y: Array, threshold: float) -> Found:

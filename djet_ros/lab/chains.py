@@ -1,0 +1,120 @@
+"""
+Whole chains of other libraries, from two images to their relative pose: what a user would pick.
+
+Unlike the methods in ``peers``, they find and match points of their own. All that they are set to
+stands here; nothing of it is taken from a preset. Where a setting matters, what served them best
+was taken, by means and medians over nine rendered scenes and held against real frames:
+
+* Lucas-Kanade: windows of 7, 9, 11, 13, 15, 21 and 31 pixels, 3 to 5 levels over the image. The
+  smaller the window, the more exact, down to 11; more levels find what moved far. OpenCV's own 21
+  and 3 leave 1.4 to 1.9 times the error, and lose some of every fifth frame. Back to 0.5 or 1 px,
+  weaker corners, and larger blocks make no difference in all, or hurt.
+* SIFT: ratios of 0.75 to 0.95 differ by a few per cent; lower contrast helps under water only.
+* PoseLib: a Cauchy loss of 0.25 px, instead of its own 0.5 px, takes a seventh of the error away
+  from both; 0.1 px takes more off sharp images and adds to blurred ones. Thresholds of 0.5 to
+  2 px, Huber's and a truncated loss are no better in all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.lab.peers import as_relative_pose, poselib
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+_POINTS = 2000
+_RATIO = 0.85
+_APART, _QUALITY = 8, 0.01
+_WINDOW, _LEVELS = 11, 5
+_THERE_AND_BACK = 1.0
+_THRESHOLD, _LOSS_SCALE = 1.0, 0.25
+# Fewer matches than the 5-point method needs for one hypothesis and a vote.
+_MIN_MATCHES = 8
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points (N, 2) float32 of one image in pixels, and their descriptors (N, D), D may be 0."""
+
+    image: Image
+    places: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """How points are found in an image, and matches x, y (N, 2) in pixels between two of them."""
+
+    detect: Callable[[Image], Points]
+    match: Callable[[Points, Points], tuple[Array, Array]]
+
+    def estimate(self, previous: Points, current: Points, K: Array) -> RelativePose:
+        """Estimate the motion between two images (H, W) whose points are known; K (3, 3)."""
+        x, y = self.match(previous, current)
+        if len(x) < _MIN_MATCHES:
+            return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+        return as_relative_pose(poselib(K, x, y, _THRESHOLD, _LOSS_SCALE), K, x, y)
+
+
+def root_sift(gray: Image) -> Points:
+    """
+    Find the 2000 strongest SIFT points; descriptors are roots of SIFT's, scaled to a sum of 1.
+
+    R. Arandjelovic, A. Zisserman, "Three things everyone should know to improve object
+    retrieval", CVPR 2012: distances of roots compare histograms by Hellinger's kernel.
+    """
+    keypoints, descriptors = cv2.SIFT.create(_POINTS).detectAndCompute(gray, None)
+    if descriptors is None:
+        return Points(gray, np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.float32(1e-9))
+    return Points(gray, np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2),
+                  np.sqrt(descriptors / sums))
+
+
+def mutual_neighbours(previous: Points, current: Points) -> tuple[Array, Array]:
+    """Match points that are nearest to each other and clearly nearer than the next (0.85)."""
+    if min(len(previous.places), len(current.places)) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    # Descriptors have unit length.
+    squares = np.maximum(2 - 2 * previous.descriptors @ current.descriptors.T, 0)
+    nearest = squares.argmin(axis=1)
+    first, second = np.partition(squares, 1, axis=1)[:, :2].T
+    kept = squares.argmin(axis=0)[nearest] == np.arange(len(nearest))
+    kept &= first < _RATIO ** 2 * second
+    return (previous.places[kept].astype(np.float64),
+            current.places[nearest[kept]].astype(np.float64))
+
+
+def corners(gray: Image) -> Points:
+    """Find up to 2000 corners by Shi and Tomasi that are at least 8 pixels apart."""
+    found = cv2.goodFeaturesToTrack(gray, _POINTS, _QUALITY, _APART)
+    places = np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
+    return Points(gray, places, np.empty((len(places), 0), np.float32))
+
+
+def tracked(previous: Points, current: Points) -> tuple[Array, Array]:
+    """Track corners forward and back by Lucas and Kanade's pyramids; keep who returns to 1 px."""
+    if not len(previous.places):
+        return np.empty((0, 2)), np.empty((0, 2))
+    there, seen = _flow(previous.image, current.image, previous.places)
+    back, seen_back = _flow(current.image, previous.image, there)
+    kept = seen & seen_back
+    kept &= np.linalg.norm(back - previous.places, axis=1) <= _THERE_AND_BACK
+    return previous.places[kept].astype(np.float64), there[kept].astype(np.float64)
+
+
+def _flow(before: Image, after: Image, places: NDArray[np.float32]
+          ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    found, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, places[:, None], np.empty(0),
+                                              winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS)
+    return np.asarray(found, np.float32).reshape(-1, 2), seen.ravel() > 0
+
+
+CHAINS: dict[str, Chain] = {'sift_poselib': Chain(root_sift, mutual_neighbours),
+                            'klt_poselib': Chain(corners, tracked)}
