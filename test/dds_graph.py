@@ -28,6 +28,7 @@ DEEP = Profile(depth=1000)
 TYPES = {
     f'{NODE}/relative_pose': 'geometry_msgs/msg/PoseStamped',
     f'{NODE}/relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    f'{NODE}/relative_pose_status': 'diagnostic_msgs/msg/DiagnosticArray',
     f'{NODE}/odometry': 'nav_msgs/msg/Odometry',
     '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
 }

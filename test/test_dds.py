@@ -270,7 +270,8 @@ def test_a_signal_in_mid_stream_ends_all_cleanly_within_a_second(live, start, pe
         assert seconds < 1, command.path
     peer.spin(0.3)
     # Whole or not at all.
-    assert len({len(peer.heard[topic]) for topic in TYPES if 'relative' in topic}) == 1
+    assert len({len(peer.heard[topic]) for topic in TYPES
+                if topic.endswith(('relative_pose', 'relative_pose_cov'))}) == 1
 
 
 def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):

@@ -101,7 +101,7 @@ def said(text: str) -> Callable[[Heard], Any]:
     return lambda heard: next((
         {pair.key: pair.value for pair in message.status[0].values}
         for message in reversed(heard['/diagnostics'])
-        if message.status[0].name == 'djet_ros: pose graph'
+        if message.status[0].name == 'pose_graph_node: pose graph'
         and message.status[0].message == text), None)
 
 

@@ -12,6 +12,7 @@ from test_live_slam import Odometry, START
 from test_session import Graph
 
 TOPICS = {'odometry': '/vo_node/odometry', 'relative_pose_cov': '/vo_node/relative_pose_cov',
+          'relative_pose_status': '/vo_node/relative_pose_status',
           'image': '/left/image_raw', 'camera_info': '/left/camera_info'}
 WAYS = [0.25 * i for i in (*range(7), *range(5, -1, -1))]
 
@@ -39,11 +40,13 @@ class Live:
             stamp, here = self._odometry.stamp, pose(x=way)
             self.session.image(image(self._cards.gray(here, noise=stamp % 97), stamp_ns=stamp))
             if self._was is None:
-                self.session.odometry(self._odometry.start())
+                status, odometry = self._odometry.start()
             else:
-                relative, odometry = self._odometry.move(np.linalg.inv(self._was) @ here)
+                relative, status, odometry = self._odometry.move(
+                    np.linalg.inv(self._was) @ here)
                 self.session.relative_pose(relative)
-                self.session.odometry(odometry)
+            self.session.relative_pose_status(status)
+            self.session.odometry(odometry)
             self._was = here
 
 

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 import gc
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 from cards import Cards, K, pose, REST, SIZE
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import Config, OdometryConfig, SlamConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
+from djet_ros.errors import DjetError
 from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.frame import Frame
@@ -41,47 +42,61 @@ class Odometry:
         """Begin anew at the origin."""
         self.here, self.covariance = np.eye(4), np.zeros((6, 6))
 
-    def _result(self, status, motion, covariance, standing=False):
+    def _result(self, status, motion, covariance, standing=False, known=True):
         return OdometryResult(
-            self.stamp, 'camera', status, self.stamp - PERIOD, None, motion, self.here @ motion,
-            covariance, compose(self.here, self.covariance, motion, covariance), 1.0, True,
-            standing, None if status is Status.FIRST_FRAME else self.stamp - PERIOD)
+            self.stamp, 'camera', status, self._reference, None, motion, self.here @ motion,
+            covariance, compose(self.here, self.covariance, motion, covariance), 1.0, known,
+            standing, self._reference)
 
     def start(self):
-        """Give the Odometry of a first frame, here."""
-        result = replace(self._result(Status.FIRST_FRAME, np.eye(4), np.zeros((6, 6))),
-                         previous_stamp_ns=None)
+        """Give (status, Odometry) of a first frame, here."""
+        self._reference = None
+        result = self._result(Status.FIRST_FRAME, np.eye(4), np.zeros((6, 6)))
+        self._reference = self.stamp
         self.stamp += PERIOD
-        return self._make.odometry(result)
+        return self._make.status(result), self._make.odometry(result)
 
-    def move(self, motion, covariance=None, standing=False):
-        """Give (relative pose, Odometry) of the next frame."""
+    def move(self, motion, covariance=None, standing=False, known=True):
+        """Give (relative pose, status, Odometry) of the next frame."""
         covariance = np.diag(SIGMAS**2) if covariance is None else covariance
-        result = self._result(Status.OK, motion, covariance, standing)
+        result = self._result(Status.OK, motion, covariance, standing, known)
         if not standing:
             self.here, self.covariance = result.pose, result.pose_covariance
+            self._reference = self.stamp
         self.stamp += PERIOD
-        return self._make.relative_pose_cov(result), self._make.odometry(result)
+        return (self._make.relative_pose_cov(result), self._make.status(result),
+                self._make.odometry(result))
 
     def lose_track(self):
-        """Know nothing of how it came to the frame that the next motion is told from."""
-        self.covariance = compose(self.here, self.covariance, np.eye(4), UNKNOWN_MOTION)
+        """Give (status, Odometry) of a bad pair after which the next frame starts from here."""
+        result = self._result(Status.TOO_FEW_MATCHES, np.eye(4), UNKNOWN_MOTION)
+        self.covariance, self._reference = result.pose_covariance, self.stamp
         self.stamp += PERIOD
+        return self._make.status(result), self._make.odometry(result)
 
 
 # Steps
 
 def told(steps, *messages):
     """Give the steps that come of messages."""
-    return [step for message in messages for step in (
-        steps.odometry(message) if hasattr(message, 'twist') else steps.relative_pose(message))]
+    return [step for message in messages for step in take(steps, message)]
+
+
+def take(taker, message):
+    """Have a message taken by what is there for its type."""
+    if hasattr(message, 'twist'):
+        return taker.odometry(message)
+    if hasattr(message, 'status'):
+        return (taker.relative_pose_status if hasattr(taker, 'relative_pose_status')
+                else taker.status)(message)
+    return taker.relative_pose(message)
 
 
 @pytest.mark.parametrize('convention', ['optical', 'body'])
 def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
     odometry, steps, motion = Odometry(convention), StepMessages(convention), pose(z=1.0, yaw=0.1)
     covariance = np.diag(np.arange(1.0, 7)**2) * 1e-6
-    first, = told(steps, odometry.start())
+    first, = told(steps, *odometry.start())
     second, = told(steps, *odometry.move(motion, covariance))
     assert (first.tracked, second.tracked) == (False, True)
     assert second.previous_stamp_ns == first.stamp_ns
@@ -91,14 +106,13 @@ def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
     assert np.allclose(second.pose, motion)
 
 
-def test_it_does_not_matter_which_of_the_two_messages_comes_first():
+def test_it_does_not_matter_in_which_order_the_messages_of_a_frame_come():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, odometry.start())
-    for turned in (False, True, False):
-        pair = odometry.move(pose(z=1.0))
-        early, late = reversed(pair) if turned else pair
-        assert not told(steps, early)
-        step, = told(steps, late)
+    told(steps, *odometry.start())
+    for order in permutations(range(3)):
+        frame = odometry.move(pose(z=1.0))
+        assert not told(steps, frame[order[0]], frame[order[1]])
+        step, = told(steps, frame[order[2]])
         assert step.tracked
     assert steps.missing == 0
 
@@ -108,13 +122,12 @@ def test_whoever_comes_late_begins_where_the_odometry_is():
     odometry.start()
     odometry.move(pose(z=3.0))
     first, = told(steps, *odometry.move(pose(z=1.0)))
-    assert not first.tracked
     assert first.pose[2, 3] == 4.0
 
 
 def test_while_the_camera_stands_motions_are_told_from_where_it_came_to_stand():
     odometry, steps = Odometry(), StepMessages('optical')
-    _, reference = told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    _, reference = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     for _ in range(3):
         stationary, = told(steps, *odometry.move(np.eye(4), standing=True))
         assert stationary.previous_stamp_ns == reference.stamp_ns
@@ -127,47 +140,56 @@ def test_while_the_camera_stands_motions_are_told_from_where_it_came_to_stand():
 
 def test_nothing_is_known_of_a_motion_over_a_gap():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
+    told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     odometry.lose_track()
-    step, = told(steps, odometry.start())
+    step, = told(steps, *odometry.start())
     assert (step.tracked, step.restarted) == (False, True)
     assert np.array_equal(step.covariance, UNKNOWN_MOTION)
     after, = told(steps, *odometry.move(pose(z=1.0)))
     assert after.previous_stamp_ns == step.stamp_ns
 
 
-def test_the_covariance_tells_that_the_odometry_had_lost_track():
-    """The next good pair is told from a frame of which nothing was published."""
+def test_after_the_odometry_had_lost_track_the_next_motion_is_from_a_frame_without_one():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
-    odometry.lose_track()
+    known = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    assert not told(steps, *odometry.lose_track())
     step, = told(steps, *odometry.move(pose(z=1.0)))
-    assert (step.tracked, step.restarted) == (False, False)
+    assert step.previous_stamp_ns == step.stamp_ns - PERIOD
+    assert step.previous_stamp_ns not in {one.stamp_ns for one in known}
     after, = told(steps, *odometry.move(pose(z=1.0)))
-    assert after.tracked
+    assert after.previous_stamp_ns == step.stamp_ns
+    assert steps.missing == 0
 
 
-@pytest.mark.parametrize('lost', [0, 1])
+@pytest.mark.parametrize('lost', [0, 1, 2])
 def test_a_message_that_never_came_leaves_a_hole_which_is_counted(lost):
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, odometry.start(), *odometry.move(pose(z=1.0)))
-    told(steps, odometry.move(pose(z=2.0))[1 - lost])
+    told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    assert not told(steps, *np.delete(np.array(odometry.move(pose(z=2.0)), object), lost))
     step, = told(steps, *odometry.move(pose(z=1.0)))
-    assert not step.tracked
+    assert step.previous_stamp_ns == step.stamp_ns - PERIOD
     assert np.allclose(step.pose, pose(z=4.0))
-    assert steps.missing == (lost == 0)
+    assert steps.missing == (lost != 2)
 
 
-def test_a_length_that_nobody_knows_is_told_by_its_covariance():
+def test_the_status_says_whether_a_length_is_known():
     odometry, steps = Odometry(), StepMessages('optical')
-    wide = np.diag(SIGMAS**2)
-    wide[2, 2] = 1e6
-    step = told(steps, odometry.start(), *odometry.move(pose(z=1.0), wide))[-1]
-    assert (step.tracked, step.scale_known) == (True, False)
-    # nor do its sums look like a hole
-    for _ in range(50):
-        step, = told(steps, *odometry.move(pose(z=1.0, yaw=0.05), wide))
-        assert step.tracked
+    told(steps, *odometry.start())
+    for known in (True, False, True):
+        step, = told(steps, *odometry.move(pose(z=1.0), known=known))
+        assert step.scale_known == known
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda message: message.status.clear(), lambda message: message.status[0].values.clear(),
+    lambda message: setattr(message.status[0].values[0], 'value', 'FINE'),
+    lambda message: setattr(message.status[0].values[1], 'value', 'long ago')])
+def test_a_status_of_another_kind_is_refused(spoil):
+    odometry, steps = Odometry(), StepMessages('optical')
+    status, _ = odometry.start()
+    spoil(status)
+    with pytest.raises(DjetError, match=f'the status of {START} ns lacks something'):
+        steps.status(status)
 
 
 # The map
@@ -198,7 +220,7 @@ class Drive:
     def start(self, place=REST):
         """Begin, or begin anew, at a place."""
         self._true = place
-        return self._take(lambda: (self.odometry.start(),))
+        return self._take(self.odometry.start)
 
     def stand(self):
         """Stay where it is for a frame."""
@@ -218,10 +240,8 @@ class Drive:
                                   stamp_ns=stamp))
         outgoing = []
         for message in messages():
-            is_odometry = hasattr(message, 'twist')
-            outgoing += (self.slam.odometry(message) if is_odometry
-                         else self.slam.relative_pose(message))
-            if is_odometry:
+            outgoing += take(self.slam, message)
+            if hasattr(message, 'twist'):
                 self.told[stamp] = pose_of(message)[1]
         self.true[stamp] = self._true
         while not self.slam.idle:
@@ -390,7 +410,7 @@ def test_without_a_scale_the_map_keeps_the_units_of_the_odometry(live):
     def move_somehow_far(motion):
         along = unit(motion[:3, 3])
         spread = np.pad(np.outer(along, along), (0, 3)) * UNKNOWN_LENGTH_SIGMA**2
-        return move(motion, np.diag(SIGMAS**2) + spread)
+        return move(motion, np.diag(SIGMAS**2) + spread, known=False)
 
     drive.odometry.move = move_somehow_far
     drive.to_and_fro()
@@ -410,7 +430,8 @@ def test_a_turn_on_the_spot_without_a_scale_leads_nowhere_else(live):
     drive = Drive(live, drift=0.0)
     drive.start()
     wide = np.diag([*[UNKNOWN_LENGTH_SIGMA**2] * 3, *SIGMAS[3:]**2])
-    drive.odometry.move, move = lambda motion: move(motion, wide), drive.odometry.move
+    move = drive.odometry.move
+    drive.odometry.move = lambda motion: move(motion, wide, known=False)
     drive.go(pose(yaw=0.2))
     edge, = drive.slam.map.edges
     assert np.allclose(edge.covariance, np.diag([1, 1, 1, *SIGMAS[3:]**2]), atol=2e-9)
@@ -460,7 +481,7 @@ def test_diagnostics_come_once_a_second_and_when_the_state_changes(live):
         for topic, message in drive.start() if i == 0 else drive.go(pose(x=0.1 * i)):
             if topic == '/diagnostics':
                 times.append((stamp - START) / 1e9)
-                assert message.status[0].name == 'djet_ros: pose graph'
+                assert message.status[0].name == 'pose_graph_node: pose graph'
     assert times == [0.0, 1.0, 2.0]
 
 
@@ -468,30 +489,29 @@ def test_it_says_what_it_waits_for(live):
     slam = live(Config(slam=QUICK), message_type)
     assert slam.state == ('WARN', 'waiting for odometry')
     odometry = Odometry()
-    slam.odometry(odometry.start())
+    for message in odometry.start():
+        take(slam, message)
     assert slam.state == ('WARN', 'waiting for camera_info')
     slam.camera_info(camera_info(K, SIZE))
     for message in odometry.move(pose(z=1.0)):
-        outgoing = slam.odometry(message) if hasattr(message, 'twist') \
-            else slam.relative_pose(message)
-        assert '/tf' not in dict(outgoing)
+        assert '/tf' not in dict(take(slam, message))
     assert slam.state == ('WARN', 'waiting for the images of the odometry')
 
 
 def test_messages_that_say_nothing_are_counted_and_named_and_leave_a_hole(live):
     drive = Drive(live)
     drive.start()
-    relative, odometry = drive.odometry.move(pose(x=1.0))
+    relative, status, odometry = drive.odometry.move(pose(x=1.0))
     relative.pose.covariance[:] = 0
-    drive.slam.relative_pose(relative)
-    drive.slam.odometry(odometry)
+    for message in (relative, status, odometry):
+        take(drive.slam, message)
     assert drive.slam.state == ('ERROR', 'message rejected')
     assert 'odometry edge' in str(drive.slam.problem)
     assert f'{START + PERIOD} ns' in str(drive.slam.problem)
-    relative, odometry = drive.odometry.move(pose(x=1.0))
+    relative, status, odometry = drive.odometry.move(pose(x=1.0))
     odometry.pose.pose.position.x = float('nan')
-    drive.slam.relative_pose(relative)
-    drive.slam.odometry(odometry)
+    for message in (relative, status, odometry):
+        take(drive.slam, message)
     drive.slam.camera_info(camera_info(K, SIZE, k=np.zeros(9), p=np.zeros(12)))
     assert drive.slam.rejected.total() == 3
     drive.slam.camera_info(camera_info(K, SIZE))
@@ -522,11 +542,10 @@ def test_on_a_block_driven_twice_the_error_shrinks_by_a_factor(live, tmp_path):
         elif topic == source.image_topic:
             slam.image(message)
             for name, said in tracker.image(message):
-                if name == 'relative_pose_cov':
-                    slam.relative_pose(said)
-                elif name == 'odometry':
+                if name in ('relative_pose_cov', 'relative_pose_status', 'odometry'):
+                    take(slam, said)
+                if name == 'odometry':
                     before.update([pose_of(said)])
-                    slam.odometry(said)
             while not slam.idle:
                 slam.work()
     path = dict(slam.work(at_once=True))['path']

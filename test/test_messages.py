@@ -69,7 +69,7 @@ def test_every_message_is_taken_by_the_classes_and_goes_to_the_wire(family):
             make.relative_pose(result), make.relative_pose_cov(result), make.odometry(result),
             make.odometry(a_result(since_ns=None)), make.transform(result),
             make.path([make.pose_stamped(result)] * 2),
-            make.diagnostics(STAMP, 'WARN', 'summary', {'rate (Hz)': '9.9'}),
+            make.diagnostics(STAMP, 'vo_node: test', 'WARN', 'summary', {'rate (Hz)': '9.9'}),
             make.picture(STAMP, 'camera', picture)):
         assert len(serialised(message)) > 20
 
@@ -160,7 +160,7 @@ def test_no_covariance_is_zero_infinite_or_absurd(family):
 @pytest.mark.parametrize('level', ['OK', 'WARN', 'ERROR'])
 def test_diagnostics_levels_are_the_classes_own(family, level):
     message = Messages(family[0], OdometryConfig()).diagnostics(
-        STAMP, level, 'tracking', {'a': 'b'})
+        STAMP, 'vo_node: test', level, 'tracking', {'a': 'b'})
     status = message.status[0]
     assert status.level == getattr(type(status), level)
     assert (status.message, status.values[0].key, status.values[0].value) == ('tracking', 'a', 'b')

@@ -136,7 +136,8 @@ def test_the_bag_holds_what_the_live_node_publishes(replayed):
         counts = {topic.name: topic.message_count for topic in out.topics}
         relative = [m.message for m in out.messages({'/vo_node/relative_pose'})]
     assert counts == {'/vo_node/relative_pose': FRAMES - 1, '/vo_node/odometry': FRAMES,
-                      '/vo_node/relative_pose_cov': FRAMES - 1, '/diagnostics': 2}
+                      '/vo_node/relative_pose_cov': FRAMES - 1,
+                      '/vo_node/relative_pose_status': FRAMES, '/diagnostics': 2}
     _, poses = read_tum(results / 'trajectory_tum.txt')
     chained = np.eye(4)
     for message in relative:

@@ -18,7 +18,7 @@ import pytest
 from ros_messages import camera_info, image, message_type, serialised
 
 PERIOD = 100_000_000
-POSES = ('relative_pose', 'relative_pose_cov', 'odometry')
+POSES = ('relative_pose', 'relative_pose_cov', 'relative_pose_status', 'odometry')
 TOPICS = {'image': '/left/image_raw', 'camera_info': '/left/camera_info'}
 
 

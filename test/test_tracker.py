@@ -8,7 +8,7 @@ from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Status
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import frame_status, FrameStatus, pose_of, stamp_ns
 from djet_ros.odometry.tracker import Tracker
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -65,7 +65,7 @@ def accounted(counts):
 
 def test_a_drive_gives_relative_poses_and_odometry_with_the_images_stamps(drive):
     out = play(tracker(), drive[:4])
-    assert set(out[0]) == {'odometry', '/diagnostics'}
+    assert set(out[0]) == {'relative_pose_status', 'odometry', '/diagnostics'}
     for i, messages in enumerate(out[1:], 1):
         assert {'relative_pose', 'relative_pose_cov', 'odometry'} <= set(messages)
         for topic in ('relative_pose', 'relative_pose_cov', 'odometry'):
@@ -159,6 +159,44 @@ def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
     play(plain, drive[:2])
     assert np.array_equal(poses['/camera/image_rect'], plain.last.pose)
     assert not np.array_equal(poses[RAW], plain.last.pose)
+
+
+# What a backend needs
+
+def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
+    one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant'})
+    black = np.zeros_like(drive[0])
+    images = [drive[0], drive[1], drive[1], drive[2], black, drive[3], black, black, drive[4],
+              drive[5]]
+    said = [frame_status(out['relative_pose_status']) for out in play(one, images)]
+    stamps = [ns(0.1 * i) for i in range(len(images))]
+    bad = Status.TOO_FEW_MATCHES
+    assert said == [FrameStatus(stamps[i], status, None if start is None else stamps[start],
+                                known, stationary) for i, status, start, known, stationary in [
+        (0, Status.FIRST_FRAME, None, False, False),
+        (1, Status.OK, 0, True, False),
+        (2, Status.NO_PARALLAX, 1, True, True),
+        # the camera stood, so that this one is from before it stood
+        (3, Status.OK, 1, True, False),
+        (4, bad, None, False, False),
+        # bridged
+        (5, Status.OK, 3, True, False),
+        (6, bad, None, False, False),
+        (7, bad, None, False, False),
+        (8, bad, None, False, False),
+        # the hole: it starts from a frame to which no relative pose leads
+        (9, Status.OK, 8, True, False)]]
+
+
+def test_the_diagnostics_of_two_nodes_are_told_apart(drive):
+    for node in ('vo_node', 'left/vo_node'):
+        one = Tracker(from_flat(FAST), message_type, node=node)
+        one.camera_info(camera_info(K, SIZE))
+        out = by_topic(one.image(image(drive[0], stamp_ns=0, frame_id='left_camera')))
+        status, = out['/diagnostics'].status
+        assert (status.name, status.hardware_id) == (f'{node}: visual odometry', 'left_camera')
+        status, = out['relative_pose_status'].status
+        assert (status.name, status.hardware_id) == (f'{node}: relative pose', 'left_camera')
 
 
 # Time
@@ -368,7 +406,13 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
     said = [o['/diagnostics'].status[0] for o in out[:2]]
     assert [(s.level, s.message) for s in said] == [
         (1, 'bad pair: TOO_FEW_MATCHES'), (2, 'lost: TOO_FEW_MATCHES')]
-    assert all('odometry' not in o for o in out)
+    # the pose is held, and nobody is to believe in it or in a velocity
+    for message in (o['odometry'] for o in out):
+        assert np.allclose(pose_of(message)[1], one.last.pose, rtol=0, atol=1e-12)
+        for covariance in (message.pose.covariance, message.twist.covariance):
+            assert np.diag(np.reshape(covariance, (6, 6)))[:3].min() >= 9999
+        assert message.twist.twist.linear.x == message.twist.twist.angular.y == 0
+    assert not any({'relative_pose', '/tf'} & set(o) for o in out)
     play(one, drive[2:4], start=0.5)
     assert one.diagnosis().summary == 'tracking'
     assert one.last.status is Status.OK

@@ -23,11 +23,12 @@ class GraphFace(Face):
         image, info = self.image_topics(config.ros)
         topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
         self.session: GraphSession = GraphSession(
-            LiveSlam(config, middleware.message_type, image), self,
+            LiveSlam(config, middleware.message_type, image, middleware.node.strip('/')), self,
             {**topics, 'image': image, 'camera_info': info})
         self.advertise(graph_outputs(tf=config.slam.publish_tf))
         for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
-                                                 self.session.relative_pose)):
+                                                 self.session.relative_pose,
+                                                 self.session.relative_pose_status)):
             self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH))
         self.listen_to_camera(image, info, config.ros.image_transport,
                               replace(input_profile(config.ros), depth=config.slam.image_buffer))

@@ -33,7 +33,8 @@ class GraphSession:
     """
     Works on the odometry's messages in a thread of its own, and on loops while none waits.
 
-    topics: resolved names of 'odometry', 'relative_pose_cov', 'image' and 'camera_info', for
+    topics: resolved names of 'odometry', 'relative_pose_cov', 'relative_pose_status',
+    'image' and 'camera_info', for
     people. Everything may be called from any one thread; nothing of it waits.
     """
 
@@ -78,6 +79,10 @@ class GraphSession:
     def relative_pose(self, message: Any) -> None:
         """Take a PoseWithCovarianceStamped."""
         self._take('relative_pose_cov', lambda: self._slam.relative_pose(message))
+
+    def relative_pose_status(self, message: Any) -> None:
+        """Take the DiagnosticArray that says of a frame what its poses do not."""
+        self._take('relative_pose_status', lambda: self._slam.relative_pose_status(message))
 
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""

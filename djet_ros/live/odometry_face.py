@@ -27,6 +27,7 @@ class OdometryFace(Face):
         image, info = self.image_topics(config.ros)
         self.session: Session = Session(
             Tracker(config, middleware.message_type, image_topic=image,
+                    node=middleware.node.strip('/'),
                     speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES))), self,
             {'image': image, 'camera_info': info})
         self._hears_speed = False

@@ -19,6 +19,7 @@ SPEED_TYPES = {
 _ODOMETRY_OUTPUTS = {
     'relative_pose': 'geometry_msgs/msg/PoseStamped',
     'relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'relative_pose_status': 'diagnostic_msgs/msg/DiagnosticArray',
     'odometry': 'nav_msgs/msg/Odometry',
     'debug_image': 'sensor_msgs/msg/Image',
     '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
@@ -27,7 +28,7 @@ _ODOMETRY_OUTPUTS = {
 }
 
 # What the pose graph takes of the odometry, by the name of the latter's output.
-GRAPH_INPUTS = ('odometry', 'relative_pose_cov')
+GRAPH_INPUTS = ('odometry', 'relative_pose_cov', 'relative_pose_status')
 
 _GRAPH_OUTPUTS = ('path', '/tf', '/diagnostics')
 

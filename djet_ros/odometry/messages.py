@@ -12,13 +12,14 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from djet_ros.config.sections import OdometryConfig
-from djet_ros.core.types import Array
+from djet_ros.config.sections import NODE_NAME, OdometryConfig
+from djet_ros.core.types import Array, Status
+from djet_ros.errors import DjetError
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
-from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
+from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -108,9 +109,6 @@ def camera_frame(config: OdometryConfig, image_frame: str) -> str:
 class MessageFactory:
     """Makes messages of arrays; message_type gives the class for a type name."""
 
-    # What the diagnostics are of.
-    component = 'djet_ros: visual odometry'
-
     def __init__(self, message_type: MessageType) -> None:
         self._type = message_type
 
@@ -165,17 +163,17 @@ class MessageFactory:
             encoding='mono8' if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
             step=pixels.size // height, data=data)
 
-    def diagnostics(self, stamp: int, level: str, summary: str,
-                    values: dict[str, str]) -> Any:
+    def diagnostics(self, stamp: int, name: str, level: str, summary: str,
+                    values: dict[str, str], hardware: str = '', frame_id: str = '') -> Any:
         """Make the DiagnosticArray of one status; level is 'OK', 'WARN' or 'ERROR'."""
         status_type = self._type('diagnostic_msgs/msg/DiagnosticStatus')
         pair = self._type('diagnostic_msgs/msg/KeyValue')
         # The class's own constant is of the type that its field wants: bytes or int.
         status = status_type(
-            level=getattr(status_type, level), name=self.component, message=summary,
-            hardware_id='', values=[pair(key=key, value=value) for key, value in values.items()])
+            level=getattr(status_type, level), name=name, message=summary, hardware_id=hardware,
+            values=[pair(key=key, value=value) for key, value in values.items()])
         return self._type('diagnostic_msgs/msg/DiagnosticArray')(
-            header=self.header(stamp, ''), status=[status])
+            header=self.header(stamp, frame_id), status=[status])
 
     def _pose(self, pose: Array) -> Any:
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
@@ -190,12 +188,42 @@ class MessageFactory:
         return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
 
 
-class Messages(MessageFactory):
-    """Makes the messages of results, too."""
+class FrameStatus(NamedTuple):
+    """
+    What a backend has to know of a frame beside its poses: see ``Messages.status``.
 
-    def __init__(self, message_type: MessageType, config: OdometryConfig) -> None:
+    reference_ns: stamp of the frame that it was related to, or None; length_known: whether the
+    translation is in metres; stationary: whether the camera stood still, so that the next frame
+    is related to the same reference.
+    """
+
+    stamp_ns: int
+    status: Status
+    reference_ns: int | None
+    length_known: bool
+    stationary: bool
+
+
+def frame_status(message: Any) -> FrameStatus:
+    """Read what ``Messages.status`` makes; DjetError where it is something else."""
+    stamp = stamp_ns(message.header)
+    try:
+        values = {pair.key: pair.value for pair in message.status[0].values}
+        reference = values['reference_stamp_ns']
+        return FrameStatus(stamp, Status(values['status']), int(reference) if reference else None,
+                           values['length'] == 'metric', values['stationary'] == 'true')
+    except (IndexError, KeyError, ValueError) as error:
+        raise DjetError(f'the status of {stamp} ns lacks something: {error}') from None
+
+
+class Messages(MessageFactory):
+    """Makes the messages of results, too; node: name of the node that they come from."""
+
+    def __init__(self, message_type: MessageType, config: OdometryConfig,
+                 node: str = NODE_NAME) -> None:
         super().__init__(message_type)
         self._config = config
+        self._node = node
 
     def relative_pose(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the current camera in the previous camera's frame."""
@@ -209,6 +237,25 @@ class Messages(MessageFactory):
         return self._type('geometry_msgs/msg/PoseWithCovarianceStamped')(
             header=self.header(result.stamp_ns, frame),
             pose=self._pose_with_covariance(turned.motion, turned.motion_covariance))
+
+    def status(self, result: OdometryResult) -> Any:
+        """
+        Make the DiagnosticArray that says of a frame what its poses do not.
+
+        One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
+        frame that the relative poses of the same stamp start from, empty where there is none;
+        'length' is metric or unknown; 'stationary' is true or false. Level OK: there is a
+        relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
+        """
+        tracked = result.status in TRACKED
+        level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
+        frame = camera_frame(self._config, result.frame_id)
+        return self.diagnostics(
+            result.stamp_ns, f'{self._node}: relative pose', level, result.status.value, {
+                'status': result.status.value,
+                'reference_stamp_ns': str(result.previous_stamp_ns) if tracked else '',
+                'length': 'metric' if tracked and result.scale_known else 'unknown',
+                'stationary': str(result.stationary).lower()}, frame, frame)
 
     def odometry(self, result: OdometryResult) -> Any:
         """

@@ -11,7 +11,7 @@ from collections import deque
 import math
 from typing import Any, NamedTuple
 
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
@@ -43,6 +43,8 @@ class Tracker:
     the resolved name of the images' topic, by which odometry.rectified 'auto' goes; speed_topics
     are where speeds are heard, for people.
 
+    node is the name by which the diagnostics are told from those of others.
+
     Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
     odometry (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of
     state and once per second of the images' stamps).
@@ -50,7 +52,7 @@ class Tracker:
 
     def __init__(self, config: Config, message_type: MessageType,
                  scale: ScaleSource | None = None, image_topic: str = '',
-                 speed_topics: str = 'speed or speed_odometry') -> None:
+                 speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME) -> None:
         self.config = config
         # What a face adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
@@ -59,7 +61,8 @@ class Tracker:
         self._speed_topics = speed_topics
         self._scale = scale or scale_source(config.odometry)
         self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale)
-        self._messages = Messages(message_type, config.odometry)
+        self._node = node
+        self._messages = Messages(message_type, config.odometry, node)
         self._info: Any = None
         self._camera: Camera | None = None
         self._paused = False
@@ -106,7 +109,7 @@ class Tracker:
             self._scale = scale_source(after)
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
-        self._messages = Messages(self._message_type, after)
+        self._messages = Messages(self._message_type, after, self._node)
         self._health.configure(after)
         self._path = deque(self._path if before == after else (),
                            maxlen=config.ros.path_length)
@@ -203,7 +206,8 @@ class Tracker:
         """Give the diagnostics message of this moment, in nanoseconds."""
         diagnosis = self.diagnosis()
         return Outgoing('/diagnostics', self._messages.diagnostics(
-            stamp, diagnosis.level, diagnosis.summary, diagnosis.values))
+            stamp, f'{self._node}: visual odometry', diagnosis.level, diagnosis.summary,
+            diagnosis.values, self.last.frame_id if self.last else ''))
 
     def debug_image(self) -> Outgoing | None:
         """Draw the last pair; None where there is none. Costs time: ask only if somebody looks."""
@@ -275,8 +279,9 @@ class Tracker:
         if result.status in TRACKED:
             outgoing += [Outgoing('relative_pose', make.relative_pose(result)),
                          Outgoing('relative_pose_cov', make.relative_pose_cov(result))]
+        outgoing += [Outgoing('relative_pose_status', make.status(result)),
+                     Outgoing('odometry', make.odometry(result))]
         if result.status in TRACKED or result.status in STARTED:
-            outgoing.append(Outgoing('odometry', make.odometry(result)))
             if self.config.ros.publish_tf and has_frame(self.config.odometry, result.frame_id):
                 outgoing.append(Outgoing('/tf', make.transform(result)))
             if self.config.ros.publish_path:

@@ -39,8 +39,7 @@ class OdometryResult:
 
     since_ns: stamp of the newest frame that was where the reference frame is, which is later
     where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
-    sure it is that this frame was there. segment: number of the unbroken stretch that the frame
-    belongs to: the motion between two segments is not known.
+    sure it is that this frame was there.
     """
 
     stamp_ns: int
@@ -57,7 +56,6 @@ class OdometryResult:
     stationary: bool = False
     since_ns: int | None = None
     since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    segment: int = 0
 
 
 class VisualOdometry:
@@ -91,7 +89,7 @@ class VisualOdometry:
         """Forget everything; the next frame is the first."""
         self._last: Frame | None = None
         self._prior: RelativePose | None = None
-        self._bad_pairs = self._segment = 0
+        self._bad_pairs = 0
         self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
 
     def process(self, frame: Frame) -> OdometryResult:
@@ -148,14 +146,13 @@ class VisualOdometry:
             self._scale.reset()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
-            self._segment += 1
             self._pose_covariance = compose(self._pose, self._pose_covariance, np.eye(4),
                                             UNKNOWN_MOTION)
         self._refer_to(frame, view)
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
-            UNKNOWN_MOTION, self._pose_covariance, 0.0, False, segment=self._segment)
+            UNKNOWN_MOTION, self._pose_covariance, 0.0, False)
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
@@ -170,7 +167,6 @@ class VisualOdometry:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
         given_up = self._bad_pairs >= self._config.max_lost
-        self._segment += given_up
         result = self._result(frame, relative.status, relative, length, np.eye(4), UNKNOWN_MOTION)
         if given_up:
             self._refer_to(frame, view)
@@ -187,7 +183,7 @@ class VisualOdometry:
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             self._pose @ motion, covariance,
             compose(self._pose, self._pose_covariance, motion, covariance), length.value,
-            length.known, stationary, self._since_ns, self._since_covariance, self._segment)
+            length.known, stationary, self._since_ns, self._since_covariance)
 
 
 def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:

@@ -15,7 +15,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
-from djet_ros.odometry.messages import Messages, MessageType, OPTICAL_TO_BODY, stamp_ns
+from djet_ros.odometry.messages import MessageFactory, MessageType, OPTICAL_TO_BODY, stamp_ns
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.keyframe_map import KeyframeMap
 from djet_ros.posegraph.step_messages import StepMessages
@@ -31,17 +31,20 @@ class LiveSlam:
 
     config: slam, and what it shares with the odometry (estimator, odometry.frame_convention,
     odometry.rectified, odometry.scale_uncertainty); message_type gives the class for a type name;
-    image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes.
+    image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes;
+    node is the name by which the diagnostics are told from those of others.
 
     Outgoing topics: /tf (the odometry's frame in the map, for each frame that was tracked), path
     (the optimised poses of the keyframes and of the newest frame), /diagnostics.
     """
 
-    def __init__(self, config: Config, message_type: MessageType, image_topic: str = '') -> None:
+    def __init__(self, config: Config, message_type: MessageType, image_topic: str = '',
+                 node: str = 'pose_graph_node') -> None:
         self.config, self.slam = config, config.slam
         # What a face adds to each diagnostics message.
         self.face_values: dict[str, str] = {}
-        self._messages = _Messages(message_type, config.odometry)
+        self._messages = MessageFactory(message_type)
+        self._node = node
         self._rectified = means_rectified(config.odometry.rectified, image_topic)
         self._turn = np.eye(4)
         if config.odometry.frame_convention == 'body':
@@ -96,11 +99,22 @@ class LiveSlam:
             self._reject('relative_pose_cov', problem)
             return []
 
+    def relative_pose_status(self, message: Any) -> list[Outgoing]:
+        """Take what the odometry says of a frame beside its poses."""
+        try:
+            return self._take(self._steps.status(message))
+        except DjetError as problem:
+            self._reject('relative_pose_status', problem)
+            return []
+
     def odometry(self, message: Any) -> list[Outgoing]:
         """Take an Odometry; a step back in time begins everything anew."""
         if self._steps.goes_back(message):
-            # Its image has come already.
+            # Its image has come already, and perhaps what else belongs to it.
+            steps = self._steps
             self._begin()
+            steps.go_back(stamp_ns(message.header))
+            self._steps = steps
         try:
             return self._take(self._steps.odometry(message))
         except DjetError as problem:
@@ -161,7 +175,9 @@ class LiveSlam:
                for topic, count in sorted(self.rejected.items())},
             **self.face_values}
         return Outgoing('/diagnostics', self._messages.diagnostics(
-            stamp, level, f'{summary}: {self.problem}' if self.problem else summary, values))
+            stamp, f'{self._node}: pose graph', level,
+            f'{summary}: {self.problem}' if self.problem else summary, values,
+            self._info.header.frame_id if self._info is not None else ''))
 
     def _take(self, steps: list[Step]) -> list[Outgoing]:
         outgoing = []
@@ -212,9 +228,3 @@ class LiveSlam:
             return []
         self._said, self._said_stamp = self.state[1], stamp
         return [self.diagnostics(stamp)]
-
-
-class _Messages(Messages):
-    """Messages of the map."""
-
-    component = 'djet_ros: pose graph'

@@ -6,6 +6,7 @@ from typing import Any
 
 from launch import Substitution
 from launch.actions import DeclareLaunchArgument
+from launch.substitution import Substitution
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
