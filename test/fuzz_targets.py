@@ -32,9 +32,9 @@ from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.datasets import euroc, tum_rgbd
 from djet_ros.recordings.decoding import decoder, jazzy, message_type
+from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
 from djet_ros.recordings.recording import BagRecording
-from djet_ros.recordings.sequence import FrameSequence
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
 from djet_ros.recordings.varos import VarosSequence

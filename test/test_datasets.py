@@ -7,9 +7,9 @@ from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.datasets import euroc, LONGEST_GAP_NS, open_sequence, tum_rgbd
+from djet_ros.recordings.frame_sequence import from_first
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import BagRecording, open_recording
-from djet_ros.recordings.sequence import from_first
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -113,7 +113,7 @@ def test_no_module_imports_from_a_room_above_or_beside_its_own() -> None:
 @pytest.mark.parametrize(('module', 'name'), [
     ('djet_ros.core.jet', 'djet_ros.config.sections.Config'),
     ('djet_ros.config.flat', 'djet_ros.odometry.frame.Frame'),
-    ('djet_ros.posegraph.graph', 'djet_ros.replay.results.BAG'),
+    ('djet_ros.posegraph.pose_graph', 'djet_ros.replay.results.BAG'),
     ('djet_ros.dds.graph', 'djet_ros.ros.vo_node.make'),
     ('djet_ros.live.session', 'djet_ros.lab.soak')])
 def test_an_upward_import_would_be_seen(module: str, name: str) -> None:

@@ -18,7 +18,7 @@ from djet_ros.odometry.scale import GroundTruthScale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import OdometryResult
-from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.step_messages import StepMessages
 from djet_ros.recordings.recording import open_recording
 import numpy as np

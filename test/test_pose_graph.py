@@ -15,8 +15,8 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.errors import DjetError
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
-from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.graph_files import write_graph
+from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.bags import Bag, BagMessage
 from djet_ros.recordings.trajectories import read_tum

@@ -16,13 +16,14 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import pose_of
+from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
 from djet_ros.replay.ground_truth import GroundTruth
-from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
+from djet_ros.replay.pair_errors import pair_errors, statistics
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE
@@ -433,7 +434,7 @@ def test_errors_follow_the_stated_rules():
     truth = [np.eye(4), pose(z=1.0), pose(z=1.005), pose(z=2), pose(z=3), np.full((4, 4), np.nan)]
     wrong = pose(x=1.0)
     wrong[:3, :3] = rotation_exp(np.array([0, 0, np.radians(3)]))
-    pairs = [Pair(i, i + 1, status, wrong) for i, status in enumerate(
+    pairs = [Step(i + 1, status, pose(), i, wrong) for i, status in enumerate(
         (Status.OK, Status.OK, Status.NO_PARALLAX, Status.TOO_FEW_MATCHES, Status.OK))]
     errors = pair_errors(pairs, np.array(truth[:-1]), np.array(truth[1:]))
     assert np.allclose(errors.rotation_deg, [3, 3, 3, np.nan, np.nan], equal_nan=True)

@@ -20,10 +20,10 @@ from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import compose
-from djet_ros.posegraph.graph import Edge, PoseGraph
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder, transferred_length
 from djet_ros.posegraph.places import PlaceIndex
+from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np

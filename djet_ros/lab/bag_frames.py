@@ -10,8 +10,8 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import pose_of, stamp_ns
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
 from djet_ros.recordings.recording import BagRecording
-from djet_ros.recordings.sequence import FrameSequence, ImageFiles
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 from numpy.typing import NDArray

@@ -21,7 +21,7 @@ from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
 from djet_ros.lab.sequences import readable_frames
-from djet_ros.recordings.sequence import FrameSequence
+from djet_ros.recordings.frame_sequence import FrameSequence
 import numpy as np
 from numpy.typing import NDArray
 

@@ -16,8 +16,8 @@ from djet_ros.lab.bag_frames import extract, ExtractedSequence, is_extracted
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.datasets import open_sequence
+from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.recording import BagRecording
-from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from numpy.typing import NDArray
 

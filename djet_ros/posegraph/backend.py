@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.types import Array
-from djet_ros.posegraph.graph import PoseGraph
+from djet_ros.posegraph.pose_graph import PoseGraph
 import gtsam
 import numpy as np
 

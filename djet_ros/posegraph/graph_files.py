@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from djet_ros.errors import DjetError
-from djet_ros.posegraph.graph import Edge, PoseGraph
+from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.recordings.outputs import check_file, write_whole
 from djet_ros.recordings.trajectories import (
     digits,

@@ -12,9 +12,9 @@ from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.uncertainty import compose, rotated, UNKNOWN_MOTION
 from djet_ros.posegraph.backend import optimise, OptimisedGraph
-from djet_ros.posegraph.graph import Edge, Motion, PoseGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
+from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 from djet_ros.posegraph.steps import Step
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -98,7 +98,7 @@ class KeyframeMap:
         self.correction = np.eye(4)
         self.newest: KeyframeOffset | None = None
         self._newest_step: Step | None = None
-        # Of the frames that the next step may be told from, by stamp.
+        # Of the frames that may be the next step's previous one, by stamp.
         self._offsets: dict[int | None, KeyframeOffset] = {}
         self._chain: list[Edge] = []
         self._found: list[Edge] = []
@@ -138,15 +138,15 @@ class KeyframeMap:
         reference = self._offsets.get(step.previous_stamp_ns)
         self._offsets = {step.stamp_ns: offset}
         if step.tracked and reference is not None:
-            # The next motion may be told from there again: then the camera stood still, and is as
-            # well seen from here.
+            # It may be the next step's previous frame again: then the camera was stationary, and
+            # this keyframe is as good for both.
             self._offsets[step.previous_stamp_ns] = reference if frame is None else \
                 KeyframeOffset(offset.keyframe, np.asarray(np.linalg.inv(step.motion)))
         self.newest, self._newest_step = offset, step
         return frame is not None
 
     def _offset(self, step: Step) -> KeyframeOffset | None:
-        """Offset of a step's frame; if the odometry began anew, its frame moves in the map."""
+        """Offset of a step's frame; if the odometry restarted, its frame moves in the map."""
         if self.newest is None or self._newest_step is None:
             return None
         reference = self._offsets.get(step.previous_stamp_ns)

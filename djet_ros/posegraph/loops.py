@@ -18,9 +18,9 @@ from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
-from djet_ros.posegraph.graph import Edge
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.places import PlaceIndex
+from djet_ros.posegraph.pose_graph import Edge
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,16 +107,16 @@ class EdgeFinder:
             yield from self._loop(current, place)
 
     def _loop(self, current: int, place: int) -> Iterator[Edge]:
-        view, seen = self._view(current), self._view(place)
+        view, other = self._view(current), self._view(place)
         # The estimator takes both views to be of one camera.
-        if not np.array_equal(view.K, seen.K):
+        if not np.array_equal(view.K, other.K):
             return
-        relative = self._wide.estimate(view, seen)
+        relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_sure(relative):
             yield _edge(current, place, relative, self._length(current, view, relative), 'loop')
 
     def _length(self, current: int, view: View, relative: RelativePose) -> Length:
-        """Length of a loop's translation, by the points that the last step of the way saw too."""
+        """Length of a loop's translation, by the points that the last odometry edge saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
         if step is None or step.source not in self._kept or not step.scale_known or not guess:
@@ -136,9 +136,8 @@ class EdgeFinder:
                 and inliers >= self._config.loop_share * len(relative.x))
 
     def _view(self, keyframe: int) -> View:
-        seen = self._kept[keyframe]
-        frame = seen.frame
-        return View(frame.gray, frame.K, seen.features, smooth(frame.gray))
+        frame, features = self._kept[keyframe]
+        return View(frame.gray, frame.K, features, smooth(frame.gray))
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
@@ -152,8 +151,8 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
     _, here, there = np.intersect1d(_pixels(step), _pixels(other), return_indices=True)
     depths, parallax = _inverse_depths(step, K)
     others, _ = _inverse_depths(other, K)
-    told = parallax[here] > _LEAST_PARALLAX
-    ratios = others[there][told] / depths[here][told]
+    sure = parallax[here] > _LEAST_PARALLAX
+    ratios = others[there][sure] / depths[here][sure]
     ratios = ratios[np.isfinite(ratios)]
     if len(ratios) < _LEAST_SHARED:
         return unknown(length.value)
@@ -162,7 +161,7 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
         return unknown(length.value)
     # Standard deviation of a median, if places apart err independently, and more than that.
     spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    places = len(np.unique(step.x[step.inliers][here][told] // CELL, axis=0))
+    places = len(np.unique(step.x[step.inliers][here][sure] // CELL, axis=0))
     sigma = 1.2533 * spread * np.sqrt(CAUTIOUS_INFLATION / places)
     return Length(length.value * ratio,
                   float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)

@@ -9,9 +9,9 @@ from pathlib import Path
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.posegraph.backend import OptimisedGraph
-from djet_ros.posegraph.graph import PoseGraph
 from djet_ros.posegraph.keyframe_images import frame_finder, KeyframeFile
 from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
+from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.recording import Recording
 import numpy as np
@@ -77,5 +77,5 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
 
 
 def travelled(poses: Array) -> float:
-    """Length of the way through poses (N, 4, 4)."""
+    """Length of the trajectory through poses (N, 4, 4)."""
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

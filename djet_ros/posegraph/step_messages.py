@@ -1,5 +1,5 @@
 """
-From the odometry's messages to the steps of its way.
+From the odometry's messages to steps.
 
 An Odometry says where the camera is, the relative pose of the same stamp how it came there and
 how sure that is, and the status of the same stamp from which frame, and whether lengths are known.

@@ -1,4 +1,4 @@
-"""The steps of a camera's way as an odometry tells them, and the graph of them."""
+"""The steps of a trajectory as an odometry estimates them, and the graph of them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from djet_ros.core.types import Array, Status
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
-from djet_ros.posegraph.graph import Edge, Motion, PoseGraph
+from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 import numpy as np
 
 
 @dataclass(frozen=True)
 class Step(Motion):
     """
-    A frame that the odometry told of, along optical axes.
+    A frame that the odometry processed, along optical axes.
 
     stamp_ns, status: of the frame; pose (4, 4): the camera in the odometry's frame;
     previous_stamp_ns: of the frame that it was related to, or None; motion (4, 4), covariance
@@ -39,7 +39,7 @@ class Step(Motion):
 
     @property
     def restarted(self) -> bool:
-        """Whether the odometry began anew, so that its frame may be another than before."""
+        """Whether the odometry restarted, so that its frame may be another than before."""
         return self.status in STARTED
 
 
@@ -50,10 +50,10 @@ def graph_of(steps: Sequence[Step]) -> PoseGraph:
     Where nothing is known of a motion, an edge of kind 'unknown' from the step before keeps the
     graph in one piece. KeyError where a step's previous frame is not among those before it.
     """
-    vertex: dict[int, int] = {}
+    vertex: dict[int | None, int] = {}
     edges = []
     for i, step in enumerate(steps):
-        if step.tracked and step.previous_stamp_ns is not None:
+        if step.tracked:
             edges.append(Edge(vertex[step.previous_stamp_ns], i, step.motion, step.covariance,
                               scale_known=step.scale_known))
         elif i:

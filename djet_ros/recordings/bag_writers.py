@@ -18,9 +18,9 @@ from djet_ros.odometry.messages import OPTICAL_TO_BODY
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, MAKE
+from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.outputs import appearing
 from djet_ros.recordings.recording import SequenceRecording, WORLD_FRAME
-from djet_ros.recordings.sequence import FrameSequence
 import numpy as np
 from rosbags.interfaces import (
     Connection,

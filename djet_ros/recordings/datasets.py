@@ -10,8 +10,8 @@ from djet_ros.config.safe_files import read_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.interpolation import poses_at
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.kitti import check_rigid, KittiSequence
-from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import (
     increasing,
     lines,

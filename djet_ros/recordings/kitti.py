@@ -6,7 +6,7 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import (
     check_positions,
     increasing,

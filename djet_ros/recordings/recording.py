@@ -19,8 +19,8 @@ from djet_ros.recordings.bags import Bag, BagMessage, is_bag, Topic
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.decoding import MAKE
+from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_poses
-from djet_ros.recordings.sequence import FrameSequence
 from djet_ros.recordings.text import lines
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.kitti import check_rigid, STAMP_OFFSET_NS
-from djet_ros.recordings.sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.text import increasing, lines, number_rows, stamped, whole_nanoseconds
 import numpy as np
 from numpy.typing import NDArray

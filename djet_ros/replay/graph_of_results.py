@@ -16,7 +16,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
-from djet_ros.posegraph.graph import PoseGraph
+from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.trajectories import read_tum
@@ -28,8 +28,8 @@ def read_steps(folder: Path) -> list[Step]:
     """
     Read the steps of a results folder of ``djet replay``.
 
-    They are those of the frames that a motion was told to or from, and of those at which the
-    odometry began anew. Raises DjetError.
+    They are those of the frames to or from which a motion was estimated, and of those at which the
+    odometry restarted. Raises DjetError.
     """
     if not (folder / 'frames.csv').is_file():
         raise DjetError(f"{folder} holds no results; give a folder that 'djet replay' wrote")
@@ -42,7 +42,8 @@ def read_steps(folder: Path) -> list[Step]:
     motions = _motions(folder / BAG, load_yaml(folder / 'config.yaml'))
     steps = list(_steps(rows, poses, motions, folder))
     if len(steps) < 2:
-        raise DjetError(f'{folder}: no motion was told between any two frames; there is no graph')
+        raise DjetError(f'{folder}: no motion was estimated between any two frames; there is no '
+                        'graph')
     return steps
 
 

@@ -4,10 +4,10 @@ Errors of estimated pairs against ground truth, as in the paper's section 5.1.
 Each pair is held against the true motion between the very two frames that it relates, which are
 neighbours unless a bad frame lies between them. The rules:
 * rotation: angle of the rotation between truth and estimate (Rodrigues), for every pair whose
-  motion was told (OK, NO_PARALLAX);
+  motion was estimated (OK, NO_PARALLAX);
 * translation: angle between the true and the estimated direction, for every pair with status OK
-  whose true way is at least 1 cm: below that the direction of the truth is noise;
-* a pair whose motion was not told has no error: it is counted as a failure, and so is, for
+  whose true length is at least 1 cm: below that the direction of the truth is noise;
+* a pair whose motion was not estimated has no error: it is counted as a failure, and so is, for
   translation, a pair called NO_PARALLAX although the camera went further than that.
 """
 
@@ -18,20 +18,11 @@ from dataclasses import dataclass
 
 from djet_ros.core.geometry import direction_angle, rotation_angle
 from djet_ros.core.types import Array, Status
+from djet_ros.posegraph.steps import Step
 import numpy as np
 from numpy.typing import NDArray
 
-SHORTEST_WAY = 0.01
-
-
-@dataclass(frozen=True)
-class Pair:
-    """An estimated pair: its stamps, its status, and the motion (4, 4), current in previous."""
-
-    previous_stamp_ns: int
-    stamp_ns: int
-    status: Status
-    motion: Array
+_SHORTEST_LENGTH = 0.01
 
 
 @dataclass(frozen=True)
@@ -41,7 +32,7 @@ class PairErrors:
 
     rotation_deg, translation_deg: (N,); compared: pairs with ground truth at both ends;
     failures: how many of them have no rotation; translation_failures: how many of those whose
-    true way is long enough have no direction.
+    true length is large enough have no direction.
     """
 
     rotation_deg: NDArray[np.float64]
@@ -63,10 +54,10 @@ def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[fl
 
 def has_direction(true_motion: Array) -> bool:
     """Tell whether a true motion (4, 4) goes far enough for its direction to mean something."""
-    return bool(np.linalg.norm(true_motion[:3, 3]) >= SHORTEST_WAY)
+    return bool(np.linalg.norm(true_motion[:3, 3]) >= _SHORTEST_LENGTH)
 
 
-def pair_errors(pairs: Sequence[Pair], previous_truth: Array, truth: Array) -> PairErrors:
+def pair_errors(pairs: Sequence[Step], previous_truth: Array, truth: Array) -> PairErrors:
     """Compare N pairs with the true poses (N, 4, 4) at their two ends, NaN where not known."""
     rotation, translation = np.full((2, len(pairs)), np.nan)
     compared = failures = translation_failures = 0

@@ -17,12 +17,12 @@ from djet_ros.odometry.diagnostics import Counts
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.scale import scale_source, ScaleSource
 from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.odometry.visual_odometry import TRACKED
+from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.recording import Recording
 from djet_ros.replay.ground_truth import GroundTruth
-from djet_ros.replay.pair_errors import Pair, pair_errors, statistics
+from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
 import numpy as np
 
@@ -98,10 +98,9 @@ class Replay:
         seconds = perf_counter() - started
         if tracker.counts.processed > processed and tracker.last is not None:
             result = tracker.last
-            log.steps.append(_Step(result.stamp_ns, result.previous_stamp_ns, result.status,
-                                   result.motion, result.pose))
-            log.metric &= result.scale_known or result.status is not Status.OK
-            log.scaled += result.scale_known and result.status in TRACKED
+            log.steps.append(Step(result.stamp_ns, result.status, result.pose,
+                                  result.previous_stamp_ns, result.motion,
+                                  result.motion_covariance, result.scale_known))
             self._folder.add_frame(number, result, seconds)
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
@@ -137,7 +136,9 @@ class Replay:
         return {
             'source': self._name, 'image_topic': self._recording.image_topic,
             'method': config.estimator.method, 'preset': config.preset,
-            'scale': config.odometry.scale, 'pairs_of_known_scale': self._log.scaled,
+            'scale': config.odometry.scale,
+            'pairs_of_known_scale': sum(step.tracked and step.scale_known
+                                        for step in self._log.steps),
             'frames': counts.processed, 'pairs': len(self._log.pairs()),
             'seconds': round(seconds, 3),
             'images': counts.received, 'dropped': dict(counts.dropped),
@@ -152,7 +153,7 @@ class Replay:
         pairs = log.pairs()
         truth = self._truth.at(np.array([step.stamp_ns for step in log.steps], np.int64))
         if len(self._truth) and pairs:
-            at = {step.stamp_ns: i for i, step in enumerate(log.steps)}
+            at: dict[int | None, int] = {step.stamp_ns: i for i, step in enumerate(log.steps)}
             ends = np.array([(at[p.previous_stamp_ns], at[p.stamp_ns]) for p in pairs])
             errors = pair_errors(pairs, truth[ends[:, 0]], truth[ends[:, 1]])
             summary.update(
@@ -176,47 +177,39 @@ class Replay:
         elif not log.metric:
             unit = 'steps of unit length'
         # The two agree where the ground truth begins.
-        true_way = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
+        positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
             if known.size else None
-        plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], true_way, title, unit)
-
-
-class _Step(NamedTuple):
-    """Of a frame, what is needed at the end: small, however long the recording is."""
-
-    stamp_ns: int
-    previous_stamp_ns: int | None
-    status: Status
-    motion: Array
-    pose: Array
+        plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], positions, title, unit)
 
 
 @dataclass
 class _Log:
-    """Steps of a run; metric: whether all their lengths were known; scaled: how many were."""
+    """Steps of a run, small however long the recording is, and what first went wrong."""
 
-    steps: list[_Step] = field(default_factory=list)
-    metric: bool = True
-    scaled: int = 0
+    steps: list[Step] = field(default_factory=list)
     first_problem: str | None = None
 
-    def pairs(self) -> list[Pair]:
-        return [Pair(step.previous_stamp_ns, step.stamp_ns, step.status, step.motion)
-                for step in self.steps if step.previous_stamp_ns is not None]
+    @property
+    def metric(self) -> bool:
+        """Whether all lengths are known."""
+        return all(step.scale_known or step.status is not Status.OK for step in self.steps)
+
+    def pairs(self) -> list[Step]:
+        return [step for step in self.steps if step.previous_stamp_ns is not None]
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
         poses: list[Array] = []
-        at: dict[int, int] = {}
+        at: dict[int | None, int] = {}
         for i, step in enumerate(self.steps):
             pose = poses[-1] if poses else np.eye(4)
-            if step.previous_stamp_ns is not None and step.status in TRACKED:
+            if step.tracked:
                 previous = at[step.previous_stamp_ns]
-                way = float(np.linalg.norm(truth[i, :3, 3] - truth[previous, :3, 3]))
+                true = float(np.linalg.norm(truth[i, :3, 3] - truth[previous, :3, 3]))
                 length = float(np.linalg.norm(step.motion[:3, 3]))
                 motion = step.motion.copy()
-                if length > 0 and np.isfinite(way):
-                    motion[:3, 3] *= way / length
+                if length > 0 and np.isfinite(true):
+                    motion[:3, 3] *= true / length
                 pose = poses[previous] @ motion
             poses.append(pose)
             at[step.stamp_ns] = i

@@ -2,7 +2,7 @@
 The results folder of a replay: everything is written as it comes, so that nothing is lost.
 
 * trajectory_tum.txt, trajectory_kitti.txt: one pose per processed frame, camera in the first
-  camera, along optical axes; the last known pose where the motion could not be told
+  camera, along optical axes; the last known pose where the motion could not be estimated
 * frames.csv: one row per image
 * bag/: what a live node would have published
 * config.yaml: the parameters in force
@@ -23,12 +23,13 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.outputs import make_room, write_whole
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
-from djet_ros.replay.pair_errors import Pair, PairErrors
+from djet_ros.replay.pair_errors import PairErrors
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,7 +86,7 @@ class ResultsFolder(Closing):
         self._bag.write(topic if topic.startswith('/') else f'/{NODE_NAME}/{topic}',
                         outgoing.message, stamp_ns)
 
-    def add_errors(self, pairs: list[Pair], errors: PairErrors) -> None:
+    def add_errors(self, pairs: list[Step], errors: PairErrors) -> None:
         """Write the errors of all pairs, empty where there is none."""
         try:
             with (self.path / 'errors.csv').open('w', newline='') as file:
@@ -147,7 +148,7 @@ def _blame(path: Path, error: OSError) -> DjetError:
 
 
 def _widen(axes: Any) -> None:
-    """Give a straight way some room at its sides, so that its deviations can be seen."""
+    """Give a straight trajectory room at its sides, so that its deviations can be seen."""
     limits = [np.array(axes.get_xlim()), np.array(axes.get_ylim())]
     longest = max(float(np.ptp(limit)) for limit in limits)
     for limit, widen in zip(limits, (axes.set_xlim, axes.set_ylim)):
@@ -158,7 +159,7 @@ def _widen(axes: Any) -> None:
 def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str,
                     unit: str) -> None:
     """
-    Draw the way seen from above: x to the right, z ahead, of positions (N, 3) in the first camera.
+    Draw a trajectory from above: x to the right, z ahead, positions (N, 3) in the first camera.
 
     truth: (M, 3) or None; unit: of the axes.
     """

@@ -92,7 +92,7 @@ class Edge(Motion):
     A relative pose between two vertices of a graph.
 
     source, target: indices of vertices; kind: 'odometry' (of neighbouring frames), 'link' (over
-    more than one keyframe), 'loop' (of a place seen again) or 'unknown' (nothing was told, and the
+    more than one keyframe), 'loop' (of a place seen again) or 'unknown' (not estimated, and the
     covariance says so).
     """
 
