@@ -140,6 +140,7 @@ class Drive:
     """The images as a sequence that can be written as a bag."""
 
     name, K, size, poses = 'cards', K, SIZE, None
+    distortion = np.zeros(5)
 
     def __init__(self, images: list[Any]) -> None:
         self._images = images
@@ -473,7 +474,7 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
     assert [good for good, _ in answers] == [True, True] + [False] * 6 + [True, True]
     reasons = [reason for _, reason in answers]
     assert 'Max: 20000' in reasons[3]
-    assert reasons[4].startswith("loss is 'hubber'; choose from none, huber, cauchy")
+    assert reasons[4].startswith("estimator.loss is 'hubber'; choose from none, huber, cauchy")
     assert 'read-only' in reasons[5]
     assert 'only a recording has' in reasons[6]
     play(publisher, drive[3:5], first=3)
@@ -492,16 +493,33 @@ def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
         'paper', 'five_point']
 
 
-def test_a_wrong_value_at_the_start_ends_it_in_one_line(tmp_path):
-    for wrong, reason in (('estimator.window:=4', 'window is 4; it must be odd'),
-                          ('odometry.scale:=ground_truth', 'only a recording has')):
-        done = subprocess.run(
-            [*command('vo_node'), '--ros-args', '-p', wrong],
-            env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 2
-        line, = done.stderr.splitlines()
-        assert line.startswith('vo_node: error: ')
-        assert reason in line
+BROKEN_YAML = '/**: {ros__parameters: {estimator: '
+
+
+@pytest.mark.parametrize(('words', 'reason'), [
+    (['-p', 'estimator.window:=4'], 'estimator.window is 4; it must be odd'),
+    (['-p', 'odometry.scale:=ground_truth'], 'only a recording has'),
+    (['-p', 'nonsense'], "Couldn't parse parameter override rule: '-p nonsense'"),
+    (['--params-file', '/no/such.yaml'], "Couldn't parse params file: '--params-file /no/such"),
+    (['--params-file', 'broken.yaml'], "Couldn't parse params file: '--params-file broken.yaml"),
+    (['-r', 'image=x'], "Couldn't parse remap rule: '-r image=x'"),
+    (['-r', 'image:=/bad//name'], "Couldn't parse remap rule: '-r image:=/bad//name'"),
+    (['-r', '__node:=bad-name'], "Couldn't parse remap rule: '-r __node:=bad-name'"),
+    (['--log-level', 'shout'], "Couldn't parse log level: '--log-level shout'"),
+    (['--no-such-flag'], '--no-such-flag'),
+    (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
+     "/image can not be had with qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
+    (['-p', 'qos_overrides./image.subscription.depth:=many'],
+     "{'subscription.depth': 'many'"),
+])
+def test_what_the_user_can_mend_ends_it_with_one_line_and_code_2(tmp_path, words, reason):
+    (tmp_path / 'broken.yaml').write_text(BROKEN_YAML)
+    done = subprocess.run([*command('vo_node'), '--ros-args', *words], env=ENVIRONMENT,
+                          capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
+    assert done.returncode == 2
+    line, = done.stderr.splitlines()
+    assert line.startswith('vo_node: error: ')
+    assert reason in line
 
 
 # Outputs on demand

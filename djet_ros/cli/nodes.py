@@ -59,8 +59,8 @@ def _run(name: str, description: str, *, without_ros: str,
     parser = argparse.ArgumentParser(
         prog=name, description=description, epilog=_EPILOG.format(name=name),
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args(running.own_words())
     try:
+        parser.parse_args(running.own_words())
         return 0 if stop.is_set() else int(running.run_node(name, make, stop))
     except DjetError as error:
         return _fail(name, str(error))

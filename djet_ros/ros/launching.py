@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from launch import Substitution
 from launch.actions import DeclareLaunchArgument
 from launch.substitution import Substitution
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution

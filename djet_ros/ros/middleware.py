@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from typing import Any
 
+from djet_ros.errors import DjetError, one_line
 from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -61,12 +63,13 @@ class RosSubscription:
                  profile: Profile) -> None:
         self.topic = topic
         self._lost = self._refused = 0
-        self._subscription = node.create_subscription(
-            message_type(kind), topic, callback, _qos(profile),
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=self._note_refusal, message_lost=self._note_loss),
-            # Overrides are by topic, and a second subscription to one is told from the publisher.
-            qos_overriding_options=None if profile.latched else _OVERRIDES)
+        with _asked_for(node, topic):
+            self._subscription = node.create_subscription(
+                message_type(kind), topic, callback, _qos(profile),
+                event_callbacks=SubscriptionEventCallbacks(
+                    incompatible_qos=self._note_refusal, message_lost=self._note_loss),
+                # Overrides are by topic; a latched subscription takes after the publisher.
+                qos_overriding_options=None if profile.latched else _OVERRIDES)
 
     @property
     def profile(self) -> Profile:
@@ -131,8 +134,10 @@ class RosMiddleware:
 
     def advertise(self, topic: str, kind: str) -> RosPublisher:
         """Publish on a topic; its quality of service can be overridden by parameters."""
-        return RosPublisher(self._node.create_publisher(
-            message_type(kind), topic, _qos(DEFAULT_PROFILE), qos_overriding_options=_OVERRIDES))
+        with _asked_for(self._node, topic):
+            return RosPublisher(self._node.create_publisher(
+                message_type(kind), topic, _qos(DEFAULT_PROFILE),
+                qos_overriding_options=_OVERRIDES))
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile) -> RosSubscription:
@@ -157,6 +162,18 @@ class RosMiddleware:
     def spin(self, seconds: float) -> None:
         """Wait for something to do, at most for some time, and do it."""
         self._executor.spin_once(timeout_sec=seconds)
+
+
+@contextmanager
+def _asked_for(node: Node, topic: str) -> Iterator[None]:
+    """Say what was asked for a topic where rclpy can't make anything of it."""
+    try:
+        yield
+    except (AssertionError, RuntimeError, TypeError, ValueError) as error:
+        asked = {name: one.value for name, one
+                 in node.get_parameters_by_prefix(f'qos_overrides.{topic}').items()}
+        raise DjetError(f'{topic} can not be had with qos_overrides.{topic}.* = {asked}: '
+                        f'{one_line(error) or "a value is of another type"}') from error
 
 
 def _qos(profile: Profile) -> QoSProfile:
