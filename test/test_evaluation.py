@@ -30,6 +30,7 @@ from djet_ros.lab.summary import table_rows
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
+from djet_ros.replay.drift import drift
 import numpy as np
 import pytest
 
@@ -162,6 +163,47 @@ def test_perfect_motions_make_the_true_trajectory(road, tmp_path):
     assert np.allclose(estimated_trajectory(source, records).poses, truth, atol=1e-6)
     # Of a record with a hole, the longer part counts.
     assert len(true_trajectory(source, records[:2] + records[3:]).poses) == 5
+
+
+def test_drift_is_told_of_ways_of_over_100_metres(road, tmp_path):
+    far = tmp_path / 'sequences' / 'far'
+    shutil.copytree(road, far)
+    (tmp_path / 'poses').mkdir()
+    write_stretched(KittiSequence(road).poses, 30, tmp_path / 'poses' / 'far.txt')
+    output = tmp_path / 'results'
+    answer = djet('evaluate', road, far, '--methods', 'djet,five_point', '--presets', 'best',
+                  '--output', output)
+    assert answer.returncode == 0, answer.stderr
+    found = {row['method']: row for row in rows(output / 'drift.csv')}
+    # The name is the scene's, and the second one's is told apart.
+    assert {row['sequence'] for row in found.values()} == {'road-2'}
+    assert set(found) == {'djet', 'five_point'}
+    way = np.linalg.norm(np.diff(KittiSequence(far).poses[:, :3, 3], axis=0), axis=1).sum()
+    for method, row in found.items():
+        _, truth = read_tum(output / 'trajectories' / 'road-2' / 'ground_truth.tum')
+        _, estimate = read_tum(output / 'trajectories' / 'road-2' / f'{method}_best.tum')
+        expected = drift(truth, estimate)
+        assert int(row['longest']) == way // 100 * 100 > 0
+        assert float(row['translation_percent']) == pytest.approx(
+            expected.translation_percent, rel=1e-3)
+        assert float(row['rotation_deg_per_100m']) == pytest.approx(
+            expected.rotation_deg_per_100m, rel=1e-3)
+    least = f"{float(found['djet']['rotation_deg_per_100m']):.3f}"
+    assert f'<b>{least}</b>' in (output / 'index.html').read_text()
+    for told in ('t_rel', 'Lengths are those of the ground truth', least):
+        assert told in ' '.join(answer.stdout.split())
+
+
+def write_stretched(poses: np.ndarray, times: float, path: Path) -> None:
+    """Write poses in KITTI's format, with steps so many times as long."""
+    stretched = poses[:, :3].copy()
+    stretched[:, :, 3] *= times
+    np.savetxt(path, stretched.reshape(-1, 12))
+
+
+def test_a_short_way_has_no_drift(evaluated):
+    assert rows(evaluated / 'drift.csv') == []
+    assert 't_rel' not in (evaluated / 'index.html').read_text()
 
 
 def record(pair: int, rotation: tuple[float, ...] = (0, 0, 0),

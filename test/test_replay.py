@@ -22,6 +22,7 @@ from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
+from djet_ros.replay.drift import drift
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 import numpy as np
@@ -120,6 +121,31 @@ def test_the_summary_holds_counts_and_errors(replayed):
     for name, limit in (('rotation_error_deg', 0.5), ('translation_error_deg', 10)):
         assert set(said[name]) == {'mean', 'median', 'p95', 'max'}
         assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
+
+
+def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
+    results, _ = replayed
+    assert summary(results)['drift'] is None
+    truth = KittiSequence(folder).poses
+    truth[:, :3, 3] *= 100
+    np.savetxt(tmp_path / 'far.txt', truth[:, :3].reshape(-1, 12))
+    told = {}
+    for scale in ('none', 'ground_truth'):
+        done = djet('replay', folder, '--poses', tmp_path / 'far.txt', '--scale', scale,
+                    '--output', tmp_path / scale)
+        told[scale] = summary(tmp_path / scale)['drift']
+        _, estimate = read_tum(tmp_path / scale / 'trajectory_tum.txt')
+        expected = drift(truth, estimate)
+        assert told[scale]['rotation_deg_per_100m'] == pytest.approx(
+            expected.rotation_deg_per_100m, rel=1e-3)
+        assert (told[scale]['segments'], told[scale]['longest']) == (1, 100)
+        assert 'r_rel' in done.stdout
+        assert ('t_rel' in done.stdout) == (scale != 'none')
+    # Without a scale the lengths of the estimate mean nothing, but its rotations do.
+    assert told['none']['translation_percent'] is None
+    assert told['ground_truth']['translation_percent'] == pytest.approx(
+        expected.translation_percent, rel=1e-3)
+    assert 0 < expected.translation_percent < 10
 
 
 def test_both_trajectories_have_a_pose_for_each_frame(replayed):

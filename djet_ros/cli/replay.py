@@ -25,7 +25,8 @@ DESCRIPTION = """\
 Run a recording through the odometry and write, into one folder, the trajectory (TUM and KITTI
 formats, camera in the first camera along optical axes), an output bag, a row per image, a summary
 and a plot. Errors against ground truth are angles between true and estimated rotation, and
-between true and estimated direction of translation where the camera went at least 1 cm.
+between true and estimated direction of translation where the camera went at least 1 cm; drift
+is told per 100 m, as the KITTI benchmark has it, where the way is that long.
 """
 
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
@@ -101,4 +102,10 @@ def _table(summary: dict[str, Any]) -> Table:
         table.add_row('error in degrees', 'mean / median / p95 / max')
         table.add_row('  rotation', spread(summary['rotation_error_deg']))
         table.add_row('  direction of translation', spread(summary['translation_error_deg']))
+    if drift := summary.get('drift'):
+        table.add_row('drift over 100 m and more', f"{drift['segments']} segments, "
+                      f"to {drift['longest']} m")
+        table.add_row('  rotation (r_rel)', f"{drift['rotation_deg_per_100m']:.3f} deg per 100 m")
+        if drift['translation_percent'] is not None:
+            table.add_row('  translation (t_rel)', f"{drift['translation_percent']:.2f} %")
     return table

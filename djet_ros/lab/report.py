@@ -22,8 +22,10 @@ from djet_ros.lab.methods import Method, TITLES
 from djet_ros.lab.pairs import FAILURE, PairRecord
 from djet_ros.lab.published import TABLE_1
 from djet_ros.lab.sequences import Dataset
-from djet_ros.lab.summary import table_rows
+from djet_ros.lab.summary import drift_row, DriftRow, table_rows
 from djet_ros.lab.tables import (
+    drift_csv,
+    drift_table,
     html_table,
     latex,
     Line,
@@ -75,6 +77,10 @@ _PAGE = """\
 """
 
 
+# Trajectories of one sequence by preset and method.
+Estimates = dict[str, dict[str, StampedTrajectory]]
+
+
 @dataclass(frozen=True)
 class Picture:
     """A plot of the page: where it is, and what it shows in words."""
@@ -99,11 +105,21 @@ def write_report(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Me
     write_whole(folder / 'table1.tex', latex(tables[0]))
     write_whole(folder / 'pairs.csv', pairs_csv(records, with_change=False))
     write_whole(folder / 'timings.csv', timings_csv(records, with_change=False))
-    files = ['table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv']
-    pictures = {dataset.name: list(_pictures(folder, dataset, records)) for dataset in datasets}
+    files = ['table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv', 'drift.csv']
+    groups = {dataset.name: plots.grouped([record for record in records
+                                           if record.sequence == dataset.name])
+              for dataset in datasets}
+    trajectories = {dataset.name: _trajectories(folder, dataset, groups[dataset.name])
+                    for dataset in datasets}
+    pictures = {name: list(_pictures(folder, name, found, *trajectories[name]))
+                for name, found in groups.items()}
+    drifts = list(_drifts(trajectories))
+    write_whole(folder / 'drift.csv', drift_csv(drifts))
+    if drifts:
+        tables.append(drift_table(drifts))
     if with_evo:
         tables.append(_evo_table(folder, datasets, methods))
-        write_whole(folder / 'evo.csv', table_csv(tables[1]))
+        write_whole(folder / 'evo.csv', table_csv(tables[-1]))
         files.append('evo.csv')
     write_page(folder, 'Relative pose of two frames: evaluation', tables, pictures, methods,
                files)
@@ -120,26 +136,25 @@ def truth_file(folder: Path, sequence: str) -> Path:
     return folder / 'trajectories' / sequence / 'ground_truth.tum'
 
 
-def _pictures(folder: Path, dataset: Dataset, records: Sequence[PairRecord]) -> Iterator[Picture]:
-    groups = plots.grouped([record for record in records if record.sequence == dataset.name])
-    place, title = folder / 'plots', dataset.name
+def _pictures(folder: Path, title: str, groups: plots.Groups, truth: StampedTrajectory,
+              estimates: Estimates) -> Iterator[Picture]:
+    place = folder / 'plots'
     for kind, draw, text in (
             ('errors', plots.plot_errors_by_frame, 'error of each pair along the sequence'),
             ('cumulative', plots.plot_cumulative, 'share of pairs whose error is below a limit'),
             ('boxes', plots.plot_boxes, 'distribution of the errors by method')):
-        path = place / f'{dataset.name}_{kind}.png'
+        path = place / f'{title}_{kind}.png'
         draw(path, title, groups)
         yield Picture(path, text)
-    truth, estimates = _trajectories(folder, dataset, groups)
-    path = place / f'{dataset.name}_trajectory.png'
+    path = place / f'{title}_trajectory.png'
     plots.plot_trajectories(path, title, truth, estimates)
     yield Picture(path, 'trajectories from above')
 
 
 def _trajectories(folder: Path, dataset: Dataset, groups: plots.Groups
-                  ) -> tuple[StampedTrajectory, dict[str, dict[str, StampedTrajectory]]]:
+                  ) -> tuple[StampedTrajectory, Estimates]:
     """Integrate the motions of every method, and write them beside the ground truth."""
-    estimates: dict[str, dict[str, StampedTrajectory]] = {}
+    estimates: Estimates = {}
     for preset, methods in groups.items():
         for method, records in methods.items():
             trajectory = estimated_trajectory(dataset, records)
@@ -148,6 +163,15 @@ def _trajectories(folder: Path, dataset: Dataset, groups: plots.Groups
             truth = true_trajectory(dataset, records)
     truth.write_tum(truth_file(folder, dataset.name))
     return truth, estimates
+
+
+def _drifts(trajectories: dict[str, tuple[StampedTrajectory, Estimates]]) -> Iterator[DriftRow]:
+    for sequence, (truth, estimates) in trajectories.items():
+        for preset, methods in estimates.items():
+            for method, estimate in methods.items():
+                row = drift_row(sequence, method, preset, truth, estimate)
+                if row is not None:
+                    yield row
 
 
 def _evo_table(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method]) -> Table:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.pairs import PairRecord
+from djet_ros.replay.drift import drift
 from djet_ros.replay.pair_errors import statistics
 import numpy as np
 
@@ -35,6 +37,23 @@ class TableRow:
     ms_per_pair: float
 
 
+@dataclass(frozen=True)
+class DriftRow:
+    """
+    Drift of the trajectory that the pairs of one method make; see ``replay.drift.Drift``.
+
+    Its lengths are the truth's: translation_percent tells of directions and rotations alone.
+    """
+
+    sequence: str
+    method: str
+    preset: str
+    translation_percent: float
+    rotation_deg_per_100m: float
+    segments: int
+    longest: int
+
+
 def table_rows(records: Iterable[PairRecord]) -> list[TableRow]:
     """Summarise records by sequence, preset, change and method, in the order of their first."""
     groups: dict[tuple[str, ...], list[PairRecord]] = {}
@@ -56,6 +75,13 @@ def _row(records: Sequence[PairRecord]) -> TableRow:
         rotation['mean'], rotation['median'], rotation['p95'],
         translation['mean'], translation['median'], translation['p95'],
         hamming['mean'], ms['mean'])
+
+
+def drift_row(sequence: str, method: str, preset: str, truth: StampedTrajectory,
+              estimate: StampedTrajectory) -> DriftRow | None:
+    """Compare a trajectory with the true one; None where that is not over 100 m long."""
+    found = drift(truth.poses, estimate.poses)
+    return DriftRow(sequence, method, preset, **asdict(found)) if found else None
 
 
 def spread_of(values: Sequence[float]) -> dict[str, float]:

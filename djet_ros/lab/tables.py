@@ -13,7 +13,7 @@ from typing import Any
 from djet_ros.lab.methods import TITLES
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.published import PublishedRow
-from djet_ros.lab.summary import TableRow
+from djet_ros.lab.summary import DriftRow, TableRow
 
 PUBLISHED = 'the paper'
 
@@ -50,8 +50,16 @@ _FIGURES = (
     ('tr. median', 'translation_median_deg', 2), ('tr. p95', 'translation_p95_deg', 2),
     ('Hamming', 'hamming_mean', 2), ('failed', 'failures', 0), ('ms', 'ms_per_pair', 0))
 _TITLES = tuple(title for title, _, _ in _FIGURES)
+_DRIFT = (
+    ('tr., %', 'translation_percent', 3), ('rot., deg per 100 m', 'rotation_deg_per_100m', 3),
+    ('segments', 'segments', 0), ('longest, m', 'longest', 0))
 # Of these the least in a section is stressed.
-_STRESSED = _TITLES[:7]
+_STRESSED = {name for _, name, _ in (*_FIGURES[:7], *_DRIFT[:2])}
+_DRIFT_CAPTION = (
+    'Drift of the trajectories as the KITTI benchmark has it (t_rel, r_rel): mean error at the '
+    'end of segments of 100 to 800 m, for each metre of them. Lengths are those of the ground '
+    'truth, so that t_rel tells of directions and rotations alone. Sequences that are not over '
+    '100 m long have none.')
 
 
 def results_table(caption: str, rows: Sequence[TableRow],
@@ -70,6 +78,16 @@ def results_table(caption: str, rows: Sequence[TableRow],
         lines += [_printed_line((sequence, PUBLISHED, TITLES[row.method]), row)
                   for row in published.get(sequence, ())]
     return Table(caption, ('sequence', 'preset', 'method', *_TITLES), tuple(lines), 2, 3)
+
+
+def drift_table(rows: Sequence[DriftRow]) -> Table:
+    """Lay out drifts by sequence and preset, the least stressed."""
+    lines = [_line(row, (row.sequence, row.preset, TITLES[row.method]),
+                   [one for one in rows
+                    if (one.sequence, one.preset) == (row.sequence, row.preset)], _DRIFT)
+             for row in rows]
+    titles = (title for title, _, _ in _DRIFT)
+    return Table(_DRIFT_CAPTION, ('sequence', 'preset', 'method', *titles), tuple(lines), 2, 3)
 
 
 def ablation_table(caption: str, rows: Sequence[TableRow]) -> Table:
@@ -94,13 +112,15 @@ def _printed_line(head: tuple[str, ...], row: PublishedRow) -> Line:
                  '', number(row.hamming, 2), '', ''), foreign=True)
 
 
-def _line(row: TableRow, head: tuple[str, ...], group: Sequence[TableRow]) -> Line:
+def _line(row: TableRow | DriftRow, head: tuple[str, ...], group: Sequence[TableRow | DriftRow],
+          figures: Sequence[tuple[str, str, int]] = _FIGURES) -> Line:
     cells, bold = list(head), set()
-    for title, name, digits in _FIGURES:
+    for _, name, digits in figures:
         value = getattr(row, name)
-        if title in _STRESSED and len(group) > 1 and value == _least(group, name):
+        if name in _STRESSED and len(group) > 1 and value == _least(group, name):
             bold.add(len(cells))
-        cells.append(_share(row) if name == 'failures' else number(value, digits))
+        cells.append(_share(row) if isinstance(row, TableRow) and name == 'failures'
+                     else number(value, digits))
     return Line(tuple(cells), frozenset(bold))
 
 
@@ -108,7 +128,7 @@ def _share(row: TableRow) -> str:
     return f'{row.failures} ({100 * row.failures / row.pairs:.0f}%)' if row.failures else '0'
 
 
-def _least(group: Sequence[TableRow], name: str) -> float:
+def _least(group: Sequence[TableRow | DriftRow], name: str) -> float:
     return min((getattr(row, name) for row in group if math.isfinite(getattr(row, name))),
                default=math.nan)
 
@@ -121,6 +141,11 @@ def number(value: float, digits: int) -> str:
 def rows_csv(rows: Sequence[TableRow], *, with_change: bool) -> str:
     """Rows as CSV; the column ``change`` only where asked for."""
     return _csv([field.name for field in fields(TableRow)], map(asdict, rows), with_change)
+
+
+def drift_csv(rows: Sequence[DriftRow]) -> str:
+    """Give drifts as CSV."""
+    return _csv([field.name for field in fields(DriftRow)], map(asdict, rows))
 
 
 # Columns of pairs.csv; times stand in a file of their own, because they alone differ from run

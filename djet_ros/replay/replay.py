@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.recording import Recording
+from djet_ros.replay.drift import drift
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
@@ -161,6 +162,7 @@ class Replay:
                 translation_failures=errors.translation_failures,
                 rotation_error_deg=statistics(errors.rotation_deg),
                 translation_error_deg=statistics(errors.translation_deg))
+            summary['drift'] = log.drift(truth)
             self._folder.add_errors(pairs, errors)
         if len(log.steps) > 1:
             self._plot(truth)
@@ -196,6 +198,19 @@ class _Log:
 
     def pairs(self) -> list[Step]:
         return [step for step in self.steps if step.previous_stamp_ns is not None]
+
+    def drift(self, truth: Array) -> dict[str, float | None] | None:
+        """
+        Drift over the frames whose true pose (N, 4, 4) is known; None where the way is too short.
+
+        Without a scale, lengths mean nothing; the drift of the rotation does not need them.
+        """
+        known = np.isfinite(truth).all(axis=(1, 2))
+        found = drift(truth[known], np.array([step.pose for step in self.steps])[known])
+        if found is None:
+            return None
+        return {**asdict(found),
+                'translation_percent': found.translation_percent if self.metric else None}
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""

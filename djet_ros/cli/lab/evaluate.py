@@ -13,8 +13,8 @@ from djet_ros.lab.report import write_report
 DESCRIPTION = """\
 Estimate the relative pose of all neighbouring frames by several methods on the same matches, and
 by whole chains of other libraries (sift_poselib, klt_poselib) on the same images, compare with
-the ground truth, and write tables, plots, trajectories and index.html. A run that was broken off
-is taken up where it ended.
+the ground truth, and write tables, plots, trajectories and index.html; the drift per 100 m too,
+where the way is that long. A run that was broken off is taken up where it ended.
 """
 
 
