@@ -52,13 +52,16 @@ def test_a_point_is_most_like_itself(gray):
     assert np.abs(found.fits.minima() - found.y).max() < 0.5
 
 
-def test_a_point_is_found_again_in_a_shifted_image(gray):
+def test_points_are_found_again_in_a_shifted_image(gray):
     shifted = np.roll(gray, (2, 5), axis=(0, 1))
-    found = cross_similarity(gray, shifted, None, 4, 12, CONFIG)
-    # Keypoints of coarse pyramid levels are a pixel off; their surfaces tell by how much.
+    found = cross_similarity(gray, shifted, None, 40, 12, CONFIG)
+    assert len(found.x) == 40
+    # Keypoints of coarse sizes are a pixel off in either image; surfaces tell by how much.
     missing = np.array([5, 2]) - (found.y - found.x)
-    assert np.abs(missing).max() <= 1
-    for index, (x, y) in enumerate(missing):
+    right = np.abs(missing).max(1) <= 2
+    assert right.mean() > 0.9  # no matching of noise is free of false ones
+    for index in np.flatnonzero(right):
+        x, y = missing[index]
         assert found.surfaces[12 + y, 12 + x, index] == 0
 
 

@@ -28,8 +28,8 @@ from rich.table import Table
 from rich.text import Text
 
 # Parameters that every method shares, so that changing them keeps the comparison fair.
-SHARED_PARAMETERS = ('estimator.max_features', 'estimator.fast_threshold',
-                     'estimator.ransac_threshold')
+SHARED_PARAMETERS = ('estimator.max_features', 'estimator.corner_contrast',
+                     'estimator.fast_threshold', 'estimator.ransac_threshold')
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:

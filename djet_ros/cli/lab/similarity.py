@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--radius', type=int, default=20, metavar='PIXELS',
                         help='of the heat maps (default: %(default)s)')
     add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_features',
+                       'estimator.detector', 'estimator.corner_contrast',
                        'estimator.fast_threshold'))
 
 
