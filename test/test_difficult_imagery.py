@@ -151,8 +151,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     'brightness that rolls through the rows': partial(drive, 'road', rolling),
     '3 of 8 frames out of focus': partial(drive, 'blur'),
     'every third frame dropped': partial(drive, 'road', keep=lambda i: i % 3 != 1),
-    'dim and hazy water, particles (`fast_threshold: 7`)':
-        partial(drive, 'underwater', fast_threshold=7),
+    'dim and hazy water, particles': partial(drive, 'underwater'),
     '1 % of the matches wrong': lambda: wrong_matches(0.01),
     '50 % of the matches wrong': lambda: wrong_matches(0.5),
     'half of the image moves by itself': partial(drive, 'moving_object'),

@@ -120,8 +120,10 @@ def _similarity(gray: Gray, other: Gray, x: Pixels, y: Pixels, radius: int,
 def _matches(gray: Gray, other: Gray, config: EstimatorConfig) -> tuple[Array, Array]:
     """Match the images: x, y (N, 2) in pixels, those of the strongest keypoints first."""
     estimator = TwoViewEstimator(config)
-    # The camera does not matter for matching.
-    views: Sequence[View] = [estimator.view(image, np.eye(3)) for image in (gray, other)]
+    # Matching asks the camera only how a turn moves the image; any of ordinary width will do.
+    height, width = gray.shape
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    views: Sequence[View] = [estimator.view(image, K) for image in (gray, other)]
     x, y = estimator.match(views[0], views[1])
     if not len(x):
         raise DjetError('the two images have no match; do they show the same place?')
