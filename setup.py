@@ -59,12 +59,12 @@ setup(
         ],
         # `djet slam`
         'slam': [
-            'gtsam>=4.2.1,<5',
+            'gtsam>=4.2.1,<4.3',
         ],
         'test': [
             'colcon-common-extensions>=0.3,<0.4',
             'cyclonedds>=11.0.1,<12',
-            'gtsam>=4.2.1,<5',
+            'gtsam>=4.2.1,<4.3',
             'hypothesis>=6.98,<7',
             'pytest>=7.4,<10',
             'pytest-xdist>=3.4,<4',

@@ -101,7 +101,7 @@ class Command:
 
     @property
     def log(self) -> str:
-        """What it has written so far."""
+        """Give what it has written so far."""
         return self.path.read_text()
 
     def finish(self) -> str:

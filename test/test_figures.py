@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -150,10 +151,15 @@ def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, sai
     assert said in captured.err
 
 
+def without_screen():
+    """Give an environment in which nothing is found but Python's own modules."""
+    return {'PATH': '', 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
+
+
 def test_drawing_needs_no_screen(road, tmp_path):
     draw = ('import sys; from djet_ros.cli.main import main; '
             f'sys.exit(main(["lab", "similarity", {str(road / "image_0" / "000000.png")!r}]))')
-    answer = subprocess.run([sys.executable, '-c', draw], cwd=tmp_path, env={'PATH': ''},
+    answer = subprocess.run([sys.executable, '-c', draw], cwd=tmp_path, env=without_screen(),
                             capture_output=True, text=True, timeout=60, check=False)
     assert answer.returncode == 0, answer.stderr
     assert (tmp_path / 'similarity.png').exists()

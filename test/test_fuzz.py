@@ -1,4 +1,5 @@
-"""Whatever strangers send: a result or an error of ours in one line, and no more memory than fits.
+"""
+Whatever strangers send: a result or an error of ours in one line, and no more memory than fits.
 
 The same targets are fuzzed with coverage as a guide by ``make fuzz``.
 """

@@ -149,7 +149,7 @@ class Drive:
     def __len__(self) -> int:
         return len(self._images)
 
-    def image(self, index: int) -> Any:
+    def raw(self, index: int) -> Any:
         return self._images[index]
 
 

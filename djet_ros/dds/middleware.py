@@ -42,7 +42,7 @@ class DdsMiddleware:
 
     @property
     def node(self) -> str:
-        """Name of the node with its namespace."""
+        """Give the name of the node with its namespace."""
         return self._names.full_node
 
     def resolve(self, name: str) -> str:

@@ -62,7 +62,7 @@ class Player:
 
     @property
     def image_topic(self) -> str:
-        """Resolved name of the topic of the images."""
+        """Give the resolved name of the topic of the images."""
         return self._names.resolve(self._recording.image_topic)
 
     def wait_for_listener(self, stop: Event) -> None:

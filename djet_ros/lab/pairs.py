@@ -152,7 +152,7 @@ class _Image:
 
     @cached_property
     def smoothed(self) -> NDArray[np.uint8]:
-        """The image (H, W) as ORB's binary tests see it."""
+        """Smooth the image (H, W) as ORB's binary tests see it."""
         return smooth(self._gray)
 
 

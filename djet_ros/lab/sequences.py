@@ -49,7 +49,7 @@ class Dataset:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of frames that follow one another."""
+        """Count the pairs of frames that follow one another."""
         return len(self.frames) - 1
 
     def settings(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+import gc
 from pathlib import Path
 import resource
 import sys
@@ -63,6 +64,8 @@ def soak(frames: int, most_growth_mb: float,
         latency[number - 1] = 1e3 * (perf_counter() - before)
         status[result.status.value] += 1
         if number == bounds[len(stretches)]:
+            # What only waits for its collection is kept by nobody.
+            gc.collect()
             stretches.append({'frames': number, 'memory_mb': resident_mb(),
                               'python_blocks': sys.getallocatedblocks(),
                               **_percentiles(latency[begin:number])})

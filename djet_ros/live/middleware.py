@@ -46,7 +46,7 @@ class Publisher(Protocol):
 
     @property
     def listeners(self) -> int:
-        """Number of subscriptions."""
+        """Count the subscriptions."""
 
 
 class Subscription(Protocol):
@@ -56,7 +56,7 @@ class Subscription(Protocol):
 
     @property
     def profile(self) -> Profile:
-        """Quality of service that it asks for."""
+        """Give the quality of service that it asks for."""
 
     def new_losses(self) -> int:
         """Count the messages that were lost on the way since the last call."""
@@ -73,11 +73,11 @@ class Middleware(Protocol):
 
     @property
     def node(self) -> str:
-        """Name of the node with its namespace, as in '/left/vo_node'."""
+        """Give the name of the node with its namespace, as in '/left/vo_node'."""
 
     @property
     def message_type(self) -> MessageType:
-        """Class of messages by the name of its type."""
+        """Give the class of messages by the name of its type."""
 
     def resolve(self, name: str) -> str:
         """Give the full name of a topic or service, remapped."""

@@ -175,7 +175,7 @@ class Tracker:
 
     @property
     def detail(self) -> str:
-        """What the state is about, such as a status or a reason."""
+        """Say what the state is about, such as a status or a reason."""
         return '' if self._paused else self._detail
 
     def speed(self, message: Any) -> None:
@@ -191,7 +191,7 @@ class Tracker:
 
     @property
     def complaints(self) -> list[Complaint]:
-        """What there is to mend beside the state: what is seen, and what helps."""
+        """Say what there is to mend beside the state: what is seen, and what helps."""
         return self._health.complaints(self._scale)
 
     def diagnosis(self) -> Diagnosis:

@@ -52,7 +52,7 @@ class RosPublisher:
 
     @property
     def listeners(self) -> int:
-        """Number of subscriptions."""
+        """Count the subscriptions."""
         return int(self._publisher.get_subscription_count())
 
 
@@ -73,7 +73,7 @@ class RosSubscription:
 
     @property
     def profile(self) -> Profile:
-        """Quality of service that it asks for, after overrides."""
+        """Give the quality of service that it asks for, after overrides."""
         return _profile(self._subscription.qos_profile)
 
     def new_losses(self) -> int:
@@ -106,7 +106,7 @@ class RosMiddleware:
 
     @property
     def node(self) -> str:
-        """Name of the node with its namespace."""
+        """Give the name of the node with its namespace."""
         return str(self._node.get_fully_qualified_name())
 
     def resolve(self, name: str) -> str:
