@@ -34,6 +34,7 @@ from ros_messages import camera_info, image, serialised
 
 pytestmark = needs_dds
 
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
 RECTIFIED = '/camera/image_rect'
 FRAMES = 12
@@ -230,6 +231,31 @@ def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
     assert images.listeners == 0
 
 
+SEEN = {
+    # what is published, and what the log says of it
+    'elsewhere': ('/front/image_raw', IMAGE_TYPE,
+                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
+                  '/front/image_raw?'),
+    'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
+                   f'nobody publishes it, but {IMAGE}/compressed; set '
+                   'ros.image_transport:=compressed'),
+    'another type': (IMAGE, COMPRESSED_TYPE,
+                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
+                     'ros.image_transport:=compressed'),
+    'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
+                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
+                        '/elsewhere/camera_info?'),
+}
+
+
+@pytest.mark.parametrize('case', SEEN)
+def test_what_is_seen_instead_is_said_with_the_remedy(live, peer, case):
+    topic, kind, line = SEEN[case]
+    one = live(*FAST)
+    peer.advertise(topic, kind, listeners=0)
+    peer.wait('the log', lambda: line in one.log)
+
+
 def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
     live(*EVERY, *FAST)
     infos, images = peer.advertise(INFO, INFO_TYPE), peer.advertise(IMAGE, IMAGE_TYPE)
@@ -238,13 +264,17 @@ def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
     for i in range(2):
         images.publish(image(drive[i], stamp_ns=stamp(i)))
     peer.wait('a pair', tracked(peer, [stamp(1)]))
-    for number, (service, state) in enumerate({
-            'pause': 'paused', 'resume': 'waiting for an image',
-            'reset': 'waiting for an image'}.items()):
+    for number, (service, (said, state)) in enumerate({
+            'pause': (b'paused: images', 'paused'),
+            'resume': (b'resumed: images', 'waiting for an image'),
+            'reset': (b'reset: forgot 2 images', 'waiting for an image')}.items()):
         peer.heard['/diagnostics'].clear()
         answer = call(peer, service, number)
-        # success, and an empty text with its terminating zero
-        assert answer[:9] == struct.pack('<B3xIB', True, 1, 0)
+        # success, and a text with its length and its terminating zero
+        success, length = struct.unpack('<B3xI', answer[:8])
+        assert success
+        assert answer[8:8 + length].startswith(said)
+        assert answer[8:8 + length].endswith(b'\0')
         said = peer.wait(state, lambda state=state: peer.said(message=state))
     assert said['frames received'] == '0'
 

@@ -98,9 +98,18 @@ def test_what_is_missing_is_said_by_its_topic(live, monkeypatch):
     for _ in range(3):
         one.session.tick()
     until(lambda: one.graph.heard('/diagnostics'))
-    assert one.graph.lines == [f'warning: waiting for {what} on {TOPICS[what]}: nobody '
-                               'publishes it' for what in TOPICS if what != 'camera_info']
+    silent = [(what, topic) for what, topic in TOPICS.items() if what != 'camera_info']
+    assert one.graph.lines == [
+        f'warning: waiting for {what} on {topic}: nothing is seen of {topic}'
+        for what, topic in silent]
     assert one.graph.said()['state'] == 'waiting for odometry'
+
+
+def test_closed_loops_are_logged(live):
+    one = live(optimise_period=0.0)
+    one.drive(WAYS)
+    until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
+    until(lambda: any(f"{one.slam.map.count('loop')} in all" in line for line in one.graph.lines))
 
 
 def test_a_reset_begins_a_new_map(live):

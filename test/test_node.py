@@ -28,6 +28,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.skipif(
 
 IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
 IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 RELATIVE = f'{NODE}/relative_pose'
 TYPES = {
     RELATIVE: 'geometry_msgs/msg/PoseStamped',
@@ -198,6 +199,31 @@ def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
     wait_for_log(one, 'waiting for camera_info on /elsewhere/info: nobody publishes it')
     publisher.advertise('/elsewhere/info', INFO_TYPE)
     wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publish it, none sends')
+
+
+SEEN = {
+    # what is published, and what the log says of it
+    'elsewhere': ('/front/image_raw', IMAGE_TYPE,
+                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
+                  '/front/image_raw?'),
+    'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
+                   f'nobody publishes it, but {IMAGE}/compressed; set '
+                   'ros.image_transport:=compressed'),
+    'another type': (IMAGE, COMPRESSED_TYPE,
+                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
+                     'ros.image_transport:=compressed'),
+    'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
+                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
+                        '/elsewhere/camera_info?'),
+}
+
+
+@pytest.mark.parametrize('case', SEEN)
+def test_what_is_seen_instead_is_said_with_the_remedy(node, publisher, case):
+    topic, kind, line = SEEN[case]
+    one = node(**FAST)
+    publisher.advertise(topic, kind, listeners=0)
+    wait_for_log(one, line)
 
 
 def test_a_latched_camera_info_from_before_the_node_is_heard(
@@ -412,7 +438,8 @@ def test_pause_and_resume(node, publisher, subscriber, drive):
     camera(publisher)
     play(publisher, drive[:3])
     subscriber.wait('a pair', paired(2))
-    assert publisher.call('pause')['success']
+    assert publisher.call('pause') == {
+        'success': True, 'message': 'paused: images are dropped and counted until a resume'}
     play(publisher, drive[3:6], first=3)
     sleep(0.5)
     assert publisher.call('resume')['success']

@@ -245,9 +245,18 @@ class Graph:
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""
         return [Offer(f'participant {one.participant_key}', _ros_type(one.type_name),
-                      _profile(one.qos)) for one in self._publications.read(1000)
-                if one.topic_name == f'rt{topic}' and
-                one.sample_info.instance_state == InstanceState.Alive]
+                      _profile(one.qos)) for one in self._alive()
+                if one.topic_name == f'rt{topic}']
+
+    def published(self, ros_type: str) -> list[str]:
+        """Give the topics over which somebody sends messages of a ROS type."""
+        return sorted({one.topic_name.removeprefix('rt') for one in self._alive()
+                       if one.topic_name.startswith('rt/')
+                       and one.type_name == dds_type_name(ros_type)})
+
+    def _alive(self) -> list[Any]:
+        return [one for one in self._publications.read(1000)
+                if one.sample_info.instance_state == InstanceState.Alive]
 
 
 def _domain_id(environment: Mapping[str, str]) -> int:

@@ -78,6 +78,10 @@ class DdsMiddleware:
         """Give who publishes a topic."""
         return self._graph.offers(topic)
 
+    def published(self, kind: str) -> list[str]:
+        """Give the topics over which somebody sends messages of a ROS type."""
+        return self._graph.published(kind)
+
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
         self._services.append(TriggerServer(self._graph, self.resolve(name), action))

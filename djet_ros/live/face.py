@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from difflib import get_close_matches
 from threading import Event
 from time import monotonic
 from typing import Any, Protocol
@@ -14,6 +15,8 @@ from djet_ros.odometry.messages import seconds_and_rest
 from djet_ros.odometry.tracker import Outgoing
 
 _TICK = 1.0
+
+_IMAGE = IMAGE_TYPES['raw']
 
 
 class LiveSession(Protocol):
@@ -52,6 +55,8 @@ class Face:
         self._middleware = middleware
         self._outputs: dict[str, Publisher] = {}
         self._inputs: list[Subscription] = []
+        # ROS types of what is heard, by topic.
+        self._kinds: dict[str, str] = {}
         self._images: Subscription | None = None
         self._latched = False
         self._last_tick = -float('inf')
@@ -87,9 +92,21 @@ class Face:
         """Log a line."""
         self._middleware.log(level, text)
 
-    def count_publishers(self, topic: str) -> int:
-        """Count who publishes a topic."""
-        return len(self._middleware.offers(topic))
+    def why_silent(self, topic: str) -> str:
+        """Say what is seen of a topic over which nothing comes, and what may help."""
+        wanted = self._kinds[topic]
+        offers = self._middleware.offers(topic)
+        if kinds := {offer.kind for offer in offers} - {wanted}:
+            return f'it is published as {", ".join(sorted(kinds))}, and not as {wanted}' + (
+                _transport_remedy(kinds))
+        if offers:
+            return f'{len(offers)} publish it, none sends'
+        if _IMAGE in (wanted, *kinds) and self._middleware.offers(f'{topic}/compressed'):
+            return (f'nobody publishes it, but {topic}/compressed; set '
+                    'ros.image_transport:=compressed')
+        elsewhere = sorted(set(self._middleware.published(wanted)) - set(self._kinds))
+        near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
+        return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
 
     def wants_debug_image(self) -> bool:
         """Tell whether anybody subscribes to the debug image."""
@@ -112,6 +129,7 @@ class Face:
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile) -> Subscription:
         """Subscribe to a resolved topic; a publisher that does not fit is reported."""
+        self._kinds[topic] = kind
         self._inputs.append(self._middleware.listen(topic, kind, callback, profile))
         return self._inputs[-1]
 
@@ -152,6 +170,12 @@ class Face:
                 self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
                          f'{self._middleware.node} asks for {ours}. Nothing is received from it; '
                          'set ' + self._middleware.qos_remedy.format(topic=topic))
+
+
+def _transport_remedy(kinds: Collection[str]) -> str:
+    """Name the parameter by which images are heard that come in another transport."""
+    found = [transport for transport, kind in IMAGE_TYPES.items() if kind in kinds]
+    return f'; set ros.image_transport:={found[0]}' if found else ''
 
 
 def input_profile(config: NodeConfig) -> Profile:

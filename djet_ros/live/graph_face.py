@@ -32,10 +32,6 @@ class GraphFace(Face):
             self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH))
         self.listen_to_camera(image, info, config.ros.image_transport,
                               replace(input_profile(config.ros), depth=config.slam.image_buffer))
-        middleware.serve('~/reset', self._reset)
+        middleware.serve('~/reset', self.session.reset)
         self.log('info', f'odometry from {topics["odometry"]}, images from {image}, '
                          f'camera_info from {info}')
-
-    def _reset(self) -> str:
-        self.session.reset()
-        return ''

@@ -48,7 +48,7 @@ class GraphSession:
         self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._infos: deque[Any] = deque(maxlen=1)
         self._latencies = Latencies()
-        self._lost = 0
+        self._lost = self._loops = 0
         self._heard = dict.fromkeys(topics, -np.inf)
         self._stopping = False
         self._worker = Thread(target=self._work, name='pose_graph', daemon=True)
@@ -98,11 +98,14 @@ class GraphSession:
         """Count images that were sent and never came."""
         self._lost += number
 
-    def reset(self) -> None:
-        """Forget the map and what waits, as soon as what is in work is done."""
+    def reset(self) -> str:
+        """Forget the map and what waits, as soon as what is in work is done; says so."""
         self._queue.clear()
         self._images.clear()
         self._put(self._forget)
+        text = 'reset: the map is forgotten; a new one begins at the next frame'
+        self._wiring.log('info', text)
+        return text
 
     def tick(self) -> None:
         """Say what no message makes the graph say; to be called about once a second."""
@@ -128,12 +131,20 @@ class GraphSession:
             self._take_images()
             if task is None:
                 self._publish(self._slam.work())
+                self._log_loops()
                 continue
             self._slam.face_values = self._face_values()
             self._publish(task.do())
             self._latencies.add(task.since)
             if self._slam.problem is not None:
                 self._log.warn(type(self._slam.problem).__name__, str(self._slam.problem))
+
+    def _log_loops(self) -> None:
+        loops = self._slam.map.count('loop')
+        if loops > self._loops:
+            self._wiring.log('info', f'{loops - self._loops} loops closed, {loops} in all, among '
+                             f'{len(self._slam.map.keyframes)} keyframes')
+        self._loops = loops
 
     def _take_images(self) -> None:
         while self._infos:

@@ -101,6 +101,9 @@ class Middleware(Protocol):
     def offers(self, topic: str) -> Sequence[Offer]:
         """Give who publishes a topic, by its resolved name."""
 
+    def published(self, kind: str) -> Sequence[str]:
+        """Give the topics over which somebody sends messages of a ROS type."""
+
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger: an action that succeeds and says what it did."""
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware
@@ -34,7 +31,7 @@ class OdometryFace(Face):
         self._connect(config)
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
         for name in ('reset', 'pause', 'resume'):
-            middleware.serve(f'~/{name}', partial(_done, getattr(self.session, name)))
+            middleware.serve(f'~/{name}', getattr(self.session, name))
         self.log('info', f'images from {image}, camera_info from {info}, queue policy '
                          f'{config.ros.queue_policy}')
 
@@ -51,8 +48,3 @@ class OdometryFace(Face):
             for topic, kind in SPEED_TYPES.items():
                 self.listen(self._middleware.resolve(topic), kind, self.session.speed,
                             input_profile(config.ros))
-
-
-def _done(action: Callable[[], None]) -> str:
-    action()
-    return ''

@@ -13,6 +13,7 @@ from threading import Lock, Thread
 from time import monotonic, time_ns
 from typing import Any, NamedTuple, Protocol
 
+from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.diagnostics import LEVELS, State
@@ -46,8 +47,8 @@ class Wiring(Protocol):
     def log(self, level: str, text: str) -> None:
         """Say something to people; level is 'info' or 'warning'."""
 
-    def count_publishers(self, topic: str) -> int:
-        """Count who publishes a topic."""
+    def why_silent(self, topic: str) -> str:
+        """Say what is seen of a topic over which nothing comes."""
 
     def wants_debug_image(self) -> bool:
         """Tell whether anybody looks at the debug image."""
@@ -77,9 +78,7 @@ class Throttle:
 
     def warn_of_missing(self, what: str, topic: str) -> None:
         """Say that nothing comes over a topic."""
-        count = self._wiring.count_publishers(topic)
-        self.warn(what, f'waiting for {what} on {topic}: ' + (
-            f'{count} publish it, none sends' if count else 'nobody publishes it'))
+        self.warn(what, f'waiting for {what} on {topic}: {self._wiring.why_silent(topic)}')
 
     def clear(self) -> None:
         """Forget what was said."""
@@ -181,9 +180,10 @@ class Session:
 
     # What is asked for between two images
 
-    def reset(self) -> None:
-        """Forget all images, poses, speeds and counts, those that still wait included."""
+    def reset(self) -> str:
+        """Forget all images, poses, speeds and counts, those that wait included; says so."""
         with self._between_images():
+            processed = self._tracker.counts.processed
             # An image that has left the queue may wait for the lock just now.
             self._forgotten = monotonic()
             self._queue.clear()
@@ -193,23 +193,40 @@ class Session:
             self._counted_drops, self._lost = self._queue.dropped, 0
             self._tracker.reset()
             self._say()
+        return self._note(f'reset: forgot {processed} images and their poses; '
+                          f'{self._tracker.config.odometry.odom_frame} begins at the next image')
 
-    def pause(self) -> None:
-        """Drop and count all images until ``resume``."""
+    def pause(self) -> str:
+        """Drop and count all images until ``resume``; says so."""
         with self._between_images():
+            before = self._tracker.state is State.PAUSED
             self._tracker.pause()
             self._say()
+        return self._note('was paused already' if before
+                          else 'paused: images are dropped and counted until a resume')
 
-    def resume(self) -> None:
-        """Work on images again."""
+    def resume(self) -> str:
+        """Work on images again; says so."""
         with self._between_images():
+            before = self._tracker.state is State.PAUSED
             self._tracker.resume()
             self._say()
+        return self._note('resumed: images are worked on again' if before else 'was not paused')
 
     def configure(self, config: Config) -> None:
         """Take other parameters from the next image on; the queue stays as it was made."""
         with self._between_images():
+            before = flat(self._tracker.config)
             self._tracker.configure(config)
+        changed = [f'{item.name} = {item.value}' for item in flat(config).values()
+                   if item.value != before[item.name].value]
+        if changed:
+            self._note(f'from the next image on: {", ".join(changed)}')
+
+    def _note(self, text: str) -> str:
+        """Log what somebody asked for and got, and give it back."""
+        self._wiring.log('info', text)
+        return text
 
     @contextmanager
     def _between_images(self) -> Iterator[None]:

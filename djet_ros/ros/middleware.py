@@ -150,6 +150,11 @@ class RosMiddleware:
                       _profile(one.qos_profile))
                 for one in self._node.get_publishers_info_by_topic(topic)]
 
+    def published(self, kind: str) -> list[str]:
+        """Give the topics over which somebody sends messages of a ROS type."""
+        return [name for name, kinds in self._node.get_topic_names_and_types()
+                if kind in kinds and self._node.count_publishers(name)]
+
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
         def answer(_: Any, response: Any) -> Any:
