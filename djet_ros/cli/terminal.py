@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from rich.console import Console
 from rich.progress import (
@@ -34,9 +34,11 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[..., 
     That goes on by one without arguments, else to (done) or (done, of how many).
     """
     console = Console(stderr=True)
-    with Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), _Rate(),
-                  TimeRemainingColumn(), console=console, transient=True,
-                  disable=not console.is_terminal) as bar:
+    bar = Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), _Rate(),
+                   TimeRemainingColumn(), console=console, transient=True,
+                   disable=not console.is_terminal)
+    # A bar of rich 13 that is disabled still leaves an empty line behind where it ends.
+    with bar if console.is_terminal else nullcontext():
         task = bar.add_task(what, total=total)
 
         def move(done: int | None = None, total: int | None = None) -> None:
