@@ -11,7 +11,7 @@ from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.live import session as sessions
 from djet_ros.live.session import Session
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 import pytest
@@ -28,6 +28,8 @@ class Graph:
     def __init__(self) -> None:
         self.batches: list[list[Outgoing]] = []
         self.lines: list[str] = []
+        # What tf knows: the second frame in the first, by their names.
+        self.frames: dict[tuple[str, str], Any] = {}
         self.debug_image_wanted = False
         self.delay = 0.0
         self.broken = False
@@ -53,6 +55,9 @@ class Graph:
 
     def why_silent(self, topic: str) -> str:
         return f'nothing is seen of {topic}'
+
+    def mounting(self, base: str, camera: str) -> Any:
+        return self.frames.get((base, camera))
 
     def wants_debug_image(self) -> bool:
         return self.debug_image_wanted
@@ -387,6 +392,29 @@ def test_a_debug_image_is_drawn_only_while_somebody_looks(live, drive):
     one.wait_for_images(5)
     stamps = [stamp_ns(message.header) for message in one.graph.heard('debug_image')]
     assert stamps == [3 * PERIOD, 4 * PERIOD]
+
+
+def test_with_a_base_frame_the_odometry_is_of_the_vehicle_once_tf_knows_the_mounting(live, drive):
+    one = live(**{'odometry.base_frame': 'base_link', 'ros.publish_tf': True})
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    assert not one.graph.heard('odometry', '/tf')
+    assert len(one.graph.heard('relative_pose')) == 2
+    assert any('static_transform_publisher --frame-id base_link --child-frame-id camera' in line
+               for line in one.graph.lines)
+    mounting = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
+    one.graph.frames['base_link', 'camera'] = mounting
+    one.send(drive[3:6], first=3)
+    one.wait_for_images(6)
+    odometry, transform = (one.graph.heard(topic)[-1] for topic in ('odometry', '/tf'))
+    expected = mounting @ one.tracker.last.pose @ np.linalg.inv(mounting)
+    assert np.allclose(pose_of(odometry)[1], expected)
+    assert np.allclose(pose_of(transform.transforms[0])[1], expected)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ('odom', 'base_link')
+    assert transform.transforms[0].child_frame_id == 'base_link'
+    # the camera goes ahead, and so does the vehicle
+    assert odometry.twist.twist.linear.x > 0
+    assert one.graph.heard('relative_pose')[-1].header.frame_id == 'camera'
 
 
 def test_new_parameters_hold_from_the_next_image(live, drive):

@@ -55,6 +55,10 @@ class OdometryConfig:
     camera_frame: str = parameter(
         '', "frame id of the camera in messages; empty takes the image's own")
     odom_frame: str = parameter('odom', 'frame id in which the integrated pose is given')
+    base_frame: str = parameter(
+        '', 'frame id of the vehicle that carries the camera: its pose and velocity (x forward, y '
+        "left, z up) are then given instead of the camera's, by the mounting that tf knows (live "
+        'alone); empty gives those of the camera')
 
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""

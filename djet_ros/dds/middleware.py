@@ -7,9 +7,11 @@ import sys
 from time import monotonic, time_ns
 from typing import Any
 
+from djet_ros.core.types import Array
 from djet_ros.dds.graph import Graph, Publisher, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
+from djet_ros.errors import DjetError
 from djet_ros.live.middleware import Offer, Profile
 from djet_ros.live.topics import IMAGE_TYPES
 from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
@@ -81,6 +83,15 @@ class DdsMiddleware:
     def published(self, kind: str) -> list[str]:
         """Give the topics over which somebody sends messages of a ROS type."""
         return self._graph.published(kind)
+
+    def follow_frames(self) -> None:
+        """Refuse: without tf2 nobody knows where the frames are."""
+        raise DjetError('odometry.base_frame needs tf2, which comes with ROS: run vo_node, or '
+                        'leave it empty for the poses of the camera')
+
+    def transform(self, parent: str, child: str) -> Array | None:
+        """Know nothing."""
+        return None
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""

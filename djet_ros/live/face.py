@@ -9,6 +9,7 @@ from time import monotonic
 from typing import Any, Protocol
 
 from djet_ros.config.sections import NodeConfig
+from djet_ros.core.types import Array
 from djet_ros.live.middleware import Middleware, Profile, Publisher, Subscription
 from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 from djet_ros.odometry.messages import seconds_and_rest
@@ -112,6 +113,10 @@ class Face:
         """Tell whether anybody subscribes to the debug image."""
         output = self._outputs.get('debug_image')
         return output is not None and bool(output.listeners)
+
+    def mounting(self, base: str, camera: str) -> Array | None:
+        """Give the camera in the base frame (4, 4), or None where tf does not know it yet."""
+        return self._middleware.transform(base, camera)
 
     # Inputs and outputs
 

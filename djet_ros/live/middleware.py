@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+from djet_ros.core.types import Array
 from djet_ros.odometry.messages import MessageType
 
 
@@ -103,6 +104,12 @@ class Middleware(Protocol):
 
     def published(self, kind: str) -> Sequence[str]:
         """Give the topics over which somebody sends messages of a ROS type."""
+
+    def follow_frames(self) -> None:
+        """Hear what tf says from now on; DjetError where that can't be had."""
+
+    def transform(self, parent: str, child: str) -> Array | None:
+        """Give a frame in another (4, 4), or None where tf does not know it."""
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger: an action that succeeds and says what it did."""

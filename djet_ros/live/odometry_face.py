@@ -21,6 +21,8 @@ class OdometryFace(Face):
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
         for_a_live_graph(config)
+        if config.odometry.base_frame:
+            middleware.follow_frames()
         image, info = self.image_topics(config.ros)
         self.session: Session = Session(
             Tracker(config, middleware.message_type, image_topic=image,

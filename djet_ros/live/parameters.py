@@ -9,7 +9,7 @@ from djet_ros.errors import DjetError
 # What a subscription or the queue was made with holds for its life; and nobody who knows the odom
 # frame could follow it to other axes.
 FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
-         'ros.queue_size', 'odometry.frame_convention')
+         'ros.queue_size', 'odometry.frame_convention', 'odometry.base_frame')
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
 SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',

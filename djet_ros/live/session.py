@@ -15,8 +15,10 @@ from typing import Any, NamedTuple, Protocol
 
 from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
+from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.diagnostics import LEVELS, State
+from djet_ros.odometry.health import optical_frame
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -52,6 +54,9 @@ class Wiring(Protocol):
 
     def wants_debug_image(self) -> bool:
         """Tell whether anybody looks at the debug image."""
+
+    def mounting(self, base: str, camera: str) -> Array | None:
+        """Give the camera in the base frame (4, 4), or None where tf does not know it yet."""
 
 
 class _Received(NamedTuple):
@@ -285,11 +290,22 @@ class Session:
         self._take_info(received.info)
         while self._speeds:
             tracker.speed(self._speeds.popleft())
+        if not tracker.mounted:
+            self._mount(received.image.header.frame_id)
         self._publish(tracker.image(received.image))
         self._latencies.add(received.at)
         self._log_trouble()
         if self._wiring.wants_debug_image() and (picture := tracker.debug_image()):
             self._publish([picture])
+
+    def _mount(self, image_frame: str) -> None:
+        config = self._tracker.config.odometry
+        camera = optical_frame(config, image_frame)
+        mounting = self._wiring.mounting(config.base_frame, camera)
+        if mounting is not None:
+            self._tracker.mount(mounting)
+            x, y, z = mounting[:3, 3]
+            self._note(f'{camera} is at ({x:.3f}, {y:.3f}, {z:.3f}) m on {config.base_frame}')
 
     def _count_drops(self) -> None:
         new = self._queue.dropped - self._counted_drops

@@ -65,10 +65,11 @@ class Health:
         elif result.status in TRACKED:
             self._unknown_lengths += 1
 
-    def complaints(self, scale: ScaleSource) -> list[Complaint]:
-        """Say what there is to mend now."""
-        return [one for one in (self._stamps(), self._frame(), self._length(scale),
-                                self._load(), self._order()) if one is not None]
+    def complaints(self, scale: ScaleSource, mounted: bool) -> list[Complaint]:
+        """Say what there is to mend now; mounted: whether base_frame is known, if asked for."""
+        return [one for one in (
+            self._stamps(), self._frame(), None if mounted else self._mounting(),
+            self._length(scale), self._load(), self._order()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
         if self._equal < _IN_A_ROW or self._last is None:
@@ -82,6 +83,9 @@ class Health:
         if self._last is None:
             return None
         frame, odom = camera_frame(self._config, self._last.frame_id), self._config.odom_frame
+        if self._config.base_frame == odom:
+            return Complaint('base_frame is odom_frame', 'ERROR', (
+                f"both are called '{odom}', and no pose goes to tf; set odometry.base_frame"))
         if not self._last.frame_id and not self._config.camera_frame:
             return Complaint('no frame_id', 'WARN', (
                 'the images have no frame_id, so that nobody knows what the poses are of, and '
@@ -91,6 +95,15 @@ class Health:
                 f"the camera's frame is called '{frame}' like odometry.odom_frame, and no pose "
                 'goes to tf; set odometry.camera_frame or odometry.odom_frame'))
         return None
+
+    def _mounting(self) -> Complaint | None:
+        if self._last is None:
+            return None
+        base, camera = self._config.base_frame, optical_frame(self._config, self._last.frame_id)
+        return Complaint('no mounting on tf', 'WARN', (
+            f"tf does not know where '{camera}' is on '{base}', and there is no odometry until it "
+            'does; publish it by robot_state_publisher or by tf2_ros static_transform_publisher '
+            f'--frame-id {base} --child-frame-id {camera}'))
 
     def _length(self, scale: ScaleSource) -> Complaint | None:
         if self._unknown_lengths < _IN_A_ROW or self._last is None:
@@ -120,8 +133,16 @@ class Health:
             'and dropped; do two cameras publish on one topic?'))
 
 
+def optical_frame(config: OdometryConfig, image_frame: str) -> str:
+    """Name the frame whose mounting is looked for: that of the images, in optical axes."""
+    named = config.camera_frame if config.frame_convention == 'optical' else ''
+    return named or image_frame
+
+
 def has_frame(config: OdometryConfig, image_frame: str) -> bool:
     """Tell whether a camera has a name that can stand on tf."""
+    if config.base_frame:
+        return config.base_frame != config.odom_frame
     named = bool(image_frame or config.camera_frame)
     return named and camera_frame(config, image_frame) != config.odom_frame
 

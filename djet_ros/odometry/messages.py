@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from djet_ros.config.sections import NODE_NAME, OdometryConfig
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
+from djet_ros.odometry.mounting import pose_of_base, twist_of_base
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED
@@ -217,11 +218,17 @@ def frame_status(message: Any) -> FrameStatus:
 
 
 class Messages(MessageFactory):
-    """Makes the messages of results, too; node: name of the node that they come from."""
+    """
+    Makes the messages of results, too.
+
+    node: name of the node that they come from; mounting: (4, 4) the camera in base_frame, needed
+    for whatever is in the odom frame where a base_frame is configured.
+    """
 
     def __init__(self, message_type: MessageType, config: OdometryConfig,
-                 node: str = NODE_NAME) -> None:
+                 node: str = NODE_NAME, mounting: Array | None = None) -> None:
         super().__init__(message_type)
+        self._mounting = mounting
         self._config = config
         self._node = node
 
@@ -259,15 +266,16 @@ class Messages(MessageFactory):
 
     def odometry(self, result: OdometryResult) -> Any:
         """
-        Make the Odometry: the integrated pose, and the twist of the last pair in the camera.
+        Make the Odometry: the integrated pose, and the twist of the last pair.
 
-        The odom frame is the first camera's, along optical or body axes as configured.
+        Of the camera, or of base_frame where that is configured. The odom frame is where it
+        began: the first camera's, along optical or body axes as configured, or the first base's.
         """
-        turned, frame = self._turned(result)
-        velocity, covariance = twist(turned)
+        pose, pose_covariance, frame = self._integrated(result)
+        velocity, covariance = self._twist(result)
         return self._type('nav_msgs/msg/Odometry')(
             header=self.header(result.stamp_ns, self._config.odom_frame), child_frame_id=frame,
-            pose=self._pose_with_covariance(turned.pose, turned.pose_covariance),
+            pose=self._pose_with_covariance(pose, pose_covariance),
             twist=self._type('geometry_msgs/msg/TwistWithCovariance')(
                 twist=self._type('geometry_msgs/msg/Twist')(
                     linear=self._vector(velocity[:3]), angular=self._vector(velocity[3:])),
@@ -275,13 +283,26 @@ class Messages(MessageFactory):
 
     def pose_stamped(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the integrated pose in the odom frame."""
-        turned, _ = self._turned(result)
-        return self.pose_in(result.stamp_ns, self._config.odom_frame, turned.pose)
+        pose, _, _ = self._integrated(result)
+        return self.pose_in(result.stamp_ns, self._config.odom_frame, pose)
 
     def transform(self, result: OdometryResult) -> Any:
-        """Make the TFMessage from the odom frame to the camera."""
-        turned, frame = self._turned(result)
-        return self.frame(result.stamp_ns, self._config.odom_frame, frame, turned.pose)
+        """Make the TFMessage from the odom frame to the camera or to base_frame."""
+        pose, _, frame = self._integrated(result)
+        return self.frame(result.stamp_ns, self._config.odom_frame, frame, pose)
+
+    def _integrated(self, result: OdometryResult) -> tuple[Array, Array, str]:
+        """Pose (4, 4) in the odom frame, its covariance (6, 6), and the frame it is of."""
+        if self._mounting is None:
+            turned, frame = self._turned(result)
+            return turned.pose, turned.pose_covariance, frame
+        return *pose_of_base(result.pose, result.pose_covariance, self._mounting), \
+            self._config.base_frame
+
+    def _twist(self, result: OdometryResult) -> tuple[Array, Array]:
+        if self._mounting is None:
+            return twist(self._turned(result)[0])
+        return twist_of_base(*twist(result), self._mounting)
 
     def _turned(self, result: OdometryResult) -> tuple[OdometryResult, str]:
         return (in_convention(result, self._config.frame_convention),

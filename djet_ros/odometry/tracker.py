@@ -12,6 +12,7 @@ import math
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.core.types import Array
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
@@ -62,6 +63,7 @@ class Tracker:
         self._scale = scale or scale_source(config.odometry)
         self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale)
         self._node = node
+        self._mounting: Array | None = None
         self._messages = Messages(message_type, config.odometry, node)
         self._info: Any = None
         self._camera: Camera | None = None
@@ -109,7 +111,7 @@ class Tracker:
             self._scale = scale_source(after)
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
-        self._messages = Messages(self._message_type, after, self._node)
+        self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
         self._path = deque(self._path if before == after else (),
                            maxlen=config.ros.path_length)
@@ -154,6 +156,16 @@ class Tracker:
             return self._reject(problem, stamp)
         return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id))
 
+    @property
+    def mounted(self) -> bool:
+        """Whether all is known of the frame whose pose is asked for."""
+        return not self.config.odometry.base_frame or self._mounting is not None
+
+    def mount(self, mounting: Array) -> None:
+        """Take the camera in base_frame (4, 4); until then there is nothing in the odom frame."""
+        self._mounting = mounting
+        self._messages = Messages(self._message_type, self.config.odometry, self._node, mounting)
+
     def pause(self) -> None:
         """Drop all images until ``resume``; whatever is known by then stays known."""
         self._paused = True
@@ -192,7 +204,7 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        return self._health.complaints(self._scale)
+        return self._health.complaints(self._scale, self.mounted)
 
     def diagnosis(self) -> Diagnosis:
         """Say how the odometry is doing."""
@@ -279,8 +291,10 @@ class Tracker:
         if result.status in TRACKED:
             outgoing += [Outgoing('relative_pose', make.relative_pose(result)),
                          Outgoing('relative_pose_cov', make.relative_pose_cov(result))]
-        outgoing += [Outgoing('relative_pose_status', make.status(result)),
-                     Outgoing('odometry', make.odometry(result))]
+        outgoing.append(Outgoing('relative_pose_status', make.status(result)))
+        if not self.mounted:
+            return outgoing
+        outgoing.append(Outgoing('odometry', make.odometry(result)))
         if result.status in TRACKED or result.status in STARTED:
             if self.config.ros.publish_tf and has_frame(self.config.odometry, result.frame_id):
                 outgoing.append(Outgoing('/tf', make.transform(result)))

@@ -106,6 +106,11 @@ class StepMessages:
             return [Step(said.stamp_ns, said.status, self._turned(pose), odom_frame=frame)]
         if said.status not in TRACKED:
             return []
+        if parts.odometry.child_frame_id != parts.relative.header.frame_id:
+            raise DjetError(
+                f"the odometry is of '{parts.odometry.child_frame_id}' and the relative poses of "
+                f"'{parts.relative.header.frame_id}'; a pose graph needs both of the camera: "
+                'leave odometry.base_frame empty')
         _, motion = pose_of(parts.relative)
         if not np.isfinite(motion).all():
             raise DjetError(f'the relative pose of {said.stamp_ns} ns holds no pose')

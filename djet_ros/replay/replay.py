@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -50,7 +50,9 @@ class Replay:
         self._config = config
         self._folder = folder
         self._name = name
-        self._tracker = Tracker(config, message_type, _scale(recording, config),
+        # A recording has no tf: the poses are those of the camera.
+        of_camera = replace(config, odometry=replace(config.odometry, base_frame=''))
+        self._tracker = Tracker(of_camera, message_type, _scale(recording, config),
                                 recording.image_topic)
         self._truth = GroundTruth()
         self._log = _Log()

@@ -8,8 +8,10 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
+from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
+from djet_ros.odometry.messages import pose_of
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -22,6 +24,7 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
@@ -103,6 +106,7 @@ class RosMiddleware:
         self._node = node
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
+        self._frames: Any = None
 
     @property
     def node(self) -> str:
@@ -154,6 +158,22 @@ class RosMiddleware:
         """Give the topics over which somebody sends messages of a ROS type."""
         return [name for name, kinds in self._node.get_topic_names_and_types()
                 if kind in kinds and self._node.count_publishers(name)]
+
+    def follow_frames(self) -> None:
+        """Hear what tf says from now on; DjetError where tf2_ros is not installed."""
+        try:
+            tf2 = import_module('tf2_ros')
+        except ImportError as error:
+            raise DjetError('odometry.base_frame needs tf2_ros: apt install '
+                            f'ros-$ROS_DISTRO-tf2-ros-py ({one_line(error)})') from error
+        self._frames = tf2.Buffer()
+        self._listener = tf2.TransformListener(self._frames, self._node)
+
+    def transform(self, parent: str, child: str) -> Array | None:
+        """Give a frame in another (4, 4), the newest that is known, or None."""
+        if self._frames is None or not self._frames.can_transform(parent, child, Time()):
+            return None
+        return pose_of(self._frames.lookup_transform(parent, child, Time()))[1]
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""

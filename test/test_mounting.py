@@ -1,0 +1,58 @@
+"""The vehicle's pose and velocity, out of those of the camera that it carries."""
+
+from djet_ros.core.geometry import rotation_exp
+from djet_ros.odometry.mounting import pose_of_base, twist_of_base
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# 0.3 m ahead of the base and 1 m above it, looking ahead: z forward, x right, y down.
+AHEAD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
+
+
+def random_pose(rng, size=1.0):
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation_exp(rng.normal(size=3)), rng.normal(size=3) * size
+    return result
+
+
+def test_a_camera_that_goes_ahead_carries_its_vehicle_ahead():
+    ahead = np.eye(4)
+    ahead[2, 3] = 2.0
+    pose, _ = pose_of_base(ahead, np.eye(6), AHEAD)
+    assert np.allclose(pose[:3, 3], [2, 0, 0])
+    assert np.allclose(pose[:3, :3], np.eye(3))
+
+
+def test_a_vehicle_that_turns_on_the_spot_stays_where_it_is():
+    turned = np.eye(4)
+    turned[:3, :3] = rotation_exp(np.array([0, 0, 0.5]))
+    camera = np.linalg.inv(AHEAD) @ turned @ AHEAD
+    assert np.linalg.norm(camera[:3, 3]) > 0.1
+    pose, _ = pose_of_base(camera, np.eye(6), AHEAD)
+    assert np.allclose(pose, turned)
+    # the camera goes sideways as it turns, the base does not
+    omega = np.array([0, 0, 0.5])
+    at_camera = np.concatenate([AHEAD[:3, :3].T @ np.cross(omega, AHEAD[:3, 3]),
+                                AHEAD[:3, :3].T @ omega])
+    velocity, _ = twist_of_base(at_camera, np.eye(6), AHEAD)
+    assert np.allclose(velocity, [0, 0, 0, 0, 0, 0.5])
+
+
+def test_covariances_are_those_of_sampled_poses_and_velocities():
+    rng = np.random.default_rng(3)
+    T, pose, velocity = random_pose(rng), random_pose(rng, 5.0), rng.normal(size=6)
+    root = rng.normal(size=(6, 6)) * 1e-3
+    covariance = root @ root.T
+    here, told = pose_of_base(pose, covariance, T)
+    moving, told_of_twist = twist_of_base(velocity, covariance, T)
+    off, off_of_twist = [], []
+    for error in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
+        disturbed = pose.copy()
+        disturbed[:3, :3] = rotation_exp(error[3:]) @ pose[:3, :3]
+        disturbed[:3, 3] += error[:3]
+        there, _ = pose_of_base(disturbed, covariance, T)
+        off.append([*(there - here)[:3, 3], *Rotation.from_matrix(
+            there[:3, :3] @ here[:3, :3].T).as_rotvec()])
+        off_of_twist.append(twist_of_base(velocity + error, covariance, T)[0] - moving)
+    for samples, said in ((off, told), (off_of_twist, told_of_twist)):
+        assert np.allclose(np.cov(np.transpose(samples)), said, atol=0.05 * np.diag(said).max())
