@@ -34,14 +34,16 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.bench import bench
 from djet_ros.lab.closure import closures, summary
+from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.methods import default_methods, make_methods, Method
-from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk
+from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
 from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 from djet_ros.recordings.outputs import write_whole
+from djet_ros.replay.drift import drift
 from djet_ros.replay.pair_errors import motion_errors
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -241,7 +243,7 @@ def opened_for(job: Job, place: Path) -> list[Dataset]:
     return open_datasets(folders, Selection(end=job.frames), place)
 
 
-def by_method(datasets: Iterable[Dataset], methods: Sequence[Method]) -> list[dict[str, Any]]:
+def by_method(datasets: Sequence[Dataset], methods: Sequence[Method]) -> list[dict[str, Any]]:
     """Estimate all pairs, each by itself, and sum up by method."""
     records = [record for dataset in datasets
                for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
@@ -253,8 +255,27 @@ def by_method(datasets: Iterable[Dataset], methods: Sequence[Method]) -> list[di
                             record.translation_error_deg, record.failed) for record in own]
         found.append({'method': method.name, 'preset': method.preset, 'change': method.change,
                       **summed(outcomes),
-                      'ms': rounded(np.median([record.milliseconds for record in own]))})
+                      'ms': rounded(np.median([record.milliseconds for record in own])),
+                      **drifts(datasets, own)})
     return found
+
+
+def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[str, Any]:
+    """Give the mean drift of the ways that pairs of one method make, if one is long enough."""
+    found = []
+    for dataset in datasets:
+        own = [record for record in records if record.sequence == dataset.name]
+        one = drift(true_trajectory(dataset, own).poses,
+                    estimated_trajectory(dataset, own).poses) if own else None
+        if one:
+            found.append(one)
+    if not found:
+        return {}
+    return {'drift': {
+        'translation_percent': rounded(np.mean([one.translation_percent for one in found])),
+        'rotation_deg_per_100m': rounded(np.mean([one.rotation_deg_per_100m for one in found])),
+        'segments': sum(one.segments for one in found),
+        'longest': max(one.longest for one in found)}}
 
 
 def odometry(datasets: Iterable[Dataset]) -> dict[str, Any]:

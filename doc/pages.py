@@ -233,6 +233,17 @@ def odometry(results: Any) -> str:
                   'largest', 'failed', 'of these `OK`'), rows)
 
 
+def drift(results: Any) -> str:
+    rows = [(name, TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
+             number(one['drift']['translation_percent']),
+             number(one['drift']['rotation_deg_per_100m']),
+             f'{one["drift"]["segments"]}, to {one["drift"]["longest"]} m')
+            for name, part in sequences(results) for one in part['methods'] if 'drift' in one]
+    if not rows:
+        return 'No sequence that was measured is over 100 m long.\n'
+    return table(('', 'method', 'preset', 't_rel, %', 'r_rel, ° per 100 m', 'segments'), rows)
+
+
 def surprise(results: Any) -> str:
     rows = []
     for name, part in sequences(results):
@@ -340,7 +351,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'covariance bound': covariance_bound,
     'measured with': measured_with, 'compared': compared,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
-    'odometry': odometry, 'surprise': surprise, 'closure': closure,
+    'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height')},

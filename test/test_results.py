@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+from importlib.util import module_from_spec, spec_from_file_location
 import json
 import os
 from pathlib import Path
 import subprocess
 import sys
+from types import ModuleType
 from typing import Any
 
+from djet_ros.core.types import Status
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.sequences import open_datasets, Selection
+from djet_ros.recordings.kitti import KittiSequence
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 import yaml
 
 ROOT = Path(__file__).parents[1]
 BOUNDS = ROOT / 'doc' / 'bounds.yaml'
 SCENE = 'standstill'
+
+
+def script(name: str) -> ModuleType:
+    """Import a script of the pages."""
+    spec = spec_from_file_location(name, ROOT / 'doc' / f'{name}.py')
+    sys.modules[name] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def measure(output: Path, *words: str) -> list[str]:
@@ -64,3 +80,30 @@ def test_what_was_measured_is_taken_over_and_other_settings_begin_anew(output, t
     assert begun.read_text() == output.read_text()
     assert measure(begun, '--frames', '4') == [SCENE]
     assert json.loads(begun.read_text())['settings']['frames'] == 4
+
+
+def test_pairs_that_each_turn_too_far_drift_by_that_over_a_long_way(small_kitti, tmp_path):
+    folder, turned = small_kitti(frames=250), Rotation.from_rotvec([0, 1e-4, 0])
+    truth = KittiSequence(folder).poses
+    records = [record(i, turned * Rotation.from_matrix(motion[:3, :3]), motion[:3, 3])
+               for i, motion in enumerate(np.linalg.inv(truth[:-1]) @ truth[1:])]
+    datasets = open_datasets([folder], Selection(), tmp_path)
+    found = script('measure').drifts(datasets, records)
+    # Half a metre to a frame, and segments that begin at every tenth.
+    assert (found['drift']['segments'], found['drift']['longest']) == (5, 100)
+    assert found['drift']['rotation_deg_per_100m'] == pytest.approx(np.degrees(0.02), rel=0.01)
+    # A step of 0.5 m after k turns of 1e-4 lies 5e-5 k m off: 1 m after 200 of them.
+    assert found['drift']['translation_percent'] == pytest.approx(1.0, rel=0.02)
+    assert script('measure').drifts(datasets, records[:190]) == {}
+    one = {'method': 'rpe', 'preset': 'best', **found}
+    page = script('pages').drift({'parts': {'kitti 07': {'methods': [one]}}})
+    assert '| KITTI 07 | RP-E | best | 0.' in page
+    assert '| 1.1' in page
+    assert page.endswith(' | 5, to 100 m |\n')
+
+
+def record(pair: int, rotation: Rotation, way: np.ndarray) -> PairRecord:
+    """Give what a method made of a pair of sequence 07."""
+    return PairRecord('07', pair, pair, pair + 1, 'rpe', 'best', '', Status.OK.value, 99, 90,
+                      False, 0.1, 0.1, 20.0, tuple(rotation.as_rotvec().tolist()),
+                      tuple((way / np.linalg.norm(way)).tolist()), 50.0)
