@@ -17,6 +17,7 @@ import cv2
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
@@ -576,6 +577,37 @@ def test_path_transform_and_debug_image_come_on_demand(
     subscriber.wait('a pair', paired(5))
     assert len(viewer.heard[f'{NODE}/debug_image']) == 3
     viewer.close()
+
+
+def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_parent(
+        node, publisher, subscriber, drive):
+    pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    one = node(**EVERY, **{'odometry.base_frame': 'base_link', 'ros.publish_tf': True})
+    camera(publisher)
+    listener = Peer('listener')
+    listener.listen('/tf', 'tf2_msgs/msg/TFMessage')
+    play(publisher, drive[:3])
+    subscriber.wait('pairs', paired(2))
+    wait_for_log(one, "tf does not know where 'camera' is on 'base_link'")
+    assert not subscriber.heard[f'{NODE}/odometry']
+    mounting = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
+    publisher.advertise('/tf_static', 'tf2_msgs/msg/TFMessage', durability='transient_local',
+                        depth=1)
+    publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', mounting))
+    sleep(0.5)
+    play(publisher, drive[3:6], first=3)
+    listener.wait('the vehicle', lambda heard: len(heard['/tf']) == 3)
+    frames = {(one.header.frame_id, one.child_frame_id) for message in listener.heard['/tf']
+              for one in message.transforms}
+    assert frames == {('odom', 'base_link')}
+    odometry = subscriber.heard[f'{NODE}/odometry'][-1]
+    assert odometry.child_frame_id == 'base_link'
+    # it drives ahead, and keeps to the plane on which it drives
+    position = odometry.pose.pose.position
+    assert position.x > 0.5
+    assert abs(position.z) < 0.2 * position.x
+    assert odometry.twist.twist.linear.x > 0
+    listener.close()
 
 
 def test_speeds_on_the_graph_give_the_length(node, publisher, subscriber, drive):
