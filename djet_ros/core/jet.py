@@ -192,26 +192,6 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
     return Solution(R, t, cost, residuals)
 
 
-def cost_in_front(problem: JetProblem, solution: Solution, loss: Loss) -> float:
-    """
-    Sum up the loss where points also have to lie in front of both cameras.
-
-    Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
-    before that pay for their way to it. Taken is the sign of t that costs less.
-    """
-    R, t = solution.R, solution.t
-    m = R @ problem.rays_x
-    ahead = m[2] > 0
-    infinite = m[:2] / np.where(ahead, m[2], 1.0)
-    a1, a2 = along = t[:2, None] - infinite * t[2]
-    s11, s12, s22 = problem.spread
-    variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
-    way = ((problem.rays_y[:2] - infinite) * along).sum(0) / np.sqrt(np.maximum(variance, 1e-24))
-    r, sign = solution.residuals.r, solution.residuals.sign
-    return min(float((sign * loss(r**2 + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum())
-               for w in (way, -way))
-
-
 def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
     """Move a pose by a step (5,): rotation vector in rad from the left, then along the sphere."""
     return rotation_exp(step[:3]) @ R, unit(t + tangents @ step[3:])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
@@ -16,7 +16,6 @@ from djet_ros.core.geometry import (
     stretches,
 )
 from djet_ros.core.jet import (
-    cost_in_front,
     epipolar_residuals,
     jet_problem,
     JetProblem,
@@ -27,6 +26,7 @@ from djet_ros.core.jet import (
     Solution,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
+from djet_ros.core.sketch import costs_in_front, refine_all, Sketch
 from djet_ros.core.starts import thinned
 from djet_ros.core.surfaces import ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
@@ -91,7 +91,7 @@ class Track:
 
     def scale(self) -> float:
         """Give the robust standard deviation of the residuals, in pixels of a typical surface."""
-        return _scale(self.residuals)
+        return _scale(self.residuals.r)
 
     def inliers(self) -> NDArray[np.bool_]:
         """(N,) bool mask of the matches that voted and agree with the pose."""
@@ -179,32 +179,37 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
               prior: Pose | None) -> tuple[Solution, Loss]:
     """Refine the most promising starts, and the cheapest of them to the end."""
-    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
-    scale = min(_scale(epipolar_residuals(some, s.R, s.t)) for s in starts)
-    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
-    if len(starts) > 1 and len(problem.blur) > TUNING.few_matches:
-        starts = _promising([_refined(some, s, tight, TUNING.steps_to_sketch) for s in starts])
-    refined = [_refined(problem, s, tight, TUNING.steps_to_compare) for s in starts]
-    best = min(refined, key=lambda solution: solution.cost)
-    if prior is not None:
-        undecided = best.cost + TUNING.undecided * _scale(best.residuals)**2
-        best = min((solution for solution in refined if solution.cost < undecided),
-                   key=lambda solution: _apart(prior, _pose(solution)))
-    loss = Loss(config.loss, config.loss_scale * _scale(best.residuals))
+    if len(starts) == 1:
+        best, scale = starts[0], _scale(epipolar_residuals(problem, starts[0].R, starts[0].t).r)
+    else:
+        best, scale = _right_basin(problem, starts, config, prior)
+    loss = Loss(config.loss, config.loss_scale * scale)
     return minimise(problem, best.R, best.t, loss), loss
 
 
-def _refined(problem: JetProblem, start: Pose, loss: Loss, steps: int) -> Solution:
-    """Make some steps; the cost of where they end is that of points in front of the cameras."""
-    solution = minimise(problem, start.R, start.t, loss, steps)
-    return replace(solution, cost=cost_in_front(problem, solution, loss))
+def _right_basin(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
+                 prior: Pose | None) -> tuple[Pose, float]:
+    """Choose among starts by what they come to; also gives the scale of the residuals there."""
+    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
+    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), TUNING.least_scale)
+    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+    if len(problem.blur) > TUNING.few_matches:
+        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight)
+    refined = refine_all(problem, starts, tight, TUNING.steps_to_compare)
+    costs, scales = costs_in_front(problem, refined, tight), refined.scales()
+    best = int(costs.argmin())
+    if prior is not None:
+        undecided = costs[best] + TUNING.undecided * max(scales[best], TUNING.least_scale)**2
+        best = min(np.flatnonzero(costs < undecided).tolist(),
+                   key=lambda number: _apart(prior, refined.pose(number)))
+    return refined.pose(best), max(float(scales[best]), TUNING.least_scale)
 
 
-def _promising(sketched: list[Solution]) -> list[Pose]:
+def _promising(problem: JetProblem, sketch: Sketch, loss: Loss) -> list[Pose]:
     """Choose the cheapest poses that lie in different basins."""
     chosen: list[Pose] = []
-    for solution in sorted(sketched, key=lambda solution: solution.cost):
-        pose = _pose(solution)
+    for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
+        pose = sketch.pose(number)
         if all(_apart(other, pose) > TUNING.same_basin for other in chosen):
             chosen.append(pose)
     return chosen[:TUNING.refined_starts]
@@ -214,8 +219,8 @@ def _pose(solution: Solution) -> Pose:
     return Pose(solution.R, solution.t)
 
 
-def _scale(residuals: Residuals) -> float:
-    return max(robust_scale(residuals.r), TUNING.least_scale)
+def _scale(residuals: Array) -> float:
+    return max(robust_scale(residuals), TUNING.least_scale)
 
 
 def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:

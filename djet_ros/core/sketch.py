@@ -1,0 +1,163 @@
+"""
+Many starting poses refined side by side: the problem of ``jet`` for all of them in one product.
+
+An epipolar residual is linear in the essential matrix, e = y*^T E x = vec(x y*^T) . vec(E), and so
+are its derivatives in those of E. One product of the matches' (9, N) with the (S, 6, 9) of all
+starts gives what a Gauss-Newton step needs. The variances g^T A'^-1 g are held during a step,
+which costs it little on the way to a basin; ``jet.minimise`` goes on exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
+from djet_ros.core.jet import JetProblem, Loss, robust_scale
+from djet_ros.core.types import Array, Pose
+import numpy as np
+from numpy.typing import NDArray
+
+# The generators of rotations, (3, 3, 3): [e_i]_x.
+_GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+
+_DAMPING_AT_FIRST = 1e-4
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """
+    Poses R (S, 3, 3), t (S, 3) with their summed losses (S,).
+
+    r, sign (S, N): residuals, and the signs of curvature with which their losses count.
+    """
+
+    R: Array
+    t: Array
+    costs: Array
+    r: Array
+    sign: Array
+
+    def __len__(self) -> int:
+        return len(self.R)
+
+    def pose(self, number: int) -> Pose:
+        """Give one of the poses."""
+        return Pose(self.R[number], self.t[number])
+
+    def scales(self) -> Array:
+        """Give the robust standard deviations (S,) of the residuals."""
+        return np.array([robust_scale(r) for r in self.r])
+
+
+@dataclass(frozen=True)
+class _Expansion:
+    """Second-order expansions of S losses: costs (S,), H (S, 5, 5), gradients (S, 5)."""
+
+    costs: Array
+    H: Array
+    gradient: Array
+    tangents: Array
+    r: Array
+    sign: Array
+
+
+def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: int) -> Sketch:
+    """
+    Make some Levenberg-Marquardt steps from each of some poses, side by side.
+
+    Each is judged by itself and never ends above the cost of its start.
+    """
+    R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
+    products = _products(problem)
+    here = _expand(problem, products, R, t, loss)
+    damping = np.full(len(R), _DAMPING_AT_FIRST)
+    for _ in range(steps):
+        R_new, t_new = _moved(R, t, here.tangents, _damped_steps(here, damping))
+        there = _expand(problem, products, R_new, t_new, loss)
+        better = there.costs < here.costs
+        damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
+        R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
+            better, there, here)
+    return Sketch(R, t, here.costs, here.r, here.sign)
+
+
+def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
+    """
+    Sum up losses (S,) where points also have to lie in front of both cameras.
+
+    Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
+    before that pay for their way to it. Taken is the sign of t that costs less.
+    """
+    t = sketch.t[:, :, None]
+    m = sketch.R @ problem.rays_x
+    ahead = m[:, 2] > 0
+    infinite = m[:, :2] / np.where(ahead, m[:, 2], 1.0)[:, None]
+    along = t[:, :2] - infinite * t[:, 2:]
+    a1, a2 = along[:, 0], along[:, 1]
+    s11, s12, s22 = problem.spread
+    variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
+    way = ((problem.rays_y[:2] - infinite) * along).sum(1) / np.sqrt(np.maximum(variance, 1e-24))
+    squared = sketch.r**2
+    return np.minimum(*(np.asarray(sketch.sign * loss(
+        squared + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum(1) for w in (way, -way)))
+
+
+def _products(problem: JetProblem) -> Array:
+    """Entries (9, N) of x y*^T in the order of an essential matrix's rows."""
+    return np.asarray((problem.rays_y[:, None] * problem.rays_x[None]).reshape(9, -1))
+
+
+def _expand(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss) -> _Expansion:
+    """Expand the losses at all poses, with the variances of their residuals held."""
+    tangents = np.array([sphere_tangents(one) for one in t])
+    across = _skew(t)
+    E = across @ R
+    by_rotation = across[:, None] @ (_GENERATORS @ R[:, None])
+    by_direction = _skew(tangents.transpose(0, 2, 1)) @ R[:, None]
+    stack = np.concatenate([E[:, None], by_rotation, by_direction], axis=1)
+    values = (stack.reshape(-1, 9) @ products).reshape(len(R), 6, -1)
+    e, J = values[:, 0], values[:, 1:]
+    l1, l2 = (E[:, :2].transpose(1, 0, 2).reshape(-1, 3) @ problem.rays_x).reshape(2, len(R), -1)
+    s11, s12, s22 = problem.spread
+    variance = (s11 * l1 + 2 * s12 * l2) * l1 + s22 * l2 * l2
+    sign = np.where(variance < 0, -1.0, 1.0)
+    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
+    squared = e * e / size
+    losses, weights = loss(squared)
+    weights = weights / size
+    weighted = J * weights[:, None]
+    return _Expansion((sign * losses).sum(1), weighted @ J.transpose(0, 2, 1),
+                      (weighted @ (sign * e)[..., None])[..., 0], tangents,
+                      e / np.sqrt(size), sign)
+
+
+def _damped_steps(here: _Expansion, damping: Array) -> Array:
+    """Damped Gauss-Newton steps (S, 5); none where a start has nothing to go by."""
+    diagonal = here.H.diagonal(axis1=1, axis2=2)
+    usable = np.asarray(np.isfinite(here.H).all((1, 2)) & diagonal.any(1))
+    ridge = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True)
+    H = np.where(usable[:, None, None], here.H + ridge[:, :, None] * np.eye(5), np.eye(5))
+    gradient = np.where(usable[:, None], here.gradient, 0.0)
+    return np.asarray(-np.linalg.solve(H, gradient[..., None])[..., 0])
+
+
+def _moved(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
+    """Move poses by steps (S, 5), as ``jet.moved`` does one."""
+    turned = np.array([rotation_exp(step[:3]) for step in steps]) @ R
+    return turned, unit(t + (tangents @ steps[:, 3:, None])[..., 0])
+
+
+def _chosen(better: NDArray[np.bool_], there: _Expansion, here: _Expansion) -> _Expansion:
+    return _Expansion(*(_where(better, getattr(there, name), getattr(here, name))
+                        for name in ('costs', 'H', 'gradient', 'tangents', 'r', 'sign')))
+
+
+def _where(better: NDArray[np.bool_], there: Array, here: Array) -> Array:
+    """Take from one array (S, …) or the other."""
+    return np.where(better.reshape(-1, *(1,) * (there.ndim - 1)), there, here)
+
+
+def _skew(v: Array) -> Array:
+    """Cross-product matrices [v]_x (…, 3, 3) of vectors (…, 3)."""
+    return np.asarray(v @ _GENERATORS.reshape(3, 9)).reshape(*v.shape, 3)
