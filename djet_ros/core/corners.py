@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 # How many times smaller the image is made for corners of each size, and their shares of all.
 _SIZES = ((1.0, 0.5), (1.44, 0.3), (2.07, 0.2))
 
-# Side of the block, in pixels, over which gradients are collected.
-_BLOCK = 7
+# Side of the block, in each second pixel, over which gradients are collected.
+_BLOCK = 3
 
 # Least share of the smaller eigenvalue in the larger one; the rest are edges.
 _LEAST_RATIO = 0.1
 
-# Corners are the strongest of all pixels that are so near, in pixels each way.
-_APART = 3
+# Corners are the strongest of all that are so near, in each second pixel each way: those of the
+# wider surroundings come first, and the others where there are not enough.
+_APART, _AT_LEAST_APART = 2, 1
 
 # The strongest of each cell of this side, in pixels, come first, then the second, and so on.
 _CELL = 40
@@ -50,35 +51,43 @@ def detect_corners(gray: Image, max_features: int, contrast: float) -> Features:
 
 
 def corner_slopes(image: Image) -> NDArray[np.float32]:
-    """Mean square slope (H, W) of a block in its weakest direction, per pixel; 0 on edges."""
+    """
+    Mean square slopes of blocks in their weakest direction, per pixel; 0 on edges.
+
+    Gives ((H + 1) // 2, (W + 1) // 2): of each second pixel, which takes a third of the time.
+    """
     dx, dy = cv2.spatialGradient(image)
-    # Into as little new memory as can be: fresh pages cost more than the sums.
     xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))
                   for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     trace = xx + yy
-    xx -= yy
-    xy *= 2
-    spread = cv2.magnitude(xx, xy, xx)
-    least = np.subtract(trace, spread, out=yy)
-    most = np.add(trace, spread, out=trace)
-    most *= np.float32(_LEAST_RATIO)
-    least *= least >= most
+    spread = cv2.magnitude(xx - yy, 2 * xy)
+    least, most = trace - spread, trace + spread
+    least *= least >= np.float32(_LEAST_RATIO) * most
     least *= np.float32(0.5 / _SOBEL**2)
     return np.asarray(least, np.float32)
 
 
 def _over_block(products: NDArray[Any]) -> NDArray[np.float32]:
-    return np.asarray(cv2.boxFilter(products, -1, (_BLOCK, _BLOCK), products), np.float32)
+    """Means over blocks around each second pixel."""
+    height, width = products.shape
+    halved = cv2.resize(products, ((width + 1) // 2, (height + 1) // 2),
+                        interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.boxFilter(halved, -1, (_BLOCK, _BLOCK)), np.float32)
 
 
-def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int) -> NDArray[np.int64]:
-    """Choose, in order, at most so many of (N, 2) points: the best of each cell before others."""
-    cells = (points // _CELL) @ np.array([1, 2**20])
+def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int,
+               first: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """
+    Choose, in order, at most so many of (N, 2) points: the best of each cell before others.
+
+    first: (N,) bool mask of points that come before all others.
+    """
+    cells = (points // _CELL) @ np.array([1, 2**20]) * 2 + ~first
     order = np.lexsort((-strengths, cells))
-    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    _, begin, count = np.unique(cells[order], return_index=True, return_counts=True)
     rank = np.empty(len(points), np.int64)
-    rank[order] = np.arange(len(points)) - np.repeat(first, count)
-    return np.asarray(np.sort(np.lexsort((-strengths, rank))[:most]))
+    rank[order] = np.arange(len(points)) - np.repeat(begin, count)
+    return np.asarray(np.sort(np.lexsort((-strengths, rank, ~first))[:most]))
 
 
 def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
@@ -87,12 +96,14 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
     width, height = (max(1, round(side / scale)) for side in gray.shape[::-1])
     image = gray if scale == 1 else np.asarray(cv2.resize(gray, (width, height)), np.uint8)
     slopes = corner_slopes(image)
-    near = np.ones((2 * _APART + 1, 2 * _APART + 1), np.uint8)
-    rows, columns = np.nonzero((slopes == cv2.dilate(slopes, near)) & (slopes > contrast**2))
-    points = np.stack([columns, rows], axis=1)
-    points = points[describable(points, image.shape)]
-    strengths = slopes[points[:, 1], points[:, 0]]
-    chosen = spread_out(points, strengths, most)
+    lonely, peaks = (slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8))
+                     for side in (2 * _APART + 1, 2 * _AT_LEAST_APART + 1))
+    rows, columns = np.nonzero(peaks & (slopes > contrast**2))
+    places = 2 * np.stack([columns, rows], axis=1)
+    inside = describable(places, image.shape)
+    points, strengths = places[inside], slopes[rows, columns][inside]
+    first = lonely[rows, columns][inside]
+    chosen = spread_out(points, strengths, most, first)
     points, strengths = points[chosen], strengths[chosen]
     descriptors = dense_descriptors(smooth(image), points)
     zoom = np.array(gray.shape[::-1]) / (width, height)

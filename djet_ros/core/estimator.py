@@ -21,7 +21,7 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.parallel import both
-from djet_ros.core.prediction import predict
+from djet_ros.core.prediction import predict, reach_of
 from djet_ros.core.starts import five_point, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorSurface,
@@ -37,6 +37,9 @@ from numpy.typing import NDArray
 # Bits that differ between the descriptors of matches beyond which they are no better than chance:
 # 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
 _CHANCE_BITS = 112
+
+# Share of the inliers of the pair before that near matches have to come to.
+_ENOUGH = 0.8
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -86,7 +89,11 @@ class TwoViewEstimator:
             radius = self.config.search_radius * max(current.gray.shape)
             known = [prior.R] if prior is not None else []
             turned = replace(there, points=predict(there, here, current.K, known, radius))
-            matches = match_nearby(turned, here, radius)
+            # As far as the motion before took them; and widely, where that finds too few.
+            near = reach_of(prior, current.K) if prior is not None else radius
+            matches = match_nearby(turned, here, min(near, radius))
+            if prior is not None and near < radius and len(matches) < _ENOUGH * prior.inliers.sum():
+                matches = match_nearby(turned, here, radius)
         return there.points[matches[:, 0]], here.points[matches[:, 1]]
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Features of the previous image that are compared at once; bounds the memory of a comparison.
-_STRIP = 128
+_STRIP = 64
 
 # How many octaves of ORB's pyramid a feature may change: one more is a factor of 1.2 in size.
 _OCTAVES = 1

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from djet_ros.core.features import factor
 from djet_ros.core.geometry import rays, unit
-from djet_ros.core.types import Array, Features
+from djet_ros.core.types import Array, Features, RelativePose
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +15,12 @@ _COMPARED = 400
 
 # Rotations that are tried, each from two of their matches.
 _SAMPLES = 300
+
+# The few that moved farthest are near, or false.
+_NEARLY_ALL = 0.98
+
+# Pixels by which the predicted turn may be off.
+_ROOM = 20.0
 
 
 def predict(previous: Features, current: Features, K: Array, known: Sequence[Array],
@@ -29,6 +35,18 @@ def predict(previous: Features, current: Features, K: Array, known: Sequence[Arr
     turned = rays(K, previous.points) @ (K @ R).T
     # What is turned to behind the camera is far out of the image.
     return np.asarray(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3))
+
+
+def reach_of(motion: RelativePose, K: Array) -> float:
+    """
+    Tell how far from where the turn alone would bring them the inliers of a motion were seen.
+
+    In pixels, with room for a camera that goes on twice as fast; for the pair after it.
+    """
+    x, y = motion.x[motion.inliers], motion.y_opt[motion.inliers]
+    turned = rays(K, x) @ (K @ motion.R).T
+    ways = np.linalg.norm(turned[:, :2] / turned[:, 2:] - y, axis=1)
+    return _ROOM + 2 * float(np.quantile(ways, _NEARLY_ALL)) if len(ways) else np.inf
 
 
 def likely_rotation(previous: Features, current: Features, K: Array, known: Sequence[Array],
