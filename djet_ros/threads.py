@@ -1,8 +1,12 @@
-"""How many threads the programs take; to be called before NumPy is imported."""
+"""How the programs use threads and memory; to be called before NumPy is imported."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+
+# Parameters of glibc's mallopt: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, in bytes.
+_LARGEST_KEPT, _MOST_KEPT = -3, -1
 
 VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
@@ -16,3 +20,16 @@ def one_blas_thread() -> None:
     """
     for variable in VARIABLES:
         os.environ.setdefault(variable, '1')
+
+
+def keep_freed_memory() -> None:
+    """
+    Have the C library keep what one frame has freed for the next, where it is glibc.
+
+    It gives arrays of some size back to the system at once, and fresh pages for the same arrays of
+    each frame took a fifteenth of the time. Programs hold up to 256 MB more for it.
+    """
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
+    if mallopt is not None:
+        mallopt(_LARGEST_KEPT, 1 << 26)
+        mallopt(_MOST_KEPT, 1 << 28)

@@ -9,7 +9,7 @@ import signal
 import sys
 from threading import Event
 
-from djet_ros.threads import one_blas_thread
+from djet_ros.threads import keep_freed_memory, one_blas_thread
 
 _EPILOG = """\
 Topics, parameters and the rest are given as to every ROS node:
@@ -39,6 +39,7 @@ def _run(name: str, description: str, *, without_ros: str,
     where ROS is missing; extra: a library that it needs, and the extra that brings it.
     """
     one_blas_thread()
+    keep_freed_memory()
     stop = Event()
     # First of all: the imports take their time, and end no worse than anything later.
     for number in (signal.SIGINT, signal.SIGTERM):

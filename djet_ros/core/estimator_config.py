@@ -55,7 +55,7 @@ class EstimatorConfig:
         24.0, 'difference in gray levels from which on a binary test of a surface is decided; '
         'below it counts by degrees; 0 takes bits, as ORB does', minimum=0.0, maximum=120.0)
     binary_tests: int = parameter(
-        128, "how many of ORB's 256 binary tests a surface compares; ORB ranks them by how much "
+        96, "how many of ORB's 256 binary tests a surface compares; ORB ranks them by how much "
         'they add', minimum=16, maximum=256)
     snap_reference: bool = parameter(
         True, 'take geometry from the whole pixel at which the reference descriptor was sampled')

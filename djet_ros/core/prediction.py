@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Features of the largest size that are compared with all of their size, wherever they are.
-_COMPARED = 400
+_COMPARED = 250
 
 # Rotations that are tried, each from two of their matches.
 _SAMPLES = 300
@@ -41,12 +41,12 @@ def reach_of(motion: RelativePose, K: Array) -> float:
     """
     Tell how far from where the turn alone would bring them the inliers of a motion were seen.
 
-    In pixels, with room for a camera that goes on twice as fast; for the pair after it.
+    In pixels, with room for a camera that goes on half as fast again; for the pair after it.
     """
     x, y = motion.x[motion.inliers], motion.y_opt[motion.inliers]
     turned = rays(K, x) @ (K @ motion.R).T
     ways = np.linalg.norm(turned[:, :2] / turned[:, 2:] - y, axis=1)
-    return _ROOM + 2 * float(np.quantile(ways, _NEARLY_ALL)) if len(ways) else np.inf
+    return _ROOM + 1.5 * float(np.quantile(ways, _NEARLY_ALL)) if len(ways) else np.inf
 
 
 def likely_rotation(previous: Features, current: Features, K: Array, known: Sequence[Array],
