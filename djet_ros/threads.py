@@ -27,9 +27,9 @@ def keep_freed_memory() -> None:
     Have the C library keep what one frame has freed for the next, where it is glibc.
 
     It gives arrays of some size back to the system at once, and fresh pages for the same arrays of
-    each frame took a fifteenth of the time. Programs hold up to 256 MB more for it.
+    each frame took a fifteenth of the time. Programs hold up to 64 MB more for it.
     """
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:
         mallopt(_LARGEST_KEPT, 1 << 26)
-        mallopt(_MOST_KEPT, 1 << 28)
+        mallopt(_MOST_KEPT, 1 << 26)

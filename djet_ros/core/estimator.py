@@ -92,7 +92,8 @@ class TwoViewEstimator:
             # As far as the motion before took them; and widely, where that finds too few.
             near = reach_of(prior, current.K) if prior is not None else radius
             matches = match_nearby(turned, here, min(near, radius))
-            if prior is not None and near < radius and len(matches) < _ENOUGH * prior.inliers.sum():
+            if (prior is not None and near < radius
+                    and len(matches) < _ENOUGH * prior.inliers.sum()):
                 matches = match_nearby(turned, here, radius)
         return there.points[matches[:, 0]], here.points[matches[:, 1]]
 

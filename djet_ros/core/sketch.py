@@ -99,8 +99,9 @@ def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
     variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
     way = ((problem.rays_y[:2] - infinite) * along).sum(1) / np.sqrt(np.maximum(variance, 1e-24))
     squared = sketch.r**2
-    return np.minimum(*(np.asarray(sketch.sign * loss(
-        squared + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum(1) for w in (way, -way)))
+    forward, backward = ((sketch.sign * loss(
+        squared + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum(1) for w in (way, -way))
+    return np.asarray(np.minimum(forward, backward))
 
 
 def _products(problem: JetProblem) -> Array:
