@@ -279,6 +279,17 @@ def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
     assert said['frames received'] == '0'
 
 
+def test_a_request_of_another_middleware_is_said_and_changes_nothing(live, peer):
+    one = live(*FAST)
+    requests = peer.graph.advertise_raw(
+        f'rq{NODE}/pauseRequest', 'std_srvs::srv::dds_::Trigger_Request_', Profile(), '')
+    peer.wait('the service', lambda: requests.listeners)
+    requests.send(b'\0\1\0\0\0')
+    peer.wait('the log', lambda: 'a request for /vo_node/pause came in the form of another '
+              'middleware' in one.log)
+    assert not peer.said(message='paused')
+
+
 def test_diagnostics_follow_simulated_time(live, start, peer, bag):
     live(*EVERY, *FAST, '-p', 'use_sim_time:=true', topic=RECTIFIED)
     start('play', bag, '--clock', '--rate', '10').finish()

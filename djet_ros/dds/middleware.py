@@ -95,7 +95,8 @@ class DdsMiddleware:
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
-        self._services.append(TriggerServer(self._graph, self.resolve(name), action))
+        self._services.append(TriggerServer(self._graph, self.resolve(name), action,
+                                            self._note_garbage))
 
     def spin(self, seconds: float) -> None:
         """Wait for messages, at most for some time, and hand them out."""

@@ -25,10 +25,17 @@ _PATIENCE = 0.1
 
 
 class TriggerServer:
-    """Calls an action on each request, and answers that it succeeded and what it did."""
+    """
+    Calls an action on each request, and answers that it succeeded and what it did.
 
-    def __init__(self, graph: Graph, name: str, action: Callable[[], str]) -> None:
+    complain is told of requests that can't be answered, and why.
+    """
+
+    def __init__(self, graph: Graph, name: str, action: Callable[[], str],
+                 complain: Callable[[str], None]) -> None:
+        self._name = name
         self._action = action
+        self._complain = complain
         # By this a client knows that both topics belong to one server.
         own = f'serviceid={".".join(f"{byte:x}" for byte in secrets.token_bytes(16))};'
         profile = Profile(depth=10)
@@ -39,6 +46,10 @@ class TriggerServer:
     def _serve(self, data: bytes, info: Any) -> None:
         header = data[_HEADER]
         if len(header) < 16:
+            # Of others, what tells one request from another is nowhere that Cyclone shows.
+            self._complain(f'a request for {self._name} came in the form of another middleware, '
+                           'and can not be answered; call it with '
+                           'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp')
             return
         text = self._action().encode() + b'\0'
         client = re.search('clientid=[^;]*;', self._requests.user_data_of(info))

@@ -105,7 +105,8 @@ class Face:
         if _IMAGE in (wanted, *kinds) and self._middleware.offers(f'{topic}/compressed'):
             return (f'nobody publishes it, but {topic}/compressed; set '
                     'ros.image_transport:=compressed')
-        elsewhere = sorted(set(self._middleware.published(wanted)) - set(self._kinds))
+        own = {self._middleware.resolve(full_name(output)) for output in self._outputs}
+        elsewhere = sorted(set(self._middleware.published(wanted)) - set(self._kinds) - own)
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
         return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
 
