@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import csv
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 import sys
 
@@ -26,7 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
-pytest.importorskip('poselib', reason="the extra 'peers' is not installed")
+# A mark: a skip while modules are imported would lose others too, where a plugin imports them.
+pytestmark = pytest.mark.skipif(find_spec('poselib') is None,
+                                reason="the extra 'peers' is not installed")
 
 NAMES = tuple(CHAINS)
 Matcher = Callable[[NDArray[np.uint8], NDArray[np.uint8]],
