@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
@@ -145,3 +146,31 @@ class NodeProcess:
         self.process.send_signal(number)
         code = self.process.wait(10)
         return code, monotonic() - start
+
+
+@contextmanager
+def peer(name: str, topics: Mapping[str, str] | None = None) -> Iterator[Peer]:
+    """Give a peer that listens to topics by type, and end it."""
+    one = Peer(name)
+    for topic, kind in (topics or {}).items():
+        one.listen(topic, kind)
+    yield one
+    one.close()
+
+
+@contextmanager
+def nodes(folder: Path, image: str) -> Iterator[Callable[..., NodeProcess]]:
+    """Give a function that starts a node on images, and end all of them with clean logs."""
+    started: list[NodeProcess] = []
+
+    def start(*words: str, name: str = 'vo_node', **parameters: Any) -> NodeProcess:
+        log = folder / f'{name}_{len(started)}.log'
+        started.append(NodeProcess(log, [*words, '-r', f'image:={image}'], parameters, name))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            code, _ = one.end()
+            assert code == 0, one.log
+        assert 'Traceback' not in one.log, one.log

@@ -14,7 +14,7 @@ from cards import Cards, K, pose, SIZE
 from djet_ros.odometry.messages import pose_of, stamp_ns
 import numpy as np
 import pytest
-from ros_graph import command, ENVIRONMENT, NodeProcess, Peer
+from ros_graph import command, ENVIRONMENT, NodeProcess, nodes as processes, Peer, peer
 from ros_messages import camera_info, image
 
 pytestmark = [
@@ -46,38 +46,22 @@ Heard = dict[str, list[Any]]
 
 @pytest.fixture(scope='module')
 def listener() -> Iterator[Peer]:
-    peer = Peer('listener')
-    for topic, kind in TYPES.items():
-        peer.listen(topic, kind)
-    yield peer
-    peer.close()
+    with peer('listener', TYPES) as one:
+        yield one
 
 
 @pytest.fixture
 def camera() -> Iterator[Peer]:
-    peer = Peer('camera_driver')
-    yield peer
-    peer.close()
+    with peer('camera_driver') as one:
+        yield one
 
 
 @pytest.fixture
 def nodes(tmp_path: Path, listener: Peer) -> Iterator[Callable[..., NodeProcess]]:
     """Give a function that starts a node by name; all have ended cleanly after the test."""
-    started: list[NodeProcess] = []
-
-    def start(name: str, **parameters: Any) -> NodeProcess:
-        one = NodeProcess(tmp_path / f'{name}.log', ['-r', f'image:={IMAGE}'], parameters,
-                          name)
-        started.append(one)
-        return one
-
     listener.heard.clear()
-    yield start
-    for one in started:
-        if one.process.poll() is None:
-            code, _ = one.end()
-            assert code == 0
-        assert 'Traceback' not in one.log, one.log
+    with processes(tmp_path, IMAGE) as start:
+        yield lambda name, **parameters: start(name=name, **parameters)
 
 
 def see(camera: Peer, ways: list[float], first: int = 0) -> None:

@@ -21,7 +21,7 @@ from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
-from ros_graph import command, ENVIRONMENT, NODE, NodeProcess, PATIENCE, Peer
+from ros_graph import command, ENVIRONMENT, NODE, NodeProcess, nodes, PATIENCE, Peer, peer
 from ros_messages import camera_info, compressed, header, image, message_type, roi, serialised
 
 pytestmark = [pytest.mark.ros, pytest.mark.skipif(
@@ -55,39 +55,28 @@ def drive() -> list[Any]:
 
 @pytest.fixture(scope='module')
 def subscriber() -> Iterator[Peer]:
-    peer = Peer('subscriber')
-    for topic, kind in TYPES.items():
-        peer.listen(topic, kind)
-    yield peer
-    peer.close()
+    with peer('subscriber', TYPES) as one:
+        yield one
 
 
 @pytest.fixture
 def publisher() -> Iterator[Peer]:
-    peer = Peer('camera_driver')
-    yield peer
-    peer.close()
+    with peer('camera_driver') as one:
+        yield one
 
 
 @pytest.fixture
 def node(tmp_path: Path, subscriber: Peer) -> Iterator[Callable[..., NodeProcess]]:
     """Give a function that starts the node; it has ended, with a clean log, after the test."""
-    started: list[NodeProcess] = []
+    with nodes(tmp_path, IMAGE) as begin:
+        def start(*words: str, **parameters: Any) -> NodeProcess:
+            one = begin(*words, **parameters)
+            for topic in TYPES:
+                subscriber.ask('published', topic=topic)
+            subscriber.heard.clear()
+            return one
 
-    def start(*words: str, **parameters: Any) -> NodeProcess:
-        one = NodeProcess(tmp_path / f'node_{len(started)}.log',
-                          [*words, '-r', f'image:={IMAGE}'], parameters)
-        started.append(one)
-        for topic in TYPES:
-            subscriber.ask('published', topic=topic)
-        subscriber.heard.clear()
-        return one
-
-    yield start
-    for one in started:
-        if one.process.poll() is None:
-            one.end()
-        assert 'Traceback' not in one.log, one.log
+        yield start
     for topic in TYPES:
         subscriber.ask('published', topic=topic, count=0)
 
