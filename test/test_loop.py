@@ -30,7 +30,7 @@ def test_closing_the_loop_leaves_less_than_a_third_of_the_trajectory_error(block
     assert said['frames'] == 427
     assert said['edges']['loop'] > 100
     assert said['rejected']['loop'] < 0.2 * said['edges']['loop']
-    assert before['ape_m'] > 0.2
+    assert before['ape_m'] > 0.1  # there is something to be closed
     assert after['ape_m'] < before['ape_m'] / 3
     if 'evo_ape_m' in before:
         assert after['evo_ape_m'] < before['evo_ape_m'] / 3
