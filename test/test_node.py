@@ -577,6 +577,7 @@ def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_pa
     camera(publisher)
     listener = Peer('listener')
     listener.listen('/tf', 'tf2_msgs/msg/TFMessage')
+    listener.ask('published', topic='/tf')
     play(publisher, drive[:3])
     subscriber.wait('pairs', paired(2))
     wait_for_log(one, "tf does not know where 'camera' is on 'base_link'")
@@ -585,9 +586,11 @@ def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_pa
     publisher.advertise('/tf_static', 'tf2_msgs/msg/TFMessage', durability='transient_local',
                         depth=1)
     publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', mounting))
-    sleep(0.5)
-    play(publisher, drive[3:6], first=3)
-    listener.wait('the vehicle', lambda heard: len(heard['/tf']) == 3)
+    for i in range(3, 12):
+        # Nothing says when the node has taken the mounting in.
+        play(publisher, drive[i:i + 1], first=i, pause=0.3)
+    listener.wait('the vehicle', lambda heard: heard['/tf'] and stamp_ns(
+        heard['/tf'][-1].transforms[0].header) == stamp(11))
     frames = {(one.header.frame_id, one.child_frame_id) for message in listener.heard['/tf']
               for one in message.transforms}
     assert frames == {('odom', 'base_link')}

@@ -58,6 +58,7 @@ class Face:
         self._inputs: list[Subscription] = []
         # ROS types of what is heard, by topic.
         self._kinds: dict[str, str] = {}
+        self._refused: list[Subscription] = []
         self._images: Subscription | None = None
         self._latched = False
         self._last_tick = -float('inf')
@@ -151,9 +152,11 @@ class Face:
     def _tick(self) -> None:
         if self._images is not None:
             self.session.count_lost(self._images.new_losses())
-        for subscription in self._inputs:
-            if subscription.new_refusals():
-                self._report_mismatch(subscription)
+        # Who publishes is known by name a little after it is refused.
+        refused = [one for one in self._inputs if one.new_refusals()]
+        for subscription in self._refused:
+            self._report_mismatch(subscription)
+        self._refused = refused
         self._listen_for_latched()
         self.session.tick()
 
