@@ -20,7 +20,7 @@ from ros_messages import serialised, STORE
 
 HERE = Path(__file__).parent
 NODE = '/vo_node'
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 # Not the graph of a robot that happens to be near.
 ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),

@@ -23,7 +23,8 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
-PATIENCE = 20.0
+# Beyond the lease that Fast DDS grants a participant whose leave was not heard.
+PATIENCE = 45.0
 
 
 class Peer:
