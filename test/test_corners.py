@@ -1,4 +1,4 @@
-"""Corners are spread, real and at whole pixels, whatever the image."""
+"""Corners are spread, real and between pixels, whatever the image."""
 
 import cv2
 from djet_ros.core.corners import corner_slopes, detect_corners, spread_out
@@ -52,14 +52,32 @@ def test_slopes_are_told_in_gray_levels_per_pixel():
     assert corner_slopes(ramp)[5:25, 5:25].max() == 0
 
 
-def test_points_are_whole_pixels_with_room_for_a_descriptor(image):
+def test_points_have_room_for_a_descriptor(image):
     features = detect_corners(image, 2000, 1.0)
     assert len(features) > 200
-    assert (features.points == np.rint(features.points)).all()
-    assert describable(features.points[features.octaves == 0].astype(int), image.shape).all()
+    fine = np.rint(features.points[features.octaves == 0]).astype(int)
+    assert describable(fine, image.shape).all()
     assert (np.diff(np.unique(features.octaves)) == 1).all()
     assert not features.angles.any()
     assert (features.responses >= 1.0).all()
+
+
+def test_points_follow_an_image_by_parts_of_a_pixel(image):
+    by = np.array([0.3, -0.4])
+    moved = cv2.warpAffine(image, np.column_stack([np.eye(2), by]), image.shape[::-1],
+                           flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    one, other = (detect_corners(seen, 2000, 1.0) for seen in (image, moved))
+    here, there = (found.points[found.octaves == 0] for found in (one, other))
+
+    def error(here, there):
+        apart = there[None] - here[:, None] - by
+        length = np.linalg.norm(apart, axis=2)
+        nearest = length.argmin(1)
+        follows = length.min(1) < 2
+        return np.median(np.abs(apart[np.arange(len(here)), nearest][follows]))
+
+    # Slopes are sampled at each second pixel.
+    assert error(here, there) < 0.7 * error(*(2 * np.rint((p - 0.5) / 2) for p in (here, there)))
 
 
 def test_a_weak_corner_is_taken_only_where_there_is_nothing_better():

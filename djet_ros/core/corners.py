@@ -41,8 +41,8 @@ def detect_corners(gray: Image, max_features: int, contrast: float) -> Features:
     Detect corners in a gray image (H, W) uint8; images too small for a descriptor give none.
 
     contrast: rms slope, in gray levels per pixel, that a corner has at least in its weakest
-    direction. Points are whole pixels, where residual surfaces take their references. Octaves
-    number the sizes; descriptors are ORB's, unrotated, in the image made smaller.
+    direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
+    in the image made smaller. Octaves number the sizes.
     """
     found = [_of_size(gray, octave, scale, round(share * max_features), contrast)
              for octave, (scale, share) in enumerate(_SIZES)]
@@ -99,13 +99,31 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
     lonely, peaks = (slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8))
                      for side in (2 * _APART + 1, 2 * _AT_LEAST_APART + 1))
     rows, columns = np.nonzero(peaks & (slopes > contrast**2))
-    places = 2 * np.stack([columns, rows], axis=1)
-    inside = describable(places, image.shape)
-    points, strengths = places[inside], slopes[rows, columns][inside]
-    first = lonely[rows, columns][inside]
-    chosen = spread_out(points, strengths, most, first)
+    points = _exact_peaks(slopes, rows, columns)
+    inside = describable(_pixels(points), image.shape)
+    points, rows, columns = points[inside], rows[inside], columns[inside]
+    strengths = slopes[rows, columns]
+    chosen = spread_out(_pixels(points), strengths, most, lonely[rows, columns])
     points, strengths = points[chosen], strengths[chosen]
-    descriptors = dense_descriptors(smooth(image), points)
+    descriptors = dense_descriptors(smooth(image), _pixels(points))
     zoom = np.array(gray.shape[::-1]) / (width, height)
-    return (np.rint((points + 0.5) * zoom - 0.5), np.full(len(points), octave, np.int32),
+    return ((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
             np.sqrt(strengths), descriptors)
+
+
+def _exact_peaks(slopes: NDArray[np.float32], rows: NDArray[np.int64],
+                 columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Pixels (N, 2) of the image at which parabolas through peaks of the slopes are highest."""
+    padded = np.pad(slopes, 1, mode='edge')
+    here, places = slopes[rows, columns], []
+    for index, down, right in ((columns, 0, 1), (rows, 1, 0)):
+        before = padded[rows + 1 - down, columns + 1 - right]
+        after = padded[rows + 1 + down, columns + 1 + right]
+        curvature = np.maximum(2 * here - before - after, np.float32(1e-9))
+        places.append(index + np.clip((after - before) / (2 * curvature), -0.5, 0.5))
+    # The middle of two pixels is half a pixel beyond the first.
+    return 2 * np.stack(places, axis=1).astype(np.float64) + 0.5
+
+
+def _pixels(points: NDArray[np.float64]) -> Pixels:
+    return np.rint(points).astype(np.int64)
