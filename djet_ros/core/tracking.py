@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
@@ -57,13 +57,9 @@ class TrackTuning:
     same_basin: float = 0.02
     # chosen: steps on all matches before costs are compared
     steps_to_compare: int = 7
-    # variances of a residual, that a rival may cost more; from a rendered dive, where few matches
-    # leave a choice between a plane's own motion and its twin: matches of one neighbourhood err
-    # alike. The first surfaces, which see half of the matches on frames far apart, are so unsure
-    # that rivals are followed; at the end the motion before decides between them
+    # variances of a residual; from a rendered dive, where few matches leave a choice between a
+    # plane's own motion and its twin: matches of one neighbourhood err alike
     undecided: float = 10.0
-    # chosen: so many, the cheapest of them, are followed to the end
-    followed: int = 3
     # chosen: a patch that would be stretched or shrunk by more is a false match
     most_stretch: float = 2.0
     # robust standard deviations; the usual three, within which a match agrees with a pose
@@ -132,138 +128,42 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
-    on, with its rivals where the first surfaces do not decide between them; the last ones do. Of
-    those that cost the same the one next to the prior, the previous motion, is taken. None where
-    too few matches have a usable surface. observe: is called for each round of the one taken.
+    on; of those that cost the same the one next to the prior, the previous motion. None where too
+    few matches have a usable surface. observe: is called at the end of each round.
     """
-    n = len(y)
-    untouched = _Keypoints(y.copy(), np.full(n, np.nan), np.ones(n, bool), None, np.ones(n, bool))
-    sight = _look(surface, K, untouched, config)
-    if sight is None:
-        return None
-    sole = len(starts) == 1
-    followed = [way for rival in _rivals(sight.problem, starts, config)
-                if (way := _follow(surface, K, sight, rival, config, sole)) is not None]
-    taken = _cheapest_way(followed, prior)
-    if taken is None:
-        return None
-    if observe is not None:
-        for seen in taken.rounds:
-            observe(seen)
-    return taken.track
-
-
-@dataclass(frozen=True)
-class _Keypoints:
-    """
-    Where matches are between two rounds.
-
-    places: (N, 2); losses: (N,) last known surface values; alive: (N,) bool, not culled; warp,
-    plausible: how their patches are seen, (N, 2, 2), and whether that can be, (N,) bool.
-    """
-
-    places: Array
-    losses: Array
-    alive: NDArray[np.bool_]
-    warp: Array | None
-    plausible: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """What a round sees around keypoints: fits, what was made of them, and the problem posed."""
-
-    keypoints: _Keypoints
-    fits: Paraboloids
-    paraboloids: Paraboloids
-    no_minimum: int
-    voting: NDArray[np.bool_]
-    problem: JetProblem
-
-
-@dataclass(frozen=True)
-class _Way:
-    """A start followed to its end: the track, what the last round saw, and all rounds."""
-
-    track: Track
-    problem: JetProblem
-    solution: Solution
-    rounds: list[Round]
-
-
-def _look(surface: ResidualSurface, K: Array, keypoints: _Keypoints,
-          config: EstimatorConfig) -> _Sight | None:
-    """Step 1: update the local residuals around the keypoints and fit A', b, c."""
-    fits = surface.around(keypoints.places, keypoints.warp)
-    paraboloids, no_minimum = with_minimum(fits, config.indefinite)
-    # Match culling: a keypoint without a surface is out, and keeps its last loss.
-    alive = keypoints.alive & paraboloids.usable
-    voting = alive & keypoints.plausible & (
-        _minimum_inside(paraboloids, config) | (not config.cull_outside))
-    if voting.sum() < config.min_matches:
-        return None
-    problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting),
-                          TUNING.epipole_blur, config.weigh_by_fit)
-    return _Sight(replace(keypoints, alive=alive), fits, paraboloids, no_minimum, voting, problem)
-
-
-def _follow(surface: ResidualSurface, K: Array, sight: _Sight, start: Pose,
-            config: EstimatorConfig, sole: bool) -> _Way | None:
-    """
-    Go on from a start on the first sight, round by round, until the pose rests.
-
-    sole: there was no other start, so that the pose may rest there as well.
-    """
-    rounds: list[Round] = []
-    pose, seen = start, sight
+    keypoints, losses = y.copy(), np.full(len(y), np.nan)
+    alive = np.ones(len(y), bool)
+    poses, warp = starts, None
+    plausible = np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
-        # Step 2: global pose optimisation.
-        scale = _scale(epipolar_residuals(seen.problem, pose.R, pose.t).r)
-        loss = Loss(config.loss, config.loss_scale * scale)
-        solution = minimise(seen.problem, pose.R, pose.t, loss)
-        before, pose = pose, _pose(solution)
-        # Keypoints go towards their optimum on the epipolar line of the new pose.
-        alive, places = seen.keypoints.alive, seen.keypoints.places
-        optimum = _optimum_on_line(seen.paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-        losses = np.where(alive, seen.paraboloids.values(optimum), seen.keypoints.losses)
-        rounds.append(Round(places, seen.fits, seen.keypoints.warp, pose, optimum))
-        rests = (sole or iteration > 1) and _change(before, pose) < config.epsilon
-        if rests or iteration == config.max_iterations:
-            break
-        places = np.where(alive[:, None], _advance(places, optimum, config), places)
-        warp, plausible = (_warps(pose, K, surface.x, optimum) if config.warp_reference
-                           else (None, np.ones(len(places), bool)))
-        sought = _look(surface, K, _Keypoints(places, losses, alive, warp, plausible), config)
-        if sought is None:
+        # Step 1: update the local residuals around the keypoints and fit A', b, c.
+        fits = surface.around(keypoints, warp)
+        paraboloids, no_minimum = with_minimum(fits, config.indefinite)
+        # Match culling: a keypoint without a surface is out, and keeps its last loss.
+        alive &= paraboloids.usable
+        voting = alive & plausible & (
+            _minimum_inside(paraboloids, config) | (not config.cull_outside))
+        if voting.sum() < config.min_matches:
             return None
-        seen = sought
-    track = Track(pose, loss, solution.residuals, seen.voting, seen.paraboloids.minima(), optimum,
-                  losses, seen.no_minimum, iteration)
-    return _Way(track, seen.problem, solution, rounds)
-
-
-def _cheapest_way(ways: list[_Way], prior: Pose | None) -> _Way | None:
-    """Take the way that ends at the least cost; a match that has no vote pays the most."""
-    if len(ways) < 2:
-        return ways[0] if ways else None
-    scale = min(way.track.scale() for way in ways)
-    tight = Loss('geman_mcclure', TUNING.tight * scale)
-    most = max(len(way.problem.blur) for way in ways)
-    costs = [_cost(way, tight) + tight.scale**2 * (most - len(way.problem.blur)) for way in ways]
-    cheapest = min(costs)
-    if prior is None:
-        return ways[costs.index(cheapest)]
-    return min((way for way, cost in zip(ways, costs)
-                if cost <= cheapest + TUNING.undecided * scale**2),
-               key=lambda way: _apart(prior, way.track.pose))
-
-
-def _cost(way: _Way, loss: Loss) -> float:
-    """Sum up the loss where a way ends, points behind the cameras as well."""
-    at, residuals = way.solution, way.solution.residuals
-    sketch = Sketch(at.R[None], at.t[None], np.array([at.cost]), residuals.r[None],
-                    residuals.sign[None])
-    return float(costs_in_front(way.problem, sketch, loss)[0])
+        # Step 2: global pose optimisation.
+        problem = jet_problem(K, surface.x[voting], _take(paraboloids, voting),
+                              TUNING.epipole_blur, config.weigh_by_fit)
+        solution, loss = _cheapest(problem, poses, config, prior)
+        pose = _pose(solution)
+        # Keypoints go towards their optimum on the epipolar line of the new pose.
+        optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
+        losses[alive] = paraboloids.values(optimum)[alive]
+        if observe is not None:
+            observe(Round(keypoints, fits, warp, pose, optimum))
+        converged = len(poses) == 1 and _change(poses[0], pose) < config.epsilon
+        poses = [pose]
+        if converged or iteration == config.max_iterations:
+            break
+        keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
+        if config.warp_reference:
+            warp, plausible = _warps(pose, K, surface.x, optimum)
+    return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
+                 no_minimum, iteration)
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
@@ -276,33 +176,43 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
                  paraboloids.values(optimum), 0, 0)
 
 
-def _rivals(problem: JetProblem, starts: list[Pose], config: EstimatorConfig) -> list[Pose]:
-    """Refine the most promising starts; give the cheapest, and what costs hardly more."""
+def _cheapest(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
+              prior: Pose | None) -> tuple[Solution, Loss]:
+    """Refine the most promising starts, and the cheapest of them to the end."""
     if len(starts) == 1:
-        return starts
+        best, scale = starts[0], _scale(epipolar_residuals(problem, starts[0].R, starts[0].t).r)
+    else:
+        best, scale = _right_basin(problem, starts, config, prior)
+    loss = Loss(config.loss, config.loss_scale * scale)
+    return minimise(problem, best.R, best.t, loss), loss
+
+
+def _right_basin(problem: JetProblem, starts: list[Pose], config: EstimatorConfig,
+                 prior: Pose | None) -> tuple[Pose, float]:
+    """Choose among starts by what they come to; also gives the scale of the residuals there."""
     some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
     scale = max(refine_all(some, starts, Loss(), 0).scales().min(), TUNING.least_scale)
     tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
     if len(problem.blur) > TUNING.few_matches:
-        sketch = refine_all(some, starts, tight, TUNING.steps_to_sketch)
-        promising = _distinct(sketch, costs_in_front(some, sketch, tight))
-        starts = [sketch.pose(number) for number in promising[:TUNING.refined_starts]]
+        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight)
     refined = refine_all(problem, starts, tight, TUNING.steps_to_compare)
-    costs = costs_in_front(problem, refined, tight)
+    costs, scales = costs_in_front(problem, refined, tight), refined.scales()
     best = int(costs.argmin())
-    undecided = costs[best] + TUNING.undecided * _scale(refined.r[best])**2
-    return [refined.pose(number) for number in _distinct(refined, costs)
-            if costs[number] <= undecided][:TUNING.followed]
+    if prior is not None:
+        undecided = costs[best] + TUNING.undecided * max(scales[best], TUNING.least_scale)**2
+        best = min(np.flatnonzero(costs < undecided).tolist(),
+                   key=lambda number: _apart(prior, refined.pose(number)))
+    return refined.pose(best), max(float(scales[best]), TUNING.least_scale)
 
 
-def _distinct(sketch: Sketch, costs: Array) -> list[int]:
-    """Give the numbers of the poses by cost, of each basin only the cheapest."""
-    chosen: list[int] = []
-    for number in costs.argsort(kind='stable').tolist():
+def _promising(problem: JetProblem, sketch: Sketch, loss: Loss) -> list[Pose]:
+    """Choose the cheapest poses that lie in different basins."""
+    chosen: list[Pose] = []
+    for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
         pose = sketch.pose(number)
-        if all(_apart(sketch.pose(other), pose) > TUNING.same_basin for other in chosen):
-            chosen.append(number)
-    return chosen
+        if all(_apart(other, pose) > TUNING.same_basin for other in chosen):
+            chosen.append(pose)
+    return chosen[:TUNING.refined_starts]
 
 
 def _pose(solution: Solution) -> Pose:
