@@ -23,7 +23,6 @@ needs_dds = pytest.mark.skipif(find_spec('cyclonedds') is None,
 
 PATIENCE = 30.0
 NODE = '/vo_node'
-IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
 DEEP = Profile(depth=1000)
 TYPES = {
     f'{NODE}/relative_pose': 'geometry_msgs/msg/PoseStamped',

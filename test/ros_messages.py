@@ -5,6 +5,26 @@ from rosbags.typesys import get_typestore, Stores
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
+IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
+IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+
+SEEN = {
+    # what is published, and what the log says of it
+    'elsewhere': ('/front/image_raw', IMAGE_TYPE,
+                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
+                  '/front/image_raw?'),
+    'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
+                   f'nobody publishes it, but {IMAGE}/compressed; set '
+                   'ros.image_transport:=compressed'),
+    'another type': (IMAGE, COMPRESSED_TYPE,
+                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
+                     'ros.image_transport:=compressed'),
+    'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
+                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
+                        '/elsewhere/camera_info?'),
+}
+
 
 def message_type(name):
     return STORE.types[name]

@@ -13,8 +13,6 @@ from cards import Cards, K, pose, SIZE
 from dds_graph import (
     Command,
     ENVIRONMENT,
-    IMAGE_TYPE,
-    INFO_TYPE,
     needs_dds,
     NODE,
     Peer,
@@ -30,12 +28,10 @@ from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
-from ros_messages import camera_info, image, serialised
+from ros_messages import camera_info, IMAGE, image, IMAGE_TYPE, INFO, INFO_TYPE, SEEN, serialised
 
 pytestmark = needs_dds
 
-COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
-IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
 RECTIFIED = '/camera/image_rect'
 FRAMES = 12
 ODOMETRY = f'{NODE}/odometry'
@@ -229,23 +225,6 @@ def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
     peer.wait('the log', lambda: f'incompatible QoS on {IMAGE}' in one.log)
     assert 'offers best_effort, volatile, /vo_node asks for reliable, volatile' in one.log
     assert images.listeners == 0
-
-
-SEEN = {
-    # what is published, and what the log says of it
-    'elsewhere': ('/front/image_raw', IMAGE_TYPE,
-                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
-                  '/front/image_raw?'),
-    'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
-                   f'nobody publishes it, but {IMAGE}/compressed; set '
-                   'ros.image_transport:=compressed'),
-    'another type': (IMAGE, COMPRESSED_TYPE,
-                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
-                     'ros.image_transport:=compressed'),
-    'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
-                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
-                        '/elsewhere/camera_info?'),
-}
 
 
 @pytest.mark.parametrize('case', SEEN)

@@ -22,14 +22,24 @@ from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
 from ros_graph import command, ENVIRONMENT, NODE, NodeProcess, nodes, PATIENCE, Peer, peer
-from ros_messages import camera_info, compressed, header, image, message_type, roi, serialised
+from ros_messages import (
+    camera_info,
+    compressed,
+    header,
+    IMAGE,
+    image,
+    IMAGE_TYPE,
+    INFO,
+    INFO_TYPE,
+    message_type,
+    roi,
+    SEEN,
+    serialised,
+)
 
 pytestmark = [pytest.mark.ros, pytest.mark.skipif(
     find_spec('rclpy') is None, reason='rclpy is missing: no ROS 2 is sourced here')]
 
-IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
-IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
-COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 RELATIVE = f'{NODE}/relative_pose'
 TYPES = {
     RELATIVE: 'geometry_msgs/msg/PoseStamped',
@@ -191,23 +201,6 @@ def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
         assert 'did you mean' not in line
     publisher.advertise('/elsewhere/info', INFO_TYPE)
     wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publish it, none sends')
-
-
-SEEN = {
-    # what is published, and what the log says of it
-    'elsewhere': ('/front/image_raw', IMAGE_TYPE,
-                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
-                  '/front/image_raw?'),
-    'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
-                   f'nobody publishes it, but {IMAGE}/compressed; set '
-                   'ros.image_transport:=compressed'),
-    'another type': (IMAGE, COMPRESSED_TYPE,
-                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
-                     'ros.image_transport:=compressed'),
-    'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
-                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
-                        '/elsewhere/camera_info?'),
-}
 
 
 @pytest.mark.parametrize('case', SEEN)
