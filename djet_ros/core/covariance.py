@@ -2,43 +2,54 @@
 
 from __future__ import annotations
 
-from djet_ros.core.geometry import sphere_tangents
+from djet_ros.core.geometry import rotation_log, sphere_tangents
 from djet_ros.core.jet import Loss, Residuals
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
-# Matches in one cell of this side (pixels) are taken to err together: ORB finds one corner in
-# several octaves, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
+# Matches in one cell of this side (pixels) are taken to err together: corners are found in several
+# sizes, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
 CELL = 32
 
-# What correlation over longer distances leaves unexplained, as a factor on the variances. Measured
-# once, as the normalised squared error on rendered streets; tests hold it on other scenes.
-_INFLATION = 1.6
+# Into so many cells the matches are cut once more. What errs together over longer distances, such
+# as a patch's perspective or a haze, is seen by these, each of which errs by itself.
+_LARGE_CELLS = 20
 
-# The same where cells are summed without a jackknife: over the ground, and in the length of a
-# loop. It is what the pose's was before patches were warped, and has not been measured anew.
+# Pixels; chosen, a fiftieth: what an image's sampling, its lens and its rolling rows are good for.
+_SHIFT = 0.02
+
+# Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
+# what the pose's was before patches were warped, and has not been measured anew.
 CAUTIOUS_INFLATION = 4.0
+
+# rad^2; a nanoradian, far below any noise: perfect data must not divide by nothing.
+_LEAST_VARIANCE = 1e-18
+
+# What is said of a pose that is not determined.
+UNKNOWN = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.
 _LEAST_SUPPORT = 1e-6
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
-                    flipped: bool) -> tuple[Array, Array]:
+                    flipped: bool, gain: float = 1.0) -> tuple[Array, Array]:
     """
     Covariance of (rotation vector in rad from the left, direction of t) at the minimum.
 
     places: (N, 2) pixels of the matches; t: (3,) the direction that was settled on, `flipped`
-    where it is the opposite of the optimiser's. Gives (5, 5) in the basis ``sphere_tangents(t)``,
+    where it is the opposite of the optimiser's; gain: of the surfaces, by which residuals are
+    smaller than what the keypoints are off. Gives (5, 5) in the basis ``sphere_tangents(t)``,
     and (6, 6) over (rotation vector, t), of rank 5 because t keeps its length. All NaN where the
     matches do not determine the pose, only those of one cell do, or they lie in too few cells.
 
-    The noise is taken from the matches themselves: from how far the pose would move without those
-    of a cell, cell by cell (delete-a-group jackknife, to first order; Bell and McCaffrey, Survey
-    Methodology 2002). Where few cells decide about a direction, their moves say little; so the
-    mean is taken of the moves that are seen and of those that noise would make, which are large
-    there, at the size that has the seen ones on average.
+    The noise is that of the residuals themselves, in whichever of the two images it arose: see
+    `_jackknife`. Many small cells tell the shape of the covariance. A few large ones, which hold
+    what errs together from one small cell to the next, tell its size: with C of the small and C'
+    of the large, tr(C^-1 C') / 5 is how much larger the variances are on average over the five
+    directions, and 1 where the small cells err each by itself. What no residual shows comes to
+    that: all that is seen in a large cell may be shifted a little.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -46,29 +57,75 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
     flattening = loss.curvature(squared).mean() / weights.mean() if len(squared) else 0.0
     H = (J * weights) @ J.T
-    unknown = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
-        return unknown
-    H_cells, gradients = _summed_by_cell(
-        places, J[:, None] * (J * weights), J * (weights * residuals.r))
-    cells = len(gradients)
-    if cells <= 5:  # so many are gone with the pose's own freedom
-        return unknown
-    whitening = np.linalg.inv(np.linalg.cholesky(H))
-    if np.linalg.eigvalsh(whitening @ H_cells @ whitening.T).max() > 1 - _LEAST_SUPPORT:
-        return unknown
-    without = np.linalg.inv(H - H_cells)
-    moves = (without @ gradients[:, :, None])[:, :, 0]
-    seen = moves.T @ moves
-    by_noise = (without - np.linalg.inv(H)).sum(0)
-    by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    covariance = _INFLATION * (1 - 1 / cells) / flattening**2 * (seen + by_noise) / 2
+        return UNKNOWN
+    parts = J[:, None] * (J * weights), J * (weights * residuals.r)
+    large = np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS)
+    small_cells, large_cells = (_jackknife(H, *summed_by_cell(places, *parts, side=side))
+                                for side in (CELL, max(large, CELL)))
+    if small_cells is None or large_cells is None:
+        return UNKNOWN
+    correlated = max(1.0, np.trace(np.linalg.solve(small_cells, large_cells)) / 5)
+    pull, = summed_by_cell(places, J * weights, side=max(large, CELL))
+    shifts = _SHIFT * np.linalg.solve(H, pull.T)
+    covariance = correlated / (gain * flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = _blocks(-residuals.tangents if flipped else residuals.tangents)
     covariance_6 = turned @ covariance @ turned.T
     basis = _blocks(sphere_tangents(t))
     return basis.T @ covariance_6 @ basis, covariance_6
+
+
+def difference(R: Array, t: Array, other: Pose) -> Array:
+    """How another motion differs (5,) from (R, t), in the parameters of a covariance of that."""
+    sign = 1.0 if other.t @ t >= 0 else -1.0
+    return np.concatenate([rotation_log(other.R @ R.T),
+                           sphere_tangents(t).T @ (sign * other.t - t)])
+
+
+def squared_distance(covariance: Array, apart: Array) -> float:
+    """Squared Mahalanobis distance of a pose that is apart (5,); finite even of perfect data."""
+    variances, axes = np.linalg.eigh(covariance)
+    return float(((axes.T @ apart)**2 / np.maximum(variances, _LEAST_VARIANCE)).sum())
+
+
+def spanning(covariance: Array, t: Array, apart: Array, sigmas: float) -> tuple[Array, Array]:
+    """
+    Widen a covariance (5, 5) so that a pose apart (5,) lies no more than some sigmas off.
+
+    Gives it with that over (rotation vector, t), (6, 6). To C comes a a^T (1/s^2 - 1/m^2), with m
+    the Mahalanobis distance that a had; by Sherman and Morrison's formula it is s then.
+    """
+    distance = squared_distance(covariance, apart)
+    if distance > sigmas**2:
+        covariance = covariance + np.outer(apart, apart) * (1 / sigmas**2 - 1 / distance)
+    basis = _blocks(sphere_tangents(t))
+    return covariance, basis @ covariance @ basis.T
+
+
+def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
+    """
+    Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
+
+    H: (5, 5) of all; H_cells, gradients: (C, 5, 5), (C, 5) of each cell. A delete-a-group
+    jackknife, to first order (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide
+    about a direction, their moves say little; so the mean is taken of the moves that are seen and
+    of those that noise would make, which are large there, at the size that has the seen ones on
+    average. None where cells are too few, or one alone decides.
+    """
+    cells = len(gradients)
+    if cells <= 5:  # so many are gone with the pose's own freedom
+        return None
+    whitening = np.linalg.inv(np.linalg.cholesky(H))
+    if np.linalg.eigvalsh(whitening @ H_cells @ whitening.T).max() > 1 - _LEAST_SUPPORT:
+        return None
+    without = np.linalg.inv(H - H_cells)
+    moves = (without @ gradients[:, :, None])[:, :, 0]
+    seen = moves.T @ moves
+    by_noise = (without - np.linalg.inv(H)).sum(0)
+    by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
+    return np.asarray((1 - 1 / cells) * (seen + by_noise) / 2)
 
 
 def _blocks(tangents: Array) -> Array:
@@ -78,9 +135,9 @@ def _blocks(tangents: Array) -> Array:
     return lift
 
 
-def _summed_by_cell(places: Array, *values: Array) -> list[Array]:
+def summed_by_cell(places: Array, *values: Array, side: float = CELL) -> list[Array]:
     """Sum values (..., N) over the C cells of the image that have matches; each (C, ...)."""
-    cells: NDArray[np.int64] = (places // CELL).astype(np.int64)
+    cells: NDArray[np.int64] = (places // side).astype(np.int64)
     _, cell = np.unique(cells[:, 0] * 2**32 + cells[:, 1], return_inverse=True)
     order = np.argsort(cell, kind='stable')
     first = np.searchsorted(cell[order], np.arange(cell.max() + 1))

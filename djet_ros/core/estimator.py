@@ -8,7 +8,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from djet_ros.core.corners import detect_corners
-from djet_ros.core.covariance import pose_covariance
+from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.geometry import (
@@ -20,16 +20,19 @@ from djet_ros.core.geometry import (
     rays,
 )
 from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.parallel import both
 from djet_ros.core.prediction import predict, reach_of
-from djet_ros.core.starts import five_point, starting_poses
+from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
+from djet_ros.core.starts import five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
+    DescriptorDistances,
     DescriptorSurface,
     PhotometricSurface,
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.tracking import hold, Observer, Track, track_jointly
+from djet_ros.core.tracking import hold, Observer, Track, track_jointly, TUNING
 from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +48,14 @@ _ENOUGH = 0.8
 _OUT_OF_NOISE = 3.0
 
 
+# Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
+_SURPRISING = 20.5
+
+# rad; chosen: no ellipsoid spans two motions that are further from one another, as the sphere of
+# directions is bent.
+_FAR = 0.17
+
+
 class TwoViewEstimator:
     """
     Estimates the relative pose of two calibrated views, ``x_current = R x_previous + t``.
@@ -55,40 +66,52 @@ class TwoViewEstimator:
     def __init__(self, config: EstimatorConfig | None = None) -> None:
         self.config = config or EstimatorConfig()
 
-    def view(self, gray: NDArray[np.uint8], K: Array) -> View:
-        """Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3)."""
-        return View(gray, K, self.features(gray), smooth(gray))
+    def view(self, gray: NDArray[np.uint8], K: Array, features: Features | None = None,
+             left_out: Mask | None = None) -> View:
+        """
+        Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3).
 
-    def features(self, gray: NDArray[np.uint8]) -> Features:
-        """Detect the features of a gray image (H, W) uint8."""
+        features: where they are known already; left_out: (H, W) bool, pixels that nothing is to
+        be told from.
+        """
+        mask = None if left_out is None else blocked(left_out)
+        return View(gray, K, self.features(gray, mask) if features is None else features,
+                    smooth(gray), DescriptorDistances(self.config).seen(gray), mask)
+
+    def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
+        """Detect the features of a gray image (H, W) uint8, but where a mask (H, W) is True."""
         if self.config.detector == 'corners':
-            return detect_corners(gray, self.config.max_features, self.config.corner_contrast)
-        return detect_orb(gray, self.config.max_features, self.config.fast_threshold)
+            return detect_corners(gray, self.config.max_features, self.config.corner_contrast,
+                                  mask)
+        return detect_orb(gray, self.config.max_features, self.config.fast_threshold, mask)
 
-    def estimate(self, previous: View, current: View,
-                 prior: RelativePose | None = None) -> RelativePose:
+    def estimate(self, previous: View, current: View, prior: RelativePose | None = None,
+                 known: Known | None = None) -> RelativePose:
         """
         Estimate the motion from the previous to the current view.
 
-        prior: the motion before this one, as one more starting pose. Never raises on image
-        content: what can't be estimated comes back with a status that says why.
+        prior: the motion before this one, as one more starting pose; known: what others than the
+        images tell of this one. Never raises on image content: what can't be estimated comes back
+        with a status that says why.
         """
         timings: dict[str, float] = {}
         with _timed(timings, 'matching'):
-            x, y = self.match(previous, current, prior)
-        return replace(self.estimate_matched(previous, current, x, y, prior, timings),
-                       timings=timings)
+            x, y = self.match(previous, current, prior, known)
+        return replace(
+            self.estimate_matched(previous, current, x, y, prior, timings, known=known),
+            timings=timings)
 
-    def match(self, previous: View, current: View,
-              prior: RelativePose | None = None) -> tuple[Array, Array]:
+    def match(self, previous: View, current: View, prior: RelativePose | None = None,
+              known: Known | None = None) -> tuple[Array, Array]:
         """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
-        there, here = previous.features, current.features
+        there, here, known = previous.features, current.features, known or Known()
         if self.config.search_radius >= 1:
             matches = match_everywhere(there, here)
         else:
             radius = self.config.search_radius * max(current.gray.shape)
-            known = [prior.R] if prior is not None else []
-            turned = replace(there, points=predict(there, here, current.K, known, radius))
+            rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
+            turned = replace(there, points=predict(
+                there, here, current.K, rotations, radius, sure=known.turn is not None))
             # As far as the motion before took them; and widely, where that finds too few.
             near = reach_of(prior, current.K) if prior is not None else radius
             matches = match_nearby(turned, here, min(near, radius))
@@ -100,12 +123,15 @@ class TwoViewEstimator:
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None,
                          timings: dict[str, float] | None = None,
-                         observe: Observer | None = None) -> RelativePose:
+                         observe: Observer | None = None,
+                         known: Known | None = None) -> RelativePose:
         """
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
-        timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1.
+        timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1;
+        known: as for ``estimate``.
         """
+        known = known or Known()
         timings = {} if timings is None else timings
         config, K = self.config, current.K
         if len(x) < config.min_matches:
@@ -115,9 +141,12 @@ class TwoViewEstimator:
         if config.starts == 'several' and config.method != 'five_point':
             # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
             # The first surfaces need no pose, and are sampled meanwhile.
+            began = perf_counter()
             starts, surface = both(
-                lambda: self._starts(K, x, y, before, timings),
+                lambda: self._starts(K, x, y, before, known),
                 lambda: self._surface(previous, current, x, y, timings))
+            # What was done beside the surfaces took no time: stages add up to all of it.
+            timings['starts'] = perf_counter() - began - timings['jet']
         else:
             # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
             with _timed(timings, 'starts'):
@@ -130,16 +159,17 @@ class TwoViewEstimator:
         # Joint epipolar tracking on the residual surfaces.
         with _timed(timings, 'jet'):
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
-                     else track_jointly(surface, K, y, starts, config, before, observe))
+                     else track_jointly(surface, K, y, starts, config, before, observe,
+                                        known.turn))
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
         with _timed(timings, 'result'):
-            return self._result(previous, current, surface, y, track)
+            return self._result(previous, current, surface, y, track, before)
 
     def _starts(self, K: Array, x: Array, y: Array, before: Pose | None,
-                timings: dict[str, float]) -> list[Pose]:
-        with _timed(timings, 'starts'):
-            return starting_poses(K, x, y, self.config.ransac_threshold, before)
+                known: Known) -> list[Pose]:
+        found = starting_poses(K, x, y, self.config.ransac_threshold, before)
+        return [*found, *known_starts(K, x, y, known)]
 
     def _surface(self, previous: View, current: View, x: Array, y: Array,
                  timings: dict[str, float]) -> ResidualSurface:
@@ -153,8 +183,8 @@ class TwoViewEstimator:
             return ReprojectionSurface(x, y)
 
     def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
-                track: Track) -> RelativePose:
-        """Settle the direction of t, the covariance, and whether there was parallax at all."""
+                track: Track, before: Pose | None) -> RelativePose:
+        """Settle the direction of t, the covariance, and whether it is to be believed."""
         x, K, R = surface.x, current.K, track.pose.R
         inliers = track.inliers()
         # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
@@ -164,25 +194,68 @@ class TwoViewEstimator:
         flipped = behind > ahead
         t = -track.pose.t if flipped else track.pose.t
 
-        covariance_5, covariance_6 = pose_covariance(
-            track.residuals, track.loss, x[track.voting], t, flipped)
+        covariances = pose_covariance(
+            track.residuals, track.loss, x[track.voting], t, flipped, surface.gain)
         hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
         status = Status.OK
-        if (inliers.sum() < self.config.min_matches or not np.isfinite(covariance_5).all()
+        if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()
                 or _by_chance(hamming[inliers])):
             status, t = Status.DEGENERATE, np.zeros(3)
+        elif self._false_alarm(track, int(inliers.sum()), current.gray.shape):
+            status = Status.TOO_FEW_INLIERS
         else:
             # Where a rotation alone explains the matches, any direction of t would do.
             R_alone = fit_rotation(rays_x, rays_y)
             parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
             if parallax < max(self.config.min_parallax, _OUT_OF_NOISE * track.scale()):
                 status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
+            else:
+                status, covariances = _judged(Pose(R, t), covariances, track, before)
         lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
         return RelativePose(
-            status, R, t, covariance_5, covariance_6, x=x, y=y, y_opt=track.y_opt,
+            status, R, t, *covariances, x=x, y=y, y_opt=track.y_opt,
             inliers=inliers, residuals=line_distances(lines, y),
             hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
             indefinite=track.indefinite, iterations=track.iterations)
+
+    def _false_alarm(self, track: Track, agreeing: int, shape: tuple[int, ...]) -> bool:
+        """
+        Tell whether false matches would bring about a motion that as many agree with.
+
+        One that may be anywhere in a disc of the search radius r lies within w of a line through
+        its middle with a probability of at most 4 w / (pi r).
+        """
+        radius = min(self.config.search_radius, 0.5) * max(shape)
+        chance = 4 * TUNING.inlier * track.scale() / (np.pi * radius)
+        return false_alarms(agreeing, len(track.voting), chance) > 0
+
+
+def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
+            before: Pose | None) -> tuple[Status, tuple[Array, Array]]:
+    """
+    Tell whether rivals leave a pose unsure, and widen its covariances to span them.
+
+    Those that the covariance allows of are spanned by it already. In a basin that is a paraboloid,
+    matches prefer its minimum by half the Mahalanobis distance m to whatever pose lies m off:
+    costs grow by m^2, and their noise by 2 m. So any other rival belongs twice as many standard
+    deviations off as the matches prefer the pose to it.
+    """
+    status = Status.TWO_MOTIONS if track.guess else Status.OK
+    for rival in track.rivals:
+        off = difference(pose.R, pose.t, rival.pose)
+        if squared_distance(covariances[0], off) < _SURPRISING:
+            continue
+        undecided = rival.preference < DECIDED and not _goes_on(before, pose, rival.pose)
+        if undecided and np.linalg.norm(off) > _FAR and not track.guess:
+            status = Status.AMBIGUOUS
+        covariances = spanning(covariances[0], pose.t, off, max(2 * rival.preference, 1.0))
+    return status, covariances
+
+
+def _goes_on(before: Pose | None, pose: Pose, rival: Pose) -> bool:
+    """Tell whether the motion before decides for a pose, whichever sign a rival's t may have."""
+    return before is not None and all(
+        goes_on(before, pose, Pose(rival.R, sign * rival.t)) for sign in (1, -1))
 
 
 def _by_chance(hamming: Array) -> bool:

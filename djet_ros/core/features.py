@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import cv2
+from djet_ros.core.masks import Mask
 from djet_ros.core.parallel import both, each
 from djet_ros.core.types import Array, Features
 import numpy as np
@@ -20,18 +21,21 @@ _OCTAVES = 1
 _DISTANCE_BITS = 32
 
 
-def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20) -> Features:
+def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20,
+               mask: Mask | None = None) -> Features:
     """
     Detect ORB features in a gray image (H, W) uint8; images too small for one give none.
 
     The descriptors are the usual rotated ones: the initial matching needs their robustness, the
-    residual surfaces use unrotated ones (`djet_ros.core.hamming`).
+    residual surfaces use unrotated ones (`djet_ros.core.hamming`). mask: (H, W) bool, where no
+    feature may be.
     """
     orb = cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
     keypoints: Sequence[cv2.KeyPoint] = ()
     descriptors = None
     if min(gray.shape) > orb.getEdgeThreshold():  # the pyramid fails on images of a pixel or two
-        keypoints, descriptors = orb.detectAndCompute(gray, None)
+        keypoints, descriptors = orb.detectAndCompute(
+            gray, None if mask is None else np.where(mask, 0, 255).astype(np.uint8))
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
     return Features(

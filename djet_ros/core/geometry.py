@@ -25,6 +25,11 @@ def rotation_exp(omega: Array) -> Array:
     return np.asarray(cv2.Rodrigues(omega)[0])
 
 
+def rotation_log(R: Array) -> Array:
+    """Rotation vector (3,) in radians of a rotation matrix (3, 3)."""
+    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+
+
 def unit(v: Array) -> Array:
     """Scale vectors along the last axis to length one; zero vectors stay zero."""
     length = np.linalg.norm(v, axis=-1, keepdims=True)
@@ -119,6 +124,20 @@ def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     with np.errstate(divide='ignore', invalid='ignore'):
         return np.asarray(depth_x / depth_y)
+
+
+def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
+    """
+    Inverse depths (N,) in A of matched rays (N, 3) with z = 1, one over the unit of t.
+
+    By least squares of y x (R x + rho t) = 0, which is linear: noise about zero stays about zero.
+    Also gives their standard deviations (N,) for rays in B that err by one in each direction.
+    """
+    turned = rays_x @ R.T
+    shift, lever = np.cross(rays_y, turned), np.cross(rays_y, t)
+    squared = np.maximum((lever**2).sum(1), 1e-12)
+    sigma = np.linalg.norm(rays_y, axis=1) / np.sqrt(squared)
+    return -(shift * lever).sum(1) / squared, sigma
 
 
 def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:

@@ -10,7 +10,8 @@ graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all 
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.hamming import Image, Pixels, sum_over_tests
+from djet_ros.core.hamming import Image, Pixels, sum_over_tests, Tests
+from djet_ros.core.orb_pattern import TESTS
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,24 +21,31 @@ Grades = NDArray[np.int16]
 _STEPS = 4
 
 
-def smooth_finely(gray: Image) -> Grades:
-    """Smooth an (H, W) uint8 image as ORB does, to quarters of a gray level."""
-    kernel = cv2.getGaussianKernel(7, 2)
+def smooth_finely(gray: Image, scale: float = 1.0) -> Grades:
+    """Smooth an (H, W) uint8 image as `smooth` does, to quarters of a gray level."""
+    kernel = cv2.getGaussianKernel(7, 2 * scale)
     return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _STEPS * kernel, kernel), np.int16)
 
 
-def grades(p: Grades, q: Grades, grading: float) -> Grades:
-    """Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level."""
+def grades(p: Grades, q: Grades, grading: float, contrast: float = 1.0) -> Grades:
+    """
+    Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level.
+
+    contrast: of the image that they are to be compared with, over that of their own.
+    """
     reach = _reach(grading)
-    return np.asarray(np.clip(p - q, -reach, reach))
+    differences = p - q
+    if contrast != 1:
+        differences = np.rint(differences * np.float32(contrast)).astype(np.int16)
+    return np.asarray(np.clip(differences, -reach, reach))
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,
-                    grading: float) -> NDArray[np.float32]:
+                    grading: float, tests: Tests = TESTS) -> NDArray[np.float32]:
     """
     Graded match residual, in bits, for all |v_x|, |v_y| <= radius around centres y_k.
 
-    reference: (T, N) grades at x_k, of the first T tests; centres: (N, 2) whole pixels in the
+    reference: (T, N) grades at x_k by T tests; centres: (N, 2) whole pixels in the
     finely smoothed image B; grading in gray levels. Gives (P, P, N) with P = 2 radius + 1, indexed
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
@@ -49,7 +57,7 @@ def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: in
         np.abs(outcomes, out=outcomes)
         return outcomes.view(np.uint16)
 
-    sums = sum_over_tests(reference, fine, centres, radius, np.subtract, differ,
+    sums = sum_over_tests(reference, fine, centres, radius, tests, np.subtract, differ,
                           most=2 * reach)
     return np.divide(sums, 2 * reach, dtype=np.float32)
 

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from typing import Any
 
 import cv2
-from djet_ros.core.orb_pattern import REACH, TESTS
+from djet_ros.core.orb_pattern import reach, TESTS
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]
+Tests = NDArray[np.int64]
 
 # Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
 _BLOCK = 2048
@@ -30,19 +31,21 @@ _WARPED_BLOCK = 256
 _TESTS_AT_ONCE = 32
 
 
-def smooth(gray: Image) -> Image:
+def smooth(gray: Image, scale: float = 1.0) -> Image:
     """
     Smooth an (H, W) image the way ORB does before its binary tests, bit for bit.
 
-    ``cv2.GaussianBlur`` rounds differently, which flips 0.07 % of the descriptor bits.
+    scale: of the tests, and with them of the smoothing. ``cv2.GaussianBlur`` rounds differently,
+    which flips 0.07 % of the descriptor bits.
     """
-    kernel = cv2.getGaussianKernel(7, 2)
+    kernel = cv2.getGaussianKernel(7, 2 * scale)
     return np.asarray(cv2.sepFilter2D(gray, -1, kernel, kernel), np.uint8)
 
 
-def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0) -> NDArray[np.bool_]:
+def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0,
+                tests: Tests = TESTS) -> NDArray[np.bool_]:
     """(N,) bool mask of the points with a descriptor at every pixel within `radius`."""
-    margin = REACH + radius
+    margin = reach(tests) + radius
     height, width = shape[:2]
     return np.asarray((points[:, 0] >= margin) & (points[:, 0] < width - margin)
                       & (points[:, 1] >= margin) & (points[:, 1] < height - margin))
@@ -59,28 +62,29 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
 
 
 def intensities(smoothed: NDArray[Any], points: Pixels,
-                count: int = len(TESTS)) -> tuple[NDArray[Any], NDArray[Any]]:
+                tests: Tests = TESTS) -> tuple[NDArray[Any], NDArray[Any]]:
     """
-    Intensities at both ends p and q of the first tests around (N, 2) whole pixels, (count, N).
+    Intensities at both ends p and q of T tests around (N, 2) whole pixels, (T, N).
 
     Raises ValueError where a point is too close to the border for a descriptor.
     """
-    require_describable(points, smoothed, 0)
-    patches = gather_patches(smoothed, points, REACH)
-    px, py, qx, qy = TESTS[:count].T + REACH
+    require_describable(points, smoothed, 0, tests)
+    patches = gather_patches(smoothed, points, reach(tests))
+    px, py, qx, qy = tests.T + reach(tests)
     return patches[py, px], patches[qy, qx]
 
 
-def intensities_through(warp: Array, smoothed: NDArray[Any], points: Pixels,
-                        count: int = len(TESTS)) -> tuple[NDArray[Any], NDArray[Any]]:
+def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
+                        tests: Tests = TESTS) -> tuple[NDArray[Any], NDArray[Any]]:
     """
-    Intensities at both ends of the first tests, (count, N), on patches seen through a warp.
+    Intensities at both ends of T tests, (T, N), on patches seen through a warp.
 
-    warp: (N, 2, 2) derivatives dy/dx, not singular; points: (N, 2) whole pixels. The tests look
+    warp: (N, 2, 2) derivatives dy/dx, not singular; points: (N, 2) pixels. The tests look
     at dx = warp^-1 dy from the point, between pixels; beyond the image its border goes on.
     """
     inverse = np.linalg.inv(warp).astype(np.float32)
-    ends = np.concatenate([TESTS[:count, :2], TESTS[:count, 2:]]).astype(np.float32)
+    ends = np.concatenate([tests[:, :2], tests[:, 2:]]).astype(np.float32)
+    count = len(tests)
     values = np.empty((2 * count, len(points)), smoothed.dtype)
     for start in range(0, len(points), _WARPED_BLOCK):
         block = slice(start, start + _WARPED_BLOCK)
@@ -97,11 +101,11 @@ def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
 
 
 def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
-                     radius: int) -> NDArray[np.uint16]:
+                     radius: int, tests: Tests = TESTS) -> NDArray[np.uint16]:
     """
     Hamming match residual Q_k(v) = H(d(x_k), d(y_k + v)) for all |v_x|, |v_y| <= radius.
 
-    bits: (T, N) reference descriptors d(x_k), of the first T tests; centres: (N, 2) whole pixels
+    bits: (T, N) reference descriptors d(x_k) by T tests; centres: (N, 2) whole pixels
     y_k in the smoothed image B. Gives (P, P, N) with P = 2 radius + 1, indexed
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
@@ -109,45 +113,46 @@ def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
         np.not_equal(outcomes, reference, out=outcomes)
         return outcomes.view(np.uint8)
 
-    sums = sum_over_tests(bits, smoothed, centres, radius, np.less, differ, most=1)
+    sums = sum_over_tests(bits, smoothed, centres, radius, tests, np.less, differ, most=1)
     return sums.astype(np.uint16)
 
 
 def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels, radius: int,
-                   outcome: np.ufunc, differ: Callable[..., NDArray[Any]],
+                   tests: Tests, outcome: np.ufunc, differ: Callable[..., NDArray[Any]],
                    most: int) -> NDArray[np.uint32]:
     """
     Sum up, at every pixel of a window, by how much the tests differ from those at a reference.
 
-    reference: (T, N) of the first T tests; image: (H, W); centres: (N, 2) whole pixels in it.
+    reference: (T, N) of T tests; image: (H, W); centres: (N, 2) whole pixels in it.
     outcome(I(p), I(q)) is a test, of the type of the reference; differ(outcomes, reference), which
     may write over the outcomes, is unsigned, as wide, and at most `most`. Gives (P, P, N) with
     P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k]. Raises ValueError where a window
     does not fit into the image.
     """
-    require_describable(centres, image, radius)
+    require_describable(centres, image, radius, tests)
     sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
     # As many at once as can be summed in the type of the differences.
     at_once = min(_TESTS_AT_ONCE, np.iinfo(f'u{reference.itemsize}').max // most)
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
-        patches = gather_patches(image, centres[block], REACH + radius)
+        patches = gather_patches(image, centres[block], reach(tests) + radius)
         # What a mask has chosen comes points first, which is three times slower to compare.
         chosen = np.ascontiguousarray(reference[:, block])
-        sums[:, :, block] = _summed(chosen, patches, radius, outcome, differ, at_once)
+        sums[:, :, block] = _summed(chosen, patches, radius, tests, outcome, differ, at_once)
     return sums
 
 
-def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, outcome: np.ufunc,
-            differ: Callable[..., NDArray[Any]], at_once: int) -> NDArray[np.uint32]:
+def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, tests: Tests,
+            outcome: np.ufunc, differ: Callable[..., NDArray[Any]],
+            at_once: int) -> NDArray[np.uint32]:
     side = 2 * radius + 1
     total = np.zeros((side, side, patches.shape[2]), np.uint32)
     buffer = np.empty((at_once, *total.shape), reference.dtype)
-    tests = (TESTS[:len(reference)] + REACH).tolist()
-    for first in range(0, len(tests), at_once):
+    places = (tests + reach(tests)).tolist()
+    for first in range(0, len(places), at_once):
         some = slice(first, first + at_once)
-        outcomes = buffer[:len(tests[some])]
-        for one, (px, py, qx, qy) in zip(outcomes, tests[some]):
+        outcomes = buffer[:len(places[some])]
+        for one, (px, py, qx, qy) in zip(outcomes, places[some]):
             outcome(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
                     out=one)
         differences = differ(outcomes, reference[some, None, None])
@@ -183,9 +188,10 @@ def gather_patches(image: NDArray[Any], centres: Pixels, reach: int) -> NDArray[
     return points_last.reshape(side, side, len(centres))
 
 
-def require_describable(points: Pixels, image: NDArray[Any], radius: int) -> None:
+def require_describable(points: Pixels, image: NDArray[Any], radius: int,
+                        tests: Tests = TESTS) -> None:
     """Raise ValueError unless all (N, 2) points are `describable`."""
-    inside = describable(points, image.shape, radius)
+    inside = describable(points, image.shape, radius, tests)
     if not inside.all():
         raise ValueError(f'{int((~inside).sum())} points, the first at {points[~inside][0]}, are '
-                         f'within {REACH + radius} pixels of the image border')
+                         f'within {reach(tests) + radius} pixels of the image border')

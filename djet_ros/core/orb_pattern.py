@@ -10,7 +10,10 @@ Willow Garage, Inc., BSD licence, which stands in NOTICE).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 # fmt: off
 _COORDINATES = (
@@ -64,3 +67,20 @@ TESTS = np.array(_COORDINATES, dtype=np.int64).reshape(256, 4)
 
 # No test reaches further than this from the keypoint, in x or y.
 REACH = int(np.abs(TESTS).max())
+
+
+@lru_cache(maxsize=8)
+def pattern(count: int, scale: float) -> NDArray[np.int64]:
+    """
+    Give the first of ORB's tests (count, 4), which it ranks by how much they add, made smaller.
+
+    Their ends lie on whole pixels again; the order stays.
+    """
+    tests: NDArray[np.int64] = np.rint(TESTS[:count] * scale).astype(np.int64)
+    tests.setflags(write=False)
+    return tests
+
+
+def reach(tests: NDArray[np.int64]) -> int:
+    """Tell how far the ends of tests (T, 4) are from the keypoint at most, in x or y."""
+    return REACH if tests is TESTS else int(np.abs(tests).max(initial=0))

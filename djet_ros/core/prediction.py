@@ -24,14 +24,15 @@ _ROOM = 20.0
 
 
 def predict(previous: Features, current: Features, K: Array, known: Sequence[Array],
-            reach: float) -> Array:
+            reach: float, sure: bool = False) -> Array:
     """
     Tell where the previous features would be seen in the current image, were they far away.
 
     Gives pixels (N, 2). known: rotations (3, 3) that are likely, such as that of the motion
-    before; reach: pixels by which near things may move otherwise.
+    before; reach: pixels by which near things may move otherwise; sure: whether the first of the
+    known rotations has been measured, so that none has to be found.
     """
-    R = likely_rotation(previous, current, K, known, reach)
+    R = known[0] if sure else likely_rotation(previous, current, K, known, reach)
     turned = rays(K, previous.points) @ (K @ R).T
     # What is turned to behind the camera is far out of the image.
     return np.asarray(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3))

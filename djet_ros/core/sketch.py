@@ -10,13 +10,14 @@ which costs it little on the way to a basin; ``jet.minimise`` goes on exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 # The generators of rotations, (3, 3, 3): [e_i]_x.
 _GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
@@ -62,19 +63,29 @@ class _Expansion:
     sign: Array
 
 
-def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: int) -> Sketch:
+@dataclass(frozen=True)
+class Held:
+    """What a rotation costs that is not R (3, 3): w^T weight w, w from it by a vector (3,)."""
+
+    R: Array
+    weight: Array
+
+
+def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: int,
+               held: Held | None = None) -> Sketch:
     """
     Make some Levenberg-Marquardt steps from each of some poses, side by side.
 
-    Each is judged by itself and never ends above the cost of its start.
+    Each is judged by itself and never ends above the cost of its start; held: a rotation that
+    all are drawn to.
     """
     R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
     products = _products(problem)
-    here = _expand(problem, products, R, t, loss)
+    here = _held(_expand(problem, products, R, t, loss), R, held)
     damping = np.full(len(R), _DAMPING_AT_FIRST)
     for _ in range(steps):
         R_new, t_new = _moved(R, t, here.tangents, _damped_steps(here, damping))
-        there = _expand(problem, products, R_new, t_new, loss)
+        there = _held(_expand(problem, products, R_new, t_new, loss), R_new, held)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
         R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
@@ -83,11 +94,17 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
 
 
 def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
+    """Sum up losses (S,) where points also have to lie in front of both cameras."""
+    return np.asarray(losses_in_front(problem, sketch, loss).sum(1))
+
+
+def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
+                    signs: Sequence[float] = (1.0, -1.0)) -> Array:
     """
-    Sum up losses (S,) where points also have to lie in front of both cameras.
+    Losses (S, N) where points also have to lie in front of both cameras.
 
     Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
-    before that pay for their way to it. Taken is the sign of t that costs less.
+    before that pay for their way to it. Taken is the sign of t that costs less, of some.
     """
     t = sketch.t[:, :, None]
     m = sketch.R @ problem.rays_x
@@ -99,9 +116,9 @@ def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
     variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
     way = ((problem.rays_y[:2] - infinite) * along).sum(1) / np.sqrt(np.maximum(variance, 1e-24))
     squared = sketch.r**2
-    forward, backward = ((sketch.sign * loss(
-        squared + np.where(ahead, np.minimum(w, 0), 0)**2)[0]).sum(1) for w in (way, -way))
-    return np.asarray(np.minimum(forward, backward))
+    losses = np.stack([sketch.sign * loss(
+        squared + np.where(ahead, np.minimum(sign * way, 0), 0)**2)[0] for sign in signs])
+    return np.asarray(losses[losses.sum(2).argmin(0), np.arange(len(sketch))])
 
 
 def _products(problem: JetProblem) -> Array:
@@ -131,6 +148,18 @@ def _expand(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss
     return _Expansion((sign * losses).sum(1), weighted @ J.transpose(0, 2, 1),
                       (weighted @ (sign * e)[..., None])[..., 0], tangents,
                       e / np.sqrt(size), sign)
+
+
+def _held(expansion: _Expansion, R: Array, held: Held | None) -> _Expansion:
+    """Add what the rotations (S, 3, 3) cost for not being the one that is held."""
+    if held is None:
+        return expansion
+    off = Rotation.from_matrix(R @ held.R.T).as_rotvec()
+    pull = off @ held.weight
+    H, gradient = expansion.H.copy(), expansion.gradient.copy()
+    H[:, :3, :3] += held.weight
+    gradient[:, :3] += pull
+    return replace(expansion, costs=expansion.costs + (pull * off).sum(1), H=H, gradient=gradient)
 
 
 def _damped_steps(here: _Expansion, damping: Array) -> Array:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
+from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import in_front, nearest_rotation, rays, unit
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -10,6 +13,13 @@ from numpy.typing import NDArray
 
 # Translation X_B = X_A + t of a camera that drives straight ahead.
 FORWARD = np.array([0.0, 0.0, -1.0])
+
+# Matches that directions are sought by, pairs of them that are tried, and how many are found.
+_MATCHES_FOR_DIRECTIONS, _PAIRS, _DIRECTIONS = 600, 500, 3
+
+# Pixels that a match has to move beyond the turn to have a say, that it may be off the epipolar
+# line of a direction, and beyond which it does not belong to it.
+_MOVED, _OFF, _BEYOND = 0.5, 1.0, 2.0
 
 # As many matches, the most similar ones, tell a motion from the false ones; all of them are for
 # the optimisation.
@@ -50,9 +60,77 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
     return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
 
 
+@dataclass(frozen=True)
+class Known:
+    """
+    What others than the images tell of a motion.
+
+    turn: its rotation, and how sure that is; guess: a pose that it may be near, as another
+    odometry has it.
+    """
+
+    turn: Turn | None = None
+    guess: Pose | None = None
+
+    def rotations(self) -> list[Array]:
+        """Give what is known of the rotation, (3, 3) each, the surest first."""
+        return [one.R for one in (self.turn, self.guess) if one is not None]
+
+
+def known_starts(K: Array, x: Array, y: Array, known: Known) -> list[Pose]:
+    """
+    Collect the guess, and the directions that matches have under the turn.
+
+    x, y: (N, 2) pixels, the surest matches first.
+    """
+    starts = [] if known.guess is None else [known.guess]
+    if known.turn is not None:
+        some = thinned(len(x), _MATCHES_FOR_DIRECTIONS)
+        starts += [Pose(known.turn.R, t) for t in directions(K, x[some], y[some], known.turn.R)]
+        if known.guess is not None:
+            starts.append(Pose(known.turn.R, known.guess.t))
+        starts.append(Pose(known.turn.R, FORWARD))
+    return starts
+
+
+def directions(K: Array, x: Array, y: Array, R: Array) -> list[Array]:
+    """
+    Find directions of translation (3,) under a rotation R (3, 3), the one of most matches first.
+
+    Each match leaves a plane that t lies in; two of them leave t. The best of random pairs comes
+    first, and after it the best that those matches leave which are not its own: something may
+    move by itself. x, y: (N, 2) pixels.
+    """
+    focal = float(K[0, 0])
+    normals = np.cross(rays(K, x) @ R.T, rays(K, y)) * focal
+    # A match that hardly moves beyond the turn leaves no plane.
+    normals = normals[np.linalg.norm(normals, axis=1) > _MOVED]
+    found: list[Array] = []
+    while len(found) < _DIRECTIONS and len(normals) > 2:
+        one, other = np.random.default_rng(0).integers(0, len(normals), (2, _PAIRS))
+        tried = unit(np.cross(normals[one], normals[other]))
+        off = np.abs(tried @ normals.T)
+        # A match paired with itself leaves nothing, which everything would agree with.
+        agreement = np.maximum(1 - (off / _OFF)**2, 0).sum(1) * tried.any(1)
+        best = int(agreement.argmax())
+        if not agreement[best]:
+            break
+        found.append(tried[best])
+        normals = normals[off[best] > _BEYOND]
+    return found
+
+
 def thinned(count: int, most: int) -> slice:
     """Choose at most so many of a count of matches, evenly from their order."""
     return slice(None, None, max(1, -(-count // most)))
+
+
+def all_round(R: Array, count: int) -> list[Pose]:
+    """Give poses of one rotation with directions evenly over half a sphere, on a spiral."""
+    z = (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * (np.arange(count) + 0.5)
+    ring = np.sqrt(1 - z**2)
+    return [Pose(R, t) for t in np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)]
 
 
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:

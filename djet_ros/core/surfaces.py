@@ -16,33 +16,56 @@ from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import (
     describable,
     hamming_surfaces,
+    Image,
     intensities,
     intensities_through,
     Pixels,
+    smooth,
 )
+from djet_ros.core.masks import at
+from djet_ros.core.orb_pattern import pattern
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
     indefinite,
     Paraboloids,
     project_to_positive,
 )
+from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-# The outermost of a descriptor's tests is 13 pixels off, and moves by a quarter of a pixel.
+# The outermost of ORB's tests is 13 pixels off, and moves by a quarter of a pixel.
 _WARP_STEP = 0.02
+
+# Pixels between which a reference may stay as it was sampled.
+_NEAR_ENOUGH = 0.05
+
+# Side of the window around a place where the minimum is expected.
+_CLOSE = 3
+
+# Matches and tests by which the contrast is measured, and how far it may change.
+_MEASURED, _MEASURED_TESTS = 200, 32
+_MOST_CONTRAST = 8.0
+
+
+# Differences of tests grow by their absolute values, so that a surface is sharper at its minimum
+# than the paraboloid through it, which is drawn to the pixel that it is fitted around. A test
+# measures the share on rendered scenes.
+_GAIN = 0.75
 
 
 class ResidualSurface(Protocol):
     """
     What the joint optimiser asks of a match residual.
 
-    x: (N, 2) pixels of the reference points in the previous image.
+    x: (N, 2) pixels of the reference points in the previous image; gain: by what share of a small
+    displacement the minimum of a paraboloid follows it.
     """
 
     x: Array
+    gain: float
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """
@@ -58,77 +81,120 @@ class DescriptorSurface:
     """
     Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET).
 
-    H is the Hamming distance, or that of graded tests.
+    H is the Hamming distance, or that of graded tests. References are first taken at the whole
+    pixels next to x; once it is known how they look around y, they are taken between pixels, so
+    that the minimum falls on a whole pixel: there a paraboloid fits without a bias, and a smaller
+    window will do ("inverse compositional", Baker and Matthews, IJCV 2004).
     """
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
-        pixels = np.rint(x).astype(np.int64)
+        self.x, self._config = x, config
         self._distances = DescriptorDistances(config)
-        self._previous, self._current = (self._distances.seen(v) for v in (previous, current))
-        self._has_reference = describable(pixels, self._previous.shape)
-        self._reference = np.zeros((config.binary_tests, len(x)), self._distances.dtype)
-        self._reference[:, self._has_reference] = self._distances.reference(
-            self._previous, pixels[self._has_reference])
-        self._pixels, self._warp = pixels, np.repeat(np.eye(2)[None], len(x), axis=0)
-        self._radius = config.window // 2
-        self._sigma = config.window_sigma
+        self._previous, self._current = previous.tested, current.tested
+        self._has_reference = (self._distances.describable(x, self._previous.shape)
+                               & ~at(previous.mask, x))
+        self._mask = current.mask
+        self.gain = _GAIN if config.warp_reference else 1.0
         self._latest = _no_paraboloids(len(x))
-        self.x = pixels.astype(float) if config.snap_reference else x
+        # The reference of each match: how it was seen, and how far from its pixel y is expected.
+        self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
+        self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
+        self._contrast = 1.0
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Fit paraboloids to the surfaces around the whole pixels next to y."""
-        anew = np.zeros(len(y), bool) if warp is None else self._see_through(warp)
+        if warp is None:
+            return self._around_pixels(y)
+        moved = np.abs(self._latest.centres - y).max(1) > _NEAR_ENOUGH
+        warped = np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP
         centres = np.rint(y).astype(np.int64)
-        usable = self._has_reference & describable(centres, self._current.shape, self._radius)
-        # Most windows stay on their pixel from one round to the next, and so does their fit.
-        stale = usable & (anew | (centres != self._latest.centres).any(1))
-        surfaces = self._distances.surfaces(self._reference[:, stale], self._current,
-                                            centres[stale], self._radius)
-        fitted = fit_paraboloids(surfaces, centres[stale].astype(float), self._sigma)
-        self._latest = replace(_put(self._latest, fitted, stale), usable=usable)
+        usable = self._usable(centres, _CLOSE // 2)
+        # Most matches rest from one round to the next.
+        anew = usable & (moved | warped | ~self._latest.usable)
+        self._warp = np.where(anew[:, None, None], warp, self._warp)
+        self._offset = np.where(anew[:, None], y - centres, self._offset)
+        back = np.linalg.inv(warp[anew]) @ self._offset[anew][:, :, None]
+        references = self._distances.reference(
+            self._previous, self.x[anew] - back[:, :, 0], self._contrast, warp[anew])
+        return self._fitted(references, y, anew, usable, centres, _CLOSE)
+
+    def _around_pixels(self, y: Array) -> Paraboloids:
+        """Fit them with the references of whole pixels, as the paper does."""
+        side = self._config.window
+        centres = np.rint(y - self._offset).astype(np.int64)
+        usable = self._usable(centres, side // 2)
+        anew = usable & (centres + self._offset != self._latest.centres).any(1)
+        pixels = np.rint(self.x).astype(np.int64)
+        if np.isnan(self._latest.centres).all():
+            self._contrast = self._distances.contrast(
+                self._previous, pixels[usable], self._current, centres[usable])
+        references = self._distances.reference(self._previous, pixels[anew], self._contrast)
+        return self._fitted(references, y, anew, usable, centres, side)
+
+    def _fitted(self, references: NDArray[Any], y: Array, anew: NDArray[np.bool_],
+                usable: NDArray[np.bool_], centres: Pixels, side: int) -> Paraboloids:
+        """Fit those of some matches (N,) bool anew, and keep the others."""
+        surfaces = self._distances.surfaces(references, self._current, centres[anew], side // 2)
+        fitted = fit_paraboloids(surfaces, centres[anew] + self._offset[anew],
+                                 self._config.window_sigma)
+        self._latest = replace(_put(self._latest, fitted, anew), usable=usable)
         # A match that never had a surface stays where it is.
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
-    def _see_through(self, warp: Array) -> NDArray[np.bool_]:
-        """Sample reference descriptors through a warp; (N,) bool mask of those that it changed."""
-        anew: NDArray[np.bool_] = self._has_reference & (
-            np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP)
-        self._reference[:, anew] = self._distances.reference(
-            self._previous, self._pixels[anew], warp[anew])
-        self._warp = np.where(anew[:, None, None], warp, self._warp)
-        return anew
+    def _usable(self, centres: Pixels, radius: int) -> NDArray[np.bool_]:
+        return self._has_reference & ~at(self._mask, centres) & self._distances.describable(
+            centres, self._current.shape, radius)
 
 
 class DescriptorDistances:
     """The distance between descriptors that a configuration asks for: graded, or Hamming's."""
 
     def __init__(self, config: EstimatorConfig) -> None:
-        self._grading, self._count = config.grading, config.binary_tests
-        self.dtype: type[np.generic] = np.int16 if self._grading else np.bool_
+        self._grading, self._scale = config.grading, config.patch_scale
+        self._tests = pattern(config.binary_tests, config.patch_scale)
 
-    def seen(self, view: View) -> NDArray[Any]:
-        """Image (H, W) of a view as the tests see it, that `reference` and `surfaces` take."""
-        return smooth_finely(view.gray) if self._grading else view.smoothed
+    def seen(self, gray: Image) -> NDArray[Any]:
+        """Image (H, W) as the tests see it, that `reference` and `surfaces` take (View.tested)."""
+        return (smooth_finely if self._grading else smooth)(gray, self._scale)
 
-    def reference(self, seen: NDArray[Any], points: Pixels,
+    def describable(self, points: NDArray[Any], shape: tuple[int, ...],
+                    radius: int = 0) -> NDArray[np.bool_]:
+        """(N,) bool mask of the points with a descriptor at every pixel within `radius`."""
+        return describable(np.rint(points).astype(np.int64), shape, radius, self._tests)
+
+    def contrast(self, there: NDArray[Any], x: Pixels, here: NDArray[Any], y: Pixels) -> float:
+        """
+        Contrast of an image around whole pixels y (N, 2), over that of another around x (N, 2).
+
+        It is what a change of exposure makes it. Bits know of no contrast: 1.
+        """
+        if not self._grading or not len(x):
+            return 1.0
+        some, tests = thinned(len(x), _MEASURED), self._tests[:_MEASURED_TESTS]
+        sums = [np.abs(np.subtract(*intensities(image, points[some], tests))).sum(0, dtype=float)
+                for image, points in ((here, y), (there, x))]
+        ratio = float(np.median((sums[0] + 1) / (sums[1] + 1)))
+        return float(np.clip(ratio, 1 / _MOST_CONTRAST, _MOST_CONTRAST))
+
+    def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
         """
-        Descriptors (T, N) at (N, 2) whole pixels, perhaps seen through a warp (N, 2, 2).
+        Descriptors (T, N) at whole pixels, or seen through a warp (N, 2, 2) at any points (N, 2).
 
-        Raises ValueError where a point is too close to the border for a descriptor, and there is
-        no warp.
+        contrast: that of the image which they are to be compared with. Raises ValueError where a
+        point is too close to the border for a descriptor, and there is no warp.
         """
-        p, q = (intensities(seen, points, self._count) if warp is None else
-                intensities_through(warp, seen, points, self._count))
-        return grades(p, q, self._grading) if self._grading else p < q
+        p, q = (intensities(seen, np.asarray(points, np.int64), self._tests) if warp is None
+                else intensities_through(warp, seen, points, self._tests))
+        return grades(p, q, self._grading, contrast) if self._grading else p < q
 
     def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:
         """Distances (P, P, N) in bits between references (T, N) and all pixels of windows."""
         if self._grading:
-            return graded_surfaces(reference, seen, centres, radius, self._grading)
-        return hamming_surfaces(reference, seen, centres, radius)
+            return graded_surfaces(reference, seen, centres, radius, self._grading, self._tests)
+        return hamming_surfaces(reference, seen, centres, radius, self._tests)
 
 
 class PhotometricSurface:
@@ -146,8 +212,9 @@ class PhotometricSurface:
             for order in ((1, 0), (0, 1))]
         self._previous = previous.smoothed.astype(np.float32)
         self._reference = self._sample(self._previous, x)
-        self._has_reference = self._inside(x, previous.smoothed.shape)
-        self.x = x
+        self._has_reference = self._inside(x, previous.smoothed.shape) & ~at(previous.mask, x)
+        self._mask = current.mask
+        self.x, self.gain = x, 1.0
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
@@ -160,7 +227,7 @@ class PhotometricSurface:
         A = np.stack([a11, a12, a12, a22], axis=1).reshape(-1, 2, 2).astype(float)
         b = -np.stack([(gx * difference) @ W, (gy * difference) @ W], axis=1).astype(float)
         c = (difference**2 @ W).astype(float)
-        usable = self._has_reference & self._inside(y, self._image.shape)
+        usable = self._has_reference & self._inside(y, self._image.shape) & ~at(self._mask, y)
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
     def _sample(self, image: NDArray[np.float32], points: Array,
@@ -184,7 +251,7 @@ class ReprojectionSurface:
     """Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E)."""
 
     def __init__(self, x: Array, y: Array) -> None:
-        self.x = x
+        self.x, self.gain = x, 1.0
         self._y = y
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ class Status(StrEnum):
     TOO_FEW_MATCHES = 'TOO_FEW_MATCHES'
     NO_PARALLAX = 'NO_PARALLAX'
     DEGENERATE = 'DEGENERATE'
+    TOO_FEW_INLIERS = 'TOO_FEW_INLIERS'
+    AMBIGUOUS = 'AMBIGUOUS'
+    TWO_MOTIONS = 'TWO_MOTIONS'
     TIME_JUMP = 'TIME_JUMP'
     SIZE_CHANGED = 'SIZE_CHANGED'
 
@@ -50,13 +54,17 @@ class View:
     One image as the estimator wants it.
 
     gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix; features: its
-    features; smoothed: (H, W) uint8, gray as ORB's binary tests see it.
+    features; smoothed: (H, W) uint8, gray as ORB's binary tests see it; tested: (H, W), as the
+    tests of the descriptor surfaces do; mask: (H, W) bool, True where neither a feature nor a
+    surface may stand, or None.
     """
 
     gray: NDArray[np.uint8]
     K: Array
     features: Features
     smoothed: NDArray[np.uint8]
+    tested: NDArray[Any]
+    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -73,9 +81,12 @@ class RelativePose:
     The motion between two frames, ``x_current = R x_previous + t``, and what vouches for it.
 
     R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be estimated
-    (status NO_PARALLAX and all failures). covariance_5: (5, 5) over (rotation vector in rad,
-    two coordinates of t in the basis ``sphere_tangents(t)``); covariance_6: (6, 6) over
-    (rotation vector, t), of rank 5 because the length of t is fixed.
+    (status NO_PARALLAX and all failures). Three statuses hold a best guess, whose covariance
+    spans what else it may be: AMBIGUOUS, where a motion far off explains the matches as well;
+    TWO_MOTIONS, where two bodies move and nothing tells which of them is the world; and
+    TOO_FEW_INLIERS, where no more matches agree than false ones might. covariance_5: (5, 5) over
+    (rotation vector in rad, two coordinates of t in the basis ``sphere_tangents(t)``);
+    covariance_6: (6, 6) over (rotation vector, t), of rank 5 because the length of t is fixed.
 
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
     the place of y after its final step onto the epipolar line; inliers: (N,) bool;

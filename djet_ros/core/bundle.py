@@ -1,0 +1,213 @@
+"""
+Least squares over several frames: poses and inverse depths, from paraboloids around observations.
+
+The paper's joint epipolar tracking has one residual for each match, because with two frames an
+inverse depth can slide along its epipolar line without cost. Where more frames see a landmark,
+each sees it at a minimum y* with curvature A', and the residual has two numbers, the way from y*
+to the projection of the landmark, whitened by A'. Inverse depths are eliminated by the Schur
+complement, so that what is solved is as small as the poses are few.
+
+Poses are world to camera, ``X_camera = R X_world + t``, moved from the left: a step (omega,
+upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+from djet_ros.core.geometry import rays, rotation_exp
+from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
+
+# A landmark that was projected from this near or from behind, in its anchor's depths.
+_NEAREST = 1e-3
+
+# What is added to the information about an inverse depth, so that there always is some.
+_TRACE = 1e-9
+
+
+@dataclass
+class Poses:
+    """Poses of F frames: R (F, 3, 3), t (F, 3), see above."""
+
+    R: Array
+    t: Array
+
+    def between(self) -> tuple[Array, Array]:
+        """Motions from frame a to frame f: R (F, F, 3, 3) and t (F, F, 3), indexed [f, a]."""
+        R = np.einsum('fij,akj->faik', self.R, self.R)
+        return R, self.t[:, None] - np.einsum('faij,aj->fai', R, self.t)
+
+    def moved(self, step: Array) -> Poses:
+        """Give the poses moved by a step (6 F,)."""
+        step = step.reshape(-1, 6)
+        turns = np.array([rotation_exp(omega) for omega in step[:, :3]])
+        return Poses(turns @ self.R, np.einsum('fij,fj->fi', turns, self.t) + step[:, 3:])
+
+    def step_from(self, other: Poses) -> Array:
+        """Give the step (6 F,) that moves other poses to these, to first order."""
+        turns = self.R @ other.R.transpose(0, 2, 1)
+        omega = np.array([cv2.Rodrigues(turn)[0].ravel() for turn in turns])
+        return np.concatenate(
+            [omega, self.t - np.einsum('fij,fj->fi', turns, other.t)], axis=1).ravel()
+
+
+@dataclass
+class Landmarks:
+    """
+    N landmarks, and what F frames saw of them.
+
+    anchors: (N,) frames that saw them first; points: (N, 2) pixels there; rho: (N,) inverse
+    depths there; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
+    ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
+    """
+
+    anchors: NDArray[np.int64]
+    points: Array
+    rho: Array
+    minima: Array
+    roots: Array
+    seen: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.rho)
+
+    @classmethod
+    def at(cls, points: Array, rho: Array, anchor: int, frames: int) -> Landmarks:
+        """Make landmarks that no other frame has seen yet."""
+        n = len(rho)
+        return cls(np.full(n, anchor, np.int64), points, rho, np.zeros((n, frames, 2)),
+                   np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
+
+    def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
+        """Give some of the landmarks."""
+        return Landmarks(self.anchors[chosen], self.points[chosen], self.rho[chosen],
+                         self.minima[chosen], self.roots[chosen], self.seen[chosen])
+
+    def joined(self, other: Landmarks) -> Landmarks:
+        """Give these landmarks and others of the same frames."""
+        return Landmarks(*(np.concatenate(pair) for pair in zip(
+            vars(self).values(), vars(other).values(), strict=True)))
+
+    def with_frame(self) -> Landmarks:
+        """Give the same with room for what one more frame sees."""
+        return Landmarks(self.anchors, self.points, self.rho, *(
+            np.concatenate([array, np.zeros_like(array[:, :1])], axis=1)
+            for array in self._by_frame()))
+
+    def without_frame(self, frame: int) -> Landmarks:
+        """Give those that are anchored elsewhere, without what a frame saw."""
+        left = self.of(self.anchors != frame)
+        return Landmarks(left.anchors - (left.anchors > frame), left.points, left.rho,
+                         *(np.delete(array, frame, axis=1) for array in left._by_frame()))
+
+    def _by_frame(self) -> tuple[Any, ...]:
+        return self.minima, self.roots, self.seen
+
+
+def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
+    """Give places (N, 3) of landmarks in a frame, times their inverse depths in their anchors."""
+    R, t = poses.between()
+    turned = R[frame, landmarks.anchors]
+    places: Array = np.einsum('nij,nj->ni', turned, rays(K, landmarks.points))
+    return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
+
+
+def projected(K: Array, places: Array) -> Array:
+    """Project places (N, 3) in a camera to pixels (N, 2); what is behind it goes far out."""
+    image = places @ K.T
+    return np.asarray(image[:, :2] / np.maximum(image[:, 2:], _NEAREST))
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """
+    M observations and how they change: see ``linearise``.
+
+    landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); by_frame, by_anchor:
+    (M, 2, 6) over the steps of the two poses; by_rho: (M, 2).
+    """
+
+    landmark: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    anchor: NDArray[np.int64]
+    residuals: Array
+    by_frame: Array
+    by_anchor: Array
+    by_rho: Array
+
+
+def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
+    """Take the residuals of all observations, in the unit of their roots, and their Jacobians."""
+    landmark, frame = np.nonzero(landmarks.seen)
+    anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
+    motions = poses.between()
+    R, t = motions[0][frame, anchor], motions[1][frame, anchor]
+    ray = rays(K, landmarks.points[landmark])
+    place = np.einsum('nij,nj->ni', R, ray) + rho[:, None] * t
+    z = np.maximum(place[:, 2], _NEAREST)
+    root = landmarks.roots[landmark, frame]
+    off = projected(K, place) - landmarks.minima[landmark, frame]
+    # Of the projection: d(x / z) = (dx - x / z dz) / z.
+    shift = np.repeat(np.eye(3)[None, :2], len(z), axis=0)
+    shift[:, :, 2] = -place[:, :2] / z[:, None]
+    by_place = root @ (K[:2, :2] @ shift / z[:, None, None])
+    by_turned = by_place @ R
+    weight = rho[:, None, None]
+    return Linearised(
+        landmark, frame, anchor, np.einsum('nij,nj->ni', root, off),
+        np.concatenate([-by_place @ _skews(place), by_place * weight], axis=2),
+        np.concatenate([by_turned @ _skews(ray), -by_turned * weight], axis=2),
+        np.einsum('nij,nj->ni', by_place, t))
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """
+    Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), depths eliminated.
+
+    depth_change gives what becomes of the inverse depths with a step of the poses.
+    """
+
+    H: Array
+    g: Array
+    _coupling: Array
+    _variances: Array
+    _slopes: Array
+
+    def depth_change(self, step: Array) -> Array:
+        """Give steps (N,) of the inverse depths that go with a step (6 F,) of the poses."""
+        return np.asarray(-self._variances * (self._slopes + self._coupling @ step))
+
+
+def eliminate(linear: Linearised, weights: Array, frames: int, landmarks: int) -> Reduced:
+    """Sum up observations with weights (M,), and eliminate the inverse depths."""
+    count, rows = len(weights), np.arange(len(weights))[:, None]
+    J = np.zeros((count, 6 * frames, 2))
+    block = np.arange(6)
+    J[rows, 6 * linear.frame[:, None] + block] = linear.by_frame.transpose(0, 2, 1)
+    J[rows, 6 * linear.anchor[:, None] + block] += linear.by_anchor.transpose(0, 2, 1)
+    root = np.sqrt(weights)[:, None]
+    J *= root[:, None]
+    e, J_rho = linear.residuals * root, linear.by_rho * root
+    flat = J.transpose(0, 2, 1).reshape(-1, 6 * frames)
+    H, g = flat.T @ flat, flat.T @ e.ravel()
+    seen, first = np.unique(linear.landmark, return_index=True)
+    variances = np.zeros(landmarks)
+    slopes, coupling = np.zeros(landmarks), np.zeros((landmarks, 6 * frames))
+    if count:
+        variances[seen] = 1 / (np.add.reduceat((J_rho**2).sum(1), first) + _TRACE)
+        slopes[seen] = np.add.reduceat((J_rho * e).sum(1), first)
+        coupling[seen] = np.add.reduceat((J * J_rho[:, None]).sum(2), first, axis=0)
+    return Reduced(H - (coupling.T * variances) @ coupling,
+                   g - coupling.T @ (variances * slopes), coupling, variances, slopes)
+
+
+def _skews(vectors: Array) -> Array:
+    """Cross-product matrices (N, 3, 3) of vectors (N, 3)."""
+    x, y, z = vectors.T
+    nought = np.zeros(len(vectors))
+    return np.stack([nought, -z, y, z, nought, -x, -y, x, nought], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,189 @@
+"""
+Other motions that explain the matches of a pair: in another basin, or of another body.
+
+Two views can leave a choice. A few matches, or those of one plane, fit two motions about equally
+well; and where a lorry fills half of the image, each half has a motion of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from djet_ros.core.covariance import summed_by_cell
+from djet_ros.core.geometry import in_front
+from djet_ros.core.jet import JetProblem, Loss, robust_scale
+from djet_ros.core.sketch import losses_in_front, refine_all
+from djet_ros.core.starts import FORWARD, thinned
+from djet_ros.core.types import Array, Pose
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+# Standard deviations by which matches have to prefer a pose to be sure of it: one wrong of a
+# hundred that are as close as this.
+DECIDED = 2.33
+
+# rad; chosen: as much as a camera's motion may change from one pair to the next.
+_LIKE_BEFORE = 0.1
+
+# Matches on which rivals are refined before they are compared on all.
+_REFINED_ON = 400
+_STEPS = 6
+
+# Robust standard deviations: strays disagree with a motion for sure, and members agree with it.
+_STRAY, _MEMBER = 6.0, 3.0
+
+# chosen: a body with less than this share of the world's matches is not mistaken for it.
+_SMALL_SHARE = 0.125
+
+# A second motion is looked for among so many strays at most.
+_STRAYS = 150
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another motion, and by how many standard deviations the matches prefer the chosen one."""
+
+    pose: Pose
+    preference: float
+
+
+@dataclass(frozen=True)
+class SecondMotion:
+    """
+    Two motions in one pair; t of both has the sign that brings their points to the front.
+
+    first: the one that most matches follow; pose: the other one; members: (N,) bool mask of the
+    matches that agree with that; width: the area that those are spread over which follow it
+    alone, over that of those which follow the first alone.
+    """
+
+    first: Pose
+    pose: Pose
+    members: NDArray[np.bool_]
+    width: float
+
+
+def change(one: Pose, other: Pose) -> float:
+    """Measure ||p - p'||: rotation and direction together, in rad to first order."""
+    return float(np.linalg.norm(np.concatenate([(other.R - one.R).ravel() / np.sqrt(2),
+                                                other.t - one.t])))
+
+
+def apart(one: Pose, other: Pose) -> float:
+    """Measure how different two motions are while the sign of t is not yet settled."""
+    return min(change(one, other), change(one, Pose(other.R, -other.t)))
+
+
+def goes_on(before: Pose, one: Pose, other: Pose) -> bool:
+    """Tell whether a motion is like the one before, and another one clearly less so."""
+    near = change(before, one)
+    return near < _LIKE_BEFORE and 2 * near < change(before, other)
+
+
+def preferences(problem: JetProblem, places: Array, poses: Sequence[Pose], chosen: int,
+                loss: Loss) -> Array:
+    """
+    Tell by how many standard deviations matches prefer one of some poses to each (S,).
+
+    places: (N, 2) pixels of the matches. Vuong's test (Econometrica 1989): of two models that are
+    both fitted and neither a special case of the other, the summed difference of losses is about
+    normal, with the variance of its parts, and its sign tells which is nearer to the truth. The
+    matches of one cell err together, so these parts are cells: with D_c the difference in cell c,
+
+        z = sum_c D_c / sqrt(sum_c D_c^2).
+
+    The probability that a pose preferred by z is the wrong one is Phi(-z) at most. Points behind
+    the camera cost as ``sketch.losses_in_front`` says.
+    """
+    losses = losses_in_front(problem, refine_all(problem, poses, loss, 0), loss)
+    by_cell, = summed_by_cell(places, losses - losses[chosen])
+    return np.asarray(by_cell.sum(0) / np.sqrt(np.maximum((by_cell**2).sum(0), 1e-300)))
+
+
+def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> list[Pose]:
+    """Bring rivals to the minima of their basins, on some of the matches."""
+    some = problem.subset(thinned(len(problem.blur), _REFINED_ON))
+    refined = refine_all(some, rivals, loss, _STEPS)
+    return [refined.pose(number) for number in range(len(refined))]
+
+
+def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
+                  least: int) -> SecondMotion | None:
+    """
+    Look for a motion that most of the matches agree with which stray from the first one.
+
+    problem: all matches, with places (N, 2) in pixels; scale: robust standard deviation of the
+    residuals of those that agree; least: how many matches make a motion; a body that has much
+    fewer than the first is not looked for, as it is not mistaken for the world. Strays are far
+    from their epipolar line, or on its wrong half: a body that moves against the camera along its
+    way shares its lines, not their direction. None where strays are few, or agree no better than
+    false matches do: those off by a few pixels agree with many a motion, so it takes more than
+    half.
+    """
+    on = refine_all(problem, [first], Loss(), 0)
+    first = _in_front(problem, first, np.abs(on.r[0]) < _MEMBER * scale)
+    scale = float(np.clip(robust_scale(on.r[0]), scale, 3 * scale))
+    off = _distances(problem, first)
+    strays = np.flatnonzero(off > _STRAY * scale)
+    least = max(least, round(_SMALL_SHARE * (off < _MEMBER * scale).sum()))
+    if len(strays) < least:
+        return None
+    alone = problem.subset(strays)
+    starts = [first, Pose(first.R, FORWARD), *(Pose(first.R, axis) for axis in np.eye(3))]
+    rough = Loss('geman_mcclure', _STRAY * scale)
+    found = refine_all(alone.subset(thinned(len(strays), _STRAYS)), starts, rough, _STEPS)
+    tight = Loss('geman_mcclure', _MEMBER * scale)
+    seen = refine_all(alone, [found.pose(n) for n in range(len(found))], tight, 1)
+    best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
+    refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
+    pose = _in_front(alone, refined.pose(0), np.abs(refined.r[0]) < _MEMBER * scale)
+    members = _distances(problem, pose) < _MEMBER * scale
+    followers = members[strays].sum()
+    if followers < least or followers <= len(strays) / 2:
+        return None
+    only_first = (off < _MEMBER * scale) & ~members
+    only_second = members & (off > _STRAY * scale)
+    return SecondMotion(first, pose, members,
+                        _area(places[only_second]) / max(_area(places[only_first]), 1e-9))
+
+
+def false_alarms(agreeing: int, matches: int, chance: float) -> float:
+    """
+    Give the logarithm (base 10) of how many motions false matches would bring about.
+
+    chance: probability that a false match agrees with a motion. A motion through 5 of n matches
+    that k agree with is expected n - 5 (sizes) . C(n, k) . C(k, 5) . 10 (solutions) . chance^(k-5)
+    times by chance alone (a-contrario model of Moisan and Stival, IJCV 2004, for 5 points).
+    Below 0 it tells something about the world.
+    """
+    if agreeing <= 5:
+        return float('inf')
+    log = (np.log(max(matches - 5, 1) * 10.0) + _log_choose(matches, agreeing)
+           + _log_choose(agreeing, 5) + (agreeing - 5) * np.log(min(chance, 1.0)))
+    return float(log / np.log(10))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def _distances(problem: JetProblem, pose: Pose) -> Array:
+    """Distances (N,) of matches from their epipolar half-lines, in those of the residuals."""
+    plain = Loss()
+    seen = refine_all(problem, [pose], plain, 0)
+    # Indefinite surfaces that are kept as printed have losses below 0.
+    return np.asarray(np.sqrt(np.abs(losses_in_front(problem, seen, plain, signs=(1.0,))[0])))
+
+
+def _in_front(problem: JetProblem, pose: Pose, agreeing: NDArray[np.bool_]) -> Pose:
+    """Give t the sign that brings more of the points to the front of both cameras."""
+    rays_x, rays_y = problem.rays_x[:, agreeing].T, problem.rays_y[:, agreeing].T
+    ahead, behind = (in_front(pose.R, sign * pose.t, rays_x, rays_y).sum() for sign in (1, -1))
+    return pose if ahead >= behind else Pose(pose.R, -pose.t)
+
+
+def _area(places: Array) -> float:
+    """Area of the ellipse of one standard deviation of places (N, 2), but for a constant."""
+    return float(np.sqrt(max(np.linalg.det(np.cov(places.T)), 0.0))) if len(places) > 2 else 0.0

@@ -1,0 +1,427 @@
+"""
+A window of frames and of the landmarks that they share: what ties the lengths of steps together.
+
+A landmark keeps the descriptor of the frame that saw it first, its anchor, and its inverse depth
+there. Each later frame samples the landmark's surface anew where pose and depth let it be
+expected, seen through the warp that they imply: nothing is detected again, so nothing wanders.
+`djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
+what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
+al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from djet_ros.core.bundle import (
+    eliminate,
+    in_frame,
+    Landmarks,
+    linearise,
+    Linearised,
+    Poses,
+    projected,
+    Reduced,
+)
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import (
+    inverse_depths,
+    patch_warp,
+    rays,
+    skew,
+    sphere_tangents,
+    stretches,
+    unit,
+)
+from djet_ros.core.jet import Loss
+from djet_ros.core.masks import at
+from djet_ros.core.paraboloid import fit_paraboloids, inverse_2x2, Paraboloids
+from djet_ros.core.surfaces import DescriptorDistances, with_minimum
+from djet_ros.core.types import Array, RelativePose, View
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+
+@dataclass(frozen=True)
+class WindowTuning:
+    """Constants of the window, each with where it comes from ("chosen" was not searched)."""
+
+    # chosen for the price: twice as many of either changed the drift on real streets by noise
+    keyframes: int = 6
+    landmarks: int = 160
+    # pixels, in the median, by which landmarks have moved beyond what the turn alone moved them
+    # where a frame becomes a keyframe; 10 costs a third more and drifts as much
+    parallax: float = 25.0
+    # chosen: share of the landmarks that are seen no more, where it becomes one too
+    gone: float = 0.4
+    # chosen: side of the cells over which landmarks spread, as a share of that with one in each
+    cell: float = 0.75
+    # octaves of depth that count as equally near, when landmarks are chosen: 1 or 4 drift more
+    classes: float = 2.0
+    # what a pair's matches add to landmarks, which are some of them, as a share of what they tell
+    # of its rotation and direction: 0.1 drifts less than 1 on rendered and real streets
+    pair: float = 0.1
+    # chosen: Gauss-Newton steps for each frame; four come to the same
+    steps: int = 2
+    # robust standard deviations beyond which an observation is false, and where the loss bends
+    outlier: float = 4.0
+    bend: float = 3.0
+    # pixels; chosen, far below any noise
+    least_scale: float = 0.05
+    # as for pairs: what would be stretched or shrunk by more is no good reference any more
+    most_stretch: float = 2.0
+    # factor on the variances of observations: neighbours and later frames err alike
+    inflation: float = 2.0
+    # chosen: pixels between a landmark and a match of a pair that are taken for one another
+    beside: float = 1.5
+    # chosen: inverse depth, negative, to which noise takes what is infinitely far
+    beyond: float = 0.01
+    # chosen: so few landmarks do not tell a length
+    few: int = 8
+
+
+TUNING = WindowTuning()
+
+# Information that holds the first pose where it is, and the first length: the unit of the track.
+_HELD = 1e10
+_UNIT = 1e8
+
+# Information where there is none, so that what hangs on it can be eliminated.
+_HARDLY = 1e-6
+
+# Information about the rotation of a pair without parallax, which has no covariance: 1 mrad.
+_ROTATION_ALONE = 1e6
+
+# Median norm of a residual of two numbers, each with a standard deviation of one.
+_MEDIAN_NORM = 1.1774
+
+
+@dataclass(frozen=True)
+class Addition:
+    """
+    What a window says of its newest frame: its motion from the one before, and how long it is.
+
+    R (3, 3), t (3,) with its length in the unit of the track: x_new = R x_before + t; sigma:
+    standard deviation of the length, as if the frames before stood where the window has them.
+    """
+
+    R: Array
+    t: Array
+    length: float
+    sigma: float
+
+
+class Window:
+    """
+    Poses of keyframes and of the newest frame, and the inverse depths of their landmarks.
+
+    The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
+    """
+
+    def __init__(self, config: EstimatorConfig, tuning: WindowTuning = TUNING) -> None:
+        self._config, self._tuning = config, tuning
+        self._distances = DescriptorDistances(config)
+
+    def start(self, view: View) -> None:
+        """Forget everything; this frame is the first."""
+        self._K, self._images = view.K, [view.tested]
+        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
+        self._is_keyframe, self._has_landmarks = [True], [False]
+        self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
+        # What is known of the poses beside the landmarks: 1/2 d^T H d + g^T d, with d the step
+        # from where they were when they came.
+        self._H, self._g, self._known_at = np.eye(6) * _HELD, np.zeros(6), self._poses
+        self._scale = 1.0
+
+    @property
+    def is_new(self) -> bool:
+        """Whether there is one frame alone, so that the next pair makes the unit."""
+        return len(self._images) == 1
+
+    def add(self, view: View, relative: RelativePose, guess: float) -> Addition:
+        """
+        Take the next frame and the pair of the newest one with it.
+
+        guess: length of the pair, where landmarks do not tell. The first pair has it in any case,
+        and must have a direction.
+        """
+        # What the pair says, in a length by depths that the window knows.
+        first = self.is_new
+        length = guess if first else self._length(relative, guess)
+        self._choose_keyframe()
+        self._append(view, relative, length)
+        self._add_pair(relative, length, first)
+        # Landmarks, old and new, are measured in the frame; then all is refined together.
+        if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
+            self._found(relative, length)
+        self._measure()
+        H = self._refine()
+        addition = self._addition(H)
+        if first:  # by definition
+            addition = replace(addition, length=length)
+        # What is no keyframe goes, and so does the oldest where there are too many.
+        if len(self._images) > 2 and not self._is_keyframe[-2]:
+            self._forget(len(self._images) - 2)
+        if sum(self._is_keyframe) > self._tuning.keyframes:
+            self._take_along(0)
+            self._forget(0)
+        return addition
+
+    def landmarks(self) -> Array:
+        """Places (M, 3) of landmarks in the newest frame, in the unit of the track."""
+        sure = self._landmarks.of(np.asarray(
+            (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
+        places = in_frame(self._K, self._poses, sure, len(self._images) - 1)
+        return np.asarray(places / sure.rho[:, None])
+
+    def _length(self, relative: RelativePose, guess: float) -> float:
+        """Length of the pair: a robust mean over landmarks beside which it has a match."""
+        before = self._landmarks.of(np.asarray(
+            self._landmarks.seen[:, -1] & (self._landmarks.rho > 0)))
+        x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
+        if not relative.t.any() or len(before) < self._tuning.few or not len(x):
+            return guess
+        places = in_frame(self._K, self._poses, before, len(self._images) - 1)
+        away, match = cKDTree(x).query(projected(self._K, places),
+                                       distance_upper_bound=self._tuning.beside)
+        near = np.isfinite(away) & (places[:, 2] > 0)
+        if near.sum() < self._tuning.few:
+            return guess
+        in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x),
+                                         rays(self._K, y))
+        known = (before.rho / places[:, 2])[near]
+        length = _weighted_median(in_units[match[near]] / known, known / sigma[match[near]])
+        return length if length > 0 else guess
+
+    def _choose_keyframe(self) -> None:
+        """Make the newest frame a keyframe where landmarks moved since the last, or are gone."""
+        if self._is_keyframe[-1]:
+            return
+        newest = len(self._images) - 1
+        last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
+        here = self._landmarks.of(self._landmarks.seen[:, newest])
+        few = len(here) < (1 - self._tuning.gone) * self._tuning.landmarks
+        if not few:
+            turn = self._poses.R[newest] @ self._poses.R[last].T
+            turned, moved = (projected(self._K, places) for places in (
+                in_frame(self._K, self._poses, here, last) @ turn.T,
+                in_frame(self._K, self._poses, here, newest)))
+            way = np.median(np.linalg.norm(moved - turned, axis=1))
+            few = bool(way > self._tuning.parallax)
+        self._is_keyframe[-1] = few
+
+    def _append(self, view: View, relative: RelativePose, length: float) -> None:
+        R, t = self._poses.R[-1], self._poses.t[-1]
+        new = (relative.R @ R)[None], (relative.R @ t + length * relative.t)[None]
+        self._poses, self._known_at = (
+            Poses(np.concatenate([poses.R, new[0]]), np.concatenate([poses.t, new[1]]))
+            for poses in (self._poses, self._known_at))
+        # The second frame stays, for the unit is told by it.
+        self._is_keyframe.append(self.is_new)
+        self._has_landmarks.append(False)
+        self._images.append(view.tested)
+        self._mask = view.mask
+        self._landmarks = self._landmarks.with_frame()
+        self._H, self._g = np.pad(self._H, (0, 6)), np.pad(self._g, (0, 6))
+
+    def _add_pair(self, relative: RelativePose, length: float, first: bool) -> None:
+        """Add what all matches of the pair tell of its rotation and direction to the prior."""
+        R, t = relative.R, length * relative.t
+        # With steps (omega, upsilon) of the frame before and of the new one, the motion turns by
+        # omega_new - R omega_before and shifts by upsilon_new - [t]x omega_new - R upsilon_before.
+        J = np.zeros((6, 12))
+        J[:3, :3], J[3:, 3:6] = -R, -R
+        J[:3, 6:9], J[3:, 6:9], J[3:, 9:] = np.eye(3), -skew(t), np.eye(3)
+        if relative.t.any():
+            J_pair = np.concatenate([J[:3], sphere_tangents(relative.t).T @ J[3:] / length])
+            information = J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
+        else:
+            information = J[:3].T @ J[:3] * _ROTATION_ALONE
+        if not first:
+            information *= self._tuning.pair
+        else:
+            along = relative.t @ J[3:] / length
+            information += _UNIT * np.outer(along, along)
+        H = np.zeros_like(self._H)
+        H[-12:, -12:] = information
+        self._add_known(H, np.zeros(len(H)))
+
+    def _add_known(self, H: Array, g: Array) -> None:
+        """Add to the prior what is known around the poses as they are now."""
+        self._H += H
+        self._g += g - H @ self._poses.step_from(self._known_at)
+
+    def _found(self, relative: RelativePose, length: float) -> None:
+        """Make landmarks of the matches of a keyframe with the frame after it."""
+        tuning, anchor = self._tuning, len(self._images) - 2
+        self._has_landmarks[anchor] = True
+        x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
+        rho, _ = inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
+        usable = (rho > 0) & self._distances.describable(x, self._images[anchor].shape)
+        x, rho = x[usable], rho[usable]
+        here = self._landmarks.of(self._landmarks.seen[:, anchor])
+        present = projected(self._K, in_frame(self._K, self._poses, here, anchor))
+        side = tuning.cell * np.sqrt(self._images[anchor].size / tuning.landmarks)
+        # Near ones tell most. Only coarse classes of depth count: by the noisy depths themselves
+        # the largest errors would be chosen, and each step come out a little shorter.
+        nearest = np.argsort(-np.floor(np.log2(rho) / tuning.classes), kind='stable')
+        x, rho = x[nearest], rho[nearest]
+        chosen = _spread(x, present, side, tuning.landmarks - len(here))
+        self._landmarks = self._landmarks.joined(Landmarks.at(
+            x[chosen], rho[chosen] / length, anchor, len(self._images)))
+
+    def _measure(self) -> None:
+        """Sample the surfaces of landmarks in the newest frame, where they are expected."""
+        landmarks, newest = self._landmarks, len(self._images) - 1
+        places = in_frame(self._K, self._poses, landmarks, newest)
+        expected = projected(self._K, places)
+        radius = self._config.window // 2
+        # What is far out of the image need not be a number that fits into an integer.
+        expected = np.clip(expected, -1e6, 1e6)
+        wanted = (places[:, 2] > 0) & ~at(self._mask, expected) & self._distances.describable(
+            expected, self._images[newest].shape, radius)
+        # One that neither of the last two frames saw is gone.
+        wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
+        for anchor in range(newest):
+            mine = np.flatnonzero(wanted & (landmarks.anchors == anchor))
+            turn = self._poses.R[newest] @ self._poses.R[anchor].T
+            warp = patch_warp(self._K, turn, expected[mine], 1 / places[mine, 2])
+            least, most = stretches(warp)
+            limit = self._tuning.most_stretch
+            plausible = (least > 1 / limit) & (most < limit)
+            mine, warp = mine[plausible], warp[plausible]
+            if len(mine):
+                self._take(mine, self._surfaces(anchor, mine, warp, expected[mine], radius))
+
+    def _surfaces(self, anchor: int, mine: NDArray[np.int64], warp: Array, expected: Array,
+                  radius: int) -> Paraboloids:
+        """Paraboloids around expected places in the newest frame, for landmarks of an anchor."""
+        # References lie between pixels, so that the minimum is expected on a whole one: there a
+        # paraboloid fits without a bias.
+        centres = np.rint(expected).astype(np.int64)
+        back = np.linalg.inv(warp) @ (expected - centres)[:, :, None]
+        points = self._landmarks.points[mine] - back[:, :, 0]
+        contrast = self._distances.contrast(
+            self._images[anchor], np.rint(self._landmarks.points[mine]).astype(np.int64),
+            self._images[-1], centres)
+        reference = self._distances.reference(self._images[anchor], points, contrast, warp)
+        sampled = self._distances.surfaces(reference, self._images[-1], centres, radius)
+        return with_minimum(fit_paraboloids(sampled, expected, self._config.window_sigma),
+                            'drop')[0]
+
+    def _take(self, mine: NDArray[np.int64], fits: Paraboloids) -> None:
+        """Take the minima of paraboloids as observations, and their curvatures as weights."""
+        minima = fits.minima()
+        inside = np.abs(minima - fits.centres).max(1) <= self._config.window // 2
+        good = fits.usable & inside
+        # As in any least squares, what the best fit leaves over tells the noise.
+        left = np.maximum(fits.values(minima), 1e-3)[good]
+        spread = inverse_2x2(fits.A[good]) * left[:, None, None]
+        chosen = mine[good]
+        self._landmarks.minima[chosen, -1] = minima[good]
+        self._landmarks.roots[chosen, -1] = np.linalg.cholesky(
+            np.linalg.inv(spread)).transpose(0, 2, 1)
+        self._landmarks.seen[chosen, -1] = True
+
+    def _refine(self) -> Array:
+        """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
+        self._equalise()
+        for _ in range(self._tuning.steps):
+            reduced = self._reduced(self._linearised())
+            H, g = self._H + reduced.H, reduced.g + self._g + self._H @ (
+                self._poses.step_from(self._known_at))
+            step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
+            self._poses = self._poses.moved(step)
+            self._landmarks.rho += reduced.depth_change(step)
+        linear = self._linearised()
+        false = np.linalg.norm(linear.residuals, axis=1) > self._tuning.outlier * self._scale
+        self._landmarks.seen[linear.landmark[false], linear.frame[false]] = False
+        self._landmarks = self._landmarks.of(np.asarray(
+            self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
+        return H
+
+    def _equalise(self) -> None:
+        """Scale the roots in the newest frame so that a typical one is of a pixel."""
+        seen = self._landmarks.seen[:, -1]
+        roots = self._landmarks.roots[seen, -1]
+        if len(roots):
+            sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
+            self._landmarks.roots[seen, -1] = roots / np.median(sizes)
+
+    def _linearised(self) -> Linearised:
+        """All observations; their scale is told anew."""
+        linear = linearise(self._K, self._poses, self._landmarks)
+        if len(linear.residuals):
+            typical = float(np.median(np.linalg.norm(linear.residuals, axis=1))) / _MEDIAN_NORM
+            self._scale = max(typical, self._tuning.least_scale)
+        return linear
+
+    def _reduced(self, linear: Linearised) -> Reduced:
+        """Weigh observations robustly, and eliminate the depths."""
+        _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
+            (linear.residuals**2).sum(1))
+        return eliminate(linear, weights / (self._scale**2 * self._tuning.inflation),
+                         len(self._images), len(self._landmarks))
+
+    def _addition(self, H: Array) -> Addition:
+        """Read the newest motion off the window, and how sure its length is."""
+        R = self._poses.R[-1] @ self._poses.R[-2].T
+        t = self._poses.t[-1] - R @ self._poses.t[-2]
+        length = float(np.linalg.norm(t))
+        # Of the newest frame alone, the others held: an inverse of the block, not a block of the
+        # inverse, so that what the unit has drifted by before is not in it.
+        block = H[-6:, -6:]
+        covariance = np.linalg.inv(block + np.diag(1e-12 * np.diag(block)))
+        along = unit(t)
+        return Addition(R, t, length, float(np.sqrt(along @ covariance[3:, 3:] @ along)))
+
+    def _take_along(self, frame: int) -> None:
+        """Take what the landmarks of a frame tell into the prior, before it goes."""
+        everything = self._landmarks
+        self._landmarks = everything.of(everything.anchors == frame)
+        reduced = self._reduced(linearise(self._K, self._poses, self._landmarks))
+        self._add_known(reduced.H, reduced.g)
+        self._landmarks = everything
+
+    def _forget(self, frame: int) -> None:
+        """Eliminate a frame from the prior, and drop it with its landmarks."""
+        gone = np.zeros(len(self._H), bool)
+        gone[6 * frame:6 * frame + 6] = True
+        own, others = self._H[np.ix_(gone, gone)], self._H[np.ix_(~gone, gone)]
+        # Of a frame that a mere turn led to, nothing may be known but its rotation.
+        own = own + np.diag(1e-9 * np.diag(own) + _HARDLY)
+        gain = np.linalg.solve(own, others.T).T
+        H = self._H[np.ix_(~gone, ~gone)] - gain @ others.T
+        self._H, self._g = (H + H.T) / 2, self._g[~gone] - gain @ self._g[gone]
+        left = ~gone[::6]
+        self._poses, self._known_at = (Poses(poses.R[left], poses.t[left])
+                                       for poses in (self._poses, self._known_at))
+        self._landmarks = self._landmarks.without_frame(frame)
+        self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
+        lists: tuple[list[Any], ...] = self._images, self._is_keyframe, self._has_landmarks
+        for things in lists:
+            del things[frame]
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values, kind='stable')
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def _spread(chosen_from: Array, present: Array, side: float, room: int) -> NDArray[np.int64]:
+    """
+    Choose points (N, 2), the first of each cell before others.
+
+    Cells in which there are present ones come later.
+    """
+    cells, taken = (np.floor(points / side).astype(np.int64) @ (1, 2**20)
+                    for points in (chosen_from, present))
+    order = np.argsort(cells, kind='stable')
+    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(first, count)
+    rank += np.isin(cells, taken)
+    return np.asarray(np.argsort(rank, kind='stable')[:max(room, 0)])
