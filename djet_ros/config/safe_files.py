@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import re
 from typing import Any
 
 from djet_ros.errors import DjetError, one_line
@@ -11,9 +12,18 @@ import yaml
 # A pose file of 300,000 frames fits; a disk image given by mistake doesn't.
 LARGEST_TEXT = 64 << 20
 
-
 # Pure-Python YAML reads about 200 kB/s; the compiled loader overflows the stack on deep nesting.
 LARGEST_YAML = 2 << 20
+
+# OpenCV begins its files with what looks like a directive of YAML, and is none.
+_OPENCV_HEADER = re.compile(r'\A\ufeff?%YAML:\d[^\n]*')
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """Reads plain values, and OpenCV's matrices as the mappings that they are."""
+
+
+_Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', yaml.SafeLoader.construct_yaml_map)
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
@@ -33,10 +43,10 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Content of a YAML file: plain values only, no Python objects."""
-    text = read_text(path, LARGEST_YAML)
+    """Content of a YAML file, OpenCV's included: plain values only, no Python objects."""
+    text = _OPENCV_HEADER.sub('', read_text(path, LARGEST_YAML))
     try:
-        loader = yaml.SafeLoader(text)
+        loader = _Loader(text)
         node = loader.get_single_node()
         _unfolded(node, {})
         return None if node is None else loader.construct_document(node)

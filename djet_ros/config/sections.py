@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import math
 
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
 from djet_ros.core.parameter import check, parameter
@@ -28,10 +29,12 @@ class OdometryConfig:
         0.3, 'median displacement of the matches, in pixels, below which the camera stands still '
         'and the reference frame stays', minimum=0.0, maximum=10.0)
     scale: str = parameter(
-        'none', 'where the length of a translation comes from: none (unit length), constant '
-        '(scale_value), speed (a speed topic), camera_height (the height over the ground that the '
-        'images show), ground_truth (offline only)',
-        choices=('none', 'constant', 'speed', 'camera_height', 'ground_truth'))
+        'structure', 'where the length of a translation comes from: structure (one unit along the '
+        'track, by what frames share), none (unit length), constant (scale_value), speed (a speed '
+        'topic), camera_height (the height over the ground that the images show), guess (another '
+        'odometry), ground_truth (offline only)',
+        choices=('structure', 'none', 'constant', 'speed', 'camera_height', 'guess',
+                 'ground_truth'))
     scale_value: float = parameter(
         1.0, 'length of each translation in metres, for scale constant',
         minimum=1e-6, maximum=1e6)
@@ -45,24 +48,66 @@ class OdometryConfig:
     camera_pitch: float = parameter(
         0.0, 'degrees by which the camera looks down, to within 2, for scale camera_height; it '
         'must not roll', minimum=-30.0, maximum=80.0)
+    imu: bool = parameter(
+        False, 'whether the gyro of an IMU (topic imu) helps: it tells how the camera turns where '
+        'the images do not, and is weighed into what they tell')
+    imu_rotation: str = parameter(
+        '', "rotation of the IMU's axes to those of the camera (optical: z forward, x right, y "
+        "down), as a quaternion 'x y z w'; empty asks tf")
+    imu_offset: float = parameter(
+        0.0, "seconds by which the IMU's clock is ahead of that of the images (t_imu = t_image + "
+        'offset); djet lab imu-offset finds it', minimum=-10.0, maximum=10.0)
+    imu_noise: float = parameter(
+        2e-4, 'density of the white noise of the gyro, in rad/s per root of Hz, as a data sheet '
+        'has it', minimum=1e-8, maximum=1.0)
+    imu_bias_walk: float = parameter(
+        2e-5, "random walk of the gyro's bias, in rad/s² per root of Hz", minimum=0.0,
+        maximum=1.0)
+    guess: bool = parameter(
+        False, 'whether another odometry (topic guess, nav_msgs/Odometry) says where to begin to '
+        'look for a motion; its length is taken by scale guess')
+    mask: bool = parameter(
+        False, 'whether each image waits a moment for its mask (topic mask, mono8, by the same '
+        'stamp), of which pixels below 128 are left out')
+    mask_file: str = parameter(
+        '', 'PNG or JPEG file of the size of the images, as they come; pixels darker than 128, '
+        'such as those of the own bonnet, are left out')
     rectified: str = parameter(
         'auto', 'whether images come rectified: true (camera is P), false (camera is K, D), auto '
         "(true where the image topic's last name has 'rect' in it, else false)",
         choices=('auto', 'true', 'false'))
     frame_convention: str = parameter(
-        'optical', 'axes of all poses: optical (z forward, x right, y down) or body (x forward, '
-        'y left, z up)', choices=('optical', 'body'))
+        'body', 'axes of all poses in messages: body (x forward, y left, z up, as REP 103 has it '
+        'for what moves) or optical (z forward, x right, y down, as it has it for images)',
+        choices=('body', 'optical'))
     camera_frame: str = parameter(
-        '', "frame id of the camera in messages; empty takes the image's own")
+        '', "frame id of the camera in messages, along these axes; empty makes it of the image's: "
+        'with optical as it is, with body camera_optical_frame becomes camera_frame, and camera '
+        'becomes camera_body')
     odom_frame: str = parameter('odom', 'frame id in which the integrated pose is given')
     base_frame: str = parameter(
         '', 'frame id of the vehicle that carries the camera: its pose and velocity (x forward, y '
-        "left, z up) are then given instead of the camera's, by the mounting that tf knows (live "
-        'alone); empty gives those of the camera')
+        "left, z up) are then given instead of the camera's, by the mounting that tf knows, or "
+        '/tf_static of a recording; empty gives those of the camera')
 
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""
         check(self)
+        self.imu_quaternion()
+
+    def imu_quaternion(self) -> tuple[float, ...] | None:
+        """Give the quaternion x y z w of imu_rotation, of length one; None where tf is asked."""
+        if not self.imu_rotation.strip():
+            return None
+        try:
+            values = [float(word) for word in self.imu_rotation.replace(',', ' ').split()]
+        except ValueError:
+            values = []
+        length = math.hypot(*values)
+        if len(values) != 4 or not 0.9 < length < 1.1:
+            raise ValueError(f"imu_rotation is '{self.imu_rotation:.80}'; give a quaternion "
+                             "'x y z w' of length 1, or nothing")
+        return tuple(value / length for value in values)
 
 
 @dataclass(frozen=True)
@@ -156,8 +201,9 @@ class Config:
     """
 
     preset: str = parameter(
-        'best', 'defaults of the estimator: best (everything known to help) or paper (the '
-        'algorithm as printed); values given for the estimator come on top', choices=PRESETS)
+        'best', 'defaults of the estimator: best (everything known to help), fast (half the time, '
+        'for small computers) or paper (the algorithm as printed); values given for the '
+        'estimator come on top', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     slam: SlamConfig = field(default_factory=SlamConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -30,9 +30,12 @@ _PRESET_NOTE = """\
 """
 
 
-def load_yaml(path: Path, base: Config | None = None) -> Config:
+def load_yaml(path: Path, base: Config | None = None,
+              take: Callable[[Config, Mapping[str, Any]], Config] = with_values) -> Config:
     """
     Read a YAML file over the base configuration (by default all defaults).
+
+    take: how the configuration takes the values.
 
     Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with the
     node names ``/**`` and ``vo_node``. Raises DjetError, beginning with the path, on anything
@@ -40,7 +43,7 @@ def load_yaml(path: Path, base: Config | None = None) -> Config:
     """
     content = read_yaml(path)
     try:
-        return with_values(base or Config(), dict(_flatten(_ours(content))))
+        return take(base or Config(), dict(_flatten(_ours(content))))
     except DjetError as error:
         raise DjetError(f'{path}: {error}') from None
 

@@ -88,7 +88,7 @@ def diagnose(state: State, detail: str, counts: Counts, last: OdometryResult | N
     if rate is not None:
         values['rate (Hz)'] = f'{rate:.2f}'
     if last is not None:
-        values['scale'] = 'known' if last.scale_known else 'unknown'
+        values['scale'] = last.scale_kind.value
         if last.relative is not None:
             values.update(_pair(last.relative))
     values.update({f'to mend: {one.name}': one.text for one in complaints})

@@ -15,13 +15,15 @@ class Frame:
     An image as the odometry takes it.
 
     gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix in pixels, pixel centres
-    at integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame.
+    at integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame;
+    left_out: (H, W) bool, pixels that nothing is to be told from, or None.
     """
 
     gray: NDArray[np.uint8]
     K: Array
     stamp_ns: int
     frame_id: str = 'camera'
+    left_out: NDArray[np.bool_] | None = None
 
 
 def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Status
-from djet_ros.odometry.messages import camera_frame, seconds_and_rest
-from djet_ros.odometry.scale import ScaleSource
+from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_and_rest
+from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
 
 # Images over which shares are taken, and of which they say nothing yet.
@@ -60,7 +60,8 @@ class Health:
         """Take the result of an image."""
         self._fates.append('')
         self._equal, self._last = 0, result
-        if self._config.scale == 'none' or result.scale_known:
+        if self._config.scale in ('none', 'structure') or (
+                result.scale_kind is Scale.METRIC and result.measured):
             self._unknown_lengths = 0
         elif result.status in TRACKED:
             self._unknown_lengths += 1
@@ -82,7 +83,7 @@ class Health:
     def _frame(self) -> Complaint | None:
         if self._last is None:
             return None
-        frame, odom = camera_frame(self._config, self._last.frame_id), self._config.odom_frame
+        odom = self._config.odom_frame
         if self._config.base_frame == odom:
             return Complaint('base_frame is odom_frame', 'ERROR', (
                 f"both are called '{odom}', and no pose goes to tf; set odometry.base_frame"))
@@ -90,16 +91,17 @@ class Health:
             return Complaint('no frame_id', 'WARN', (
                 'the images have no frame_id, so that nobody knows what the poses are of, and '
                 'none goes to tf; set it in the camera driver, or odometry.camera_frame here'))
-        if frame == odom:
+        if _like_odom(self._config, self._last.frame_id):
             return Complaint('frame_id is odom_frame', 'ERROR', (
-                f"the camera's frame is called '{frame}' like odometry.odom_frame, and no pose "
+                f"the camera's frame is called '{odom}' like odometry.odom_frame, and no pose "
                 'goes to tf; set odometry.camera_frame or odometry.odom_frame'))
         return None
 
     def _mounting(self) -> Complaint | None:
         if self._last is None:
             return None
-        base, camera = self._config.base_frame, optical_frame(self._config, self._last.frame_id)
+        base, (camera, _) = self._config.base_frame, mounted_frame(
+            self._config, self._last.frame_id)
         return Complaint('no mounting on tf', 'WARN', (
             f"tf does not know where '{camera}' is on '{base}', and there is no odometry until it "
             'does; publish it by robot_state_publisher or by tf2_ros static_transform_publisher '
@@ -110,7 +112,7 @@ class Health:
             return None
         remedy = _REMEDIES.get(self._config.scale, 'choose another odometry.scale')
         return Complaint('no metric length', 'WARN', (
-            f'odometry.scale is {self._config.scale}, and no length is known: '
+            f'odometry.scale is {self._config.scale}, and no length is measured: '
             f'{scale.why_unknown(self._last.stamp_ns)}; '
             + remedy.format(topics=self._speed_topics)))
 
@@ -133,18 +135,17 @@ class Health:
             'and dropped; do two cameras publish on one topic?'))
 
 
-def optical_frame(config: OdometryConfig, image_frame: str) -> str:
-    """Name the frame whose mounting is looked for: that of the images, in optical axes."""
-    named = config.camera_frame if config.frame_convention == 'optical' else ''
-    return named or image_frame
-
-
 def has_frame(config: OdometryConfig, image_frame: str) -> bool:
     """Tell whether a camera has a name that can stand on tf."""
     if config.base_frame:
         return config.base_frame != config.odom_frame
-    named = bool(image_frame or config.camera_frame)
-    return named and camera_frame(config, image_frame) != config.odom_frame
+    return bool(config.camera_frame or image_frame) and not _like_odom(config, image_frame)
+
+
+def _like_odom(config: OdometryConfig, image_frame: str) -> bool:
+    """Tell whether a camera is called like the odom frame, by what its images or its poses say."""
+    return config.odom_frame in (config.camera_frame or image_frame,
+                                 camera_frame(config, image_frame))
 
 
 def why_restarted(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:

@@ -181,7 +181,7 @@ def _declared_size(raw: bytes) -> tuple[int, int]:
         if (scans := raw.count(b'\xff\xda')) > _MOST_SCANS:
             raise BadMessage('undecodable', f'JPEG image has {scans} scans, at most {_MOST_SCANS} '
                              'are decoded')
-        return _jpeg_size(raw)
+        return jpeg_size(raw)
     raise BadMessage('unknown_encoding', 'compressed image is neither JPEG nor PNG')
 
 
@@ -189,7 +189,8 @@ def _declared_size(raw: bytes) -> tuple[int, int]:
 _START_OF_FRAME = set(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
 
 
-def _jpeg_size(raw: bytes) -> tuple[int, int]:
+def jpeg_size(raw: bytes) -> tuple[int, int]:
+    """Give (width, height) that the beginning of a JPEG file declares. Raises BadMessage."""
     at = 2
     while at + 9 <= len(raw) and raw[at] == 0xff:
         marker = raw[at + 1]

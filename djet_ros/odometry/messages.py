@@ -18,7 +18,7 @@ from djet_ros.config.sections import NODE_NAME, OdometryConfig
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
-from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
+from djet_ros.odometry.scale import Scale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED
 import numpy as np
@@ -101,10 +101,22 @@ def camera_frame(config: OdometryConfig, image_frame: str) -> str:
     With the body convention the image's optical frame would be the wrong name:
     camera_optical_frame becomes camera_frame, and any other name gets the ending _body.
     """
-    if config.camera_frame or config.frame_convention == 'optical':
+    if config.camera_frame or config.frame_convention == 'optical' or not image_frame:
         return config.camera_frame or image_frame
     body = image_frame.replace('_optical', '', 1)
     return body if body != image_frame else f'{image_frame}_body'
+
+
+def mounted_frame(config: OdometryConfig, image_frame: str) -> tuple[str, Array]:
+    """
+    Name the frame whose place on base_frame is asked for; the images' optical axes in it (4, 4).
+
+    That is the configured camera_frame, along the axes of frame_convention, or the image's own.
+    """
+    axes = np.eye(4)
+    if config.camera_frame and config.frame_convention == 'body':
+        axes[:3, :3] = OPTICAL_TO_BODY
+    return config.camera_frame or image_frame, axes
 
 
 class MessageFactory:
@@ -151,6 +163,17 @@ class MessageFactory:
             r=np.eye(3).ravel(), p=np.hstack([K, np.zeros((3, 1))]).ravel(),
             binning_x=0, binning_y=0, roi=roi)
 
+    def imu(self, stamp: int, frame_id: str, rate: Array, acceleration: Array) -> Any:
+        """Make the Imu of a rate (3,) in rad/s and an acceleration (3,) in m/s², and no more."""
+        unknown = np.array([-1.0, *[0.0] * 8])
+        return self._type('sensor_msgs/msg/Imu')(
+            header=self.header(stamp, frame_id),
+            orientation=self._type('geometry_msgs/msg/Quaternion')(x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=unknown, angular_velocity=self._vector(rate),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=self._vector(acceleration),
+            linear_acceleration_covariance=np.zeros(9))
+
     def picture(self, stamp: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
         """Make the Image of an array (H, W), mono8, or (H, W, 3), bgr8."""
         image_type = self._type('sensor_msgs/msg/Image')
@@ -163,6 +186,21 @@ class MessageFactory:
             header=self.header(stamp, frame_id), height=height, width=width,
             encoding='mono8' if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
             step=pixels.size // height, data=data)
+
+    def cloud(self, stamp: int, frame_id: str, places: Array) -> Any:
+        """Make the PointCloud2 of places (M, 3), float32 x, y and z."""
+        cloud_type = self._type('sensor_msgs/msg/PointCloud2')
+        field = self._type('sensor_msgs/msg/PointField')
+        data: Any = np.ascontiguousarray(places, '<f4').view(np.uint8).ravel()
+        if hasattr(cloud_type, 'get_fields_and_field_types'):
+            # As for pictures.
+            data = array('B', data.tobytes())
+        return cloud_type(
+            header=self.header(stamp, frame_id), height=1, width=len(places),
+            fields=[field(name=name, offset=4 * number, datatype=7, count=1)
+                    for number, name in enumerate('xyz')],
+            is_bigendian=False, point_step=12, row_step=12 * len(places), data=data,
+            is_dense=True)
 
     def diagnostics(self, stamp: int, name: str, level: str, summary: str,
                     values: dict[str, str], hardware: str = '', frame_id: str = '') -> Any:
@@ -193,15 +231,15 @@ class FrameStatus(NamedTuple):
     """
     What a backend has to know of a frame beside its poses: see ``Messages.status``.
 
-    reference_ns: stamp of the frame that it was related to, or None; length_known: whether the
-    translation is in metres; stationary: whether the camera stood still, so that the next frame
+    reference_ns: stamp of the frame that it was related to, or None; scale: what the length of
+    the translation is in; stationary: whether the camera stood still, so that the next frame
     is related to the same reference.
     """
 
     stamp_ns: int
     status: Status
     reference_ns: int | None
-    length_known: bool
+    scale: Scale
     stationary: bool
 
 
@@ -212,7 +250,7 @@ def frame_status(message: Any) -> FrameStatus:
         values = {pair.key: pair.value for pair in message.status[0].values}
         reference = values['reference_stamp_ns']
         return FrameStatus(stamp, Status(values['status']), int(reference) if reference else None,
-                           values['length'] == 'metric', values['stationary'] == 'true')
+                           Scale(values['length']), values['stationary'] == 'true')
     except (IndexError, KeyError, ValueError) as error:
         raise DjetError(f'the status of {stamp} ns lacks something: {error}') from None
 
@@ -251,8 +289,9 @@ class Messages(MessageFactory):
 
         One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
         frame that the relative poses of the same stamp start from, empty where there is none;
-        'length' is metric or unknown; 'stationary' is true or false. Level OK: there is a
-        relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
+        'length' is metric, relative (to the first step of the track) or unknown; 'stationary' is
+        true or false. Level OK: there is a relative pose; WARN: the odometry started or restarted
+        here; ERROR: a bad pair.
         """
         tracked = result.status in TRACKED
         level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
@@ -261,8 +300,8 @@ class Messages(MessageFactory):
             result.stamp_ns, f'{self._node}: relative pose', level, result.status.value, {
                 'status': result.status.value,
                 'reference_stamp_ns': str(result.previous_stamp_ns) if tracked else '',
-                'length': 'metric' if tracked and result.scale_known else 'unknown',
-                'stationary': str(result.stationary).lower()}, frame, frame)
+                'length': (result.scale_kind if tracked else Scale.UNKNOWN).value,
+                'stationary': str(result.stationary).lower()}, result.frame_id, frame)
 
     def odometry(self, result: OdometryResult) -> Any:
         """
@@ -280,6 +319,10 @@ class Messages(MessageFactory):
                 twist=self._type('geometry_msgs/msg/Twist')(
                     linear=self._vector(velocity[:3]), angular=self._vector(velocity[3:])),
                 covariance=(covariance + LEAST_COVARIANCE).ravel()))
+
+    def landmarks(self, result: OdometryResult, places: Array) -> Any:
+        """Make the PointCloud2 of places (M, 3) along the optical axes of the images' frame."""
+        return self.cloud(result.stamp_ns, result.frame_id, places)
 
     def pose_stamped(self, result: OdometryResult) -> Any:
         """Make the PoseStamped of the integrated pose in the odom frame."""

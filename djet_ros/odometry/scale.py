@@ -11,12 +11,14 @@ from abc import abstractmethod
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum, unique
 from typing import Protocol
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.ground import Ground, GroundMotion
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
+from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.interpolation import positions_at
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +49,35 @@ _BOUNCE = np.radians(0.2)
 _SURPRISE = 20.0
 
 
+@unique
+class Scale(StrEnum):
+    """What lengths are in: metres, the one unit of the track, or nothing that lasts."""
+
+    METRIC = 'metric'
+    RELATIVE = 'relative'
+    UNKNOWN = 'unknown'
+
+
 @dataclass(frozen=True)
 class Length:
-    """How long a translation is, in metres where it is known and in units where it is not."""
+    """
+    How long a translation is.
+
+    known: whether value and sigma mean anything, in metres if `metric`, otherwise in the unit
+    that all lengths of the track have in common; measured: whether its source measured it.
+    """
 
     value: float
     sigma: float
     known: bool
+    metric: bool = True
+    measured: bool = True
+
+    @property
+    def scale(self) -> Scale:
+        """Tell what the length is in."""
+        return (Scale.UNKNOWN if not self.known else
+                Scale.METRIC if self.metric else Scale.RELATIVE)
 
 
 class ScaleSource(Protocol):
@@ -61,7 +85,13 @@ class ScaleSource(Protocol):
     Something that knows how far the camera went.
 
     What it does not use of what it is shown, and what it does not measure, it leaves as it is.
+
+    carried: whether the landmarks that frames share carry its scale from step to step, and on
+    where it falls silent; exact: whether each length that it knows is right as it is.
     """
+
+    carried: bool = True
+    exact: bool = False
 
     def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
                 relative: RelativePose) -> None:
@@ -88,6 +118,16 @@ class ScaleSource(Protocol):
 class UnitScale(ScaleSource):
     """Every translation has length one, and nothing is known."""
 
+    carried = False
+
+    def between(self, start_ns: int, end_ns: int) -> Length:
+        """Give one, unknown."""
+        return unknown(1.0)
+
+
+class Unmeasured(ScaleSource):
+    """Nothing measures metres; landmarks carry one unit, the length of the first step."""
+
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Give one, unknown."""
         return unknown(1.0)
@@ -95,6 +135,8 @@ class UnitScale(ScaleSource):
 
 class ConstantScale(ScaleSource):
     """Every translation has the same known length in metres; uncertainty is a share of it."""
+
+    carried, exact = False, True
 
     def __init__(self, metres: float, uncertainty: float = 0.05) -> None:
         self._length = Length(metres, metres * uncertainty, True)
@@ -245,8 +287,35 @@ class CameraHeightScale(ScaleSource):
         self._seen_ns = stamp_ns
 
 
+class GuessScale(ScaleSource):
+    """How far another odometry says that the camera went."""
+
+    def __init__(self, uncertainty: float = 0.05) -> None:
+        self._uncertainty = uncertainty
+        self.guess = Guess()
+
+    def why_unknown(self, stamp_ns: int) -> str:
+        """Say what is missing of the guess."""
+        return ('nobody says where the camera is in the frame of the guess'
+                if self.guess.mounting is None else 'no guess covers the time of the newest image')
+
+    def between(self, start_ns: int, end_ns: int) -> Length:
+        """Give the way of the guess, unknown where it has none."""
+        motion = self.guess.motion(start_ns, end_ns)
+        if motion is None:
+            return unknown(1.0)
+        metres = float(np.linalg.norm(motion[:3, 3]))
+        return Length(metres, max(metres * self._uncertainty, 1e-3), True)
+
+    def reset(self) -> None:
+        """Forget all poses."""
+        self.guess.reset()
+
+
 class GroundTruthScale(ScaleSource):
     """Distances between known positions (N, 3) in metres at increasing stamps (N,)."""
+
+    exact = True
 
     def __init__(self, stamps_ns: NDArray[np.int64], positions: Array,
                  uncertainty: float = 0.05) -> None:
@@ -291,7 +360,7 @@ def scale_source(config: OdometryConfig,
         return kind(*parameters)
     if ground_truth is None:
         raise DjetError("odometry.scale is 'ground_truth', and there is no ground truth; "
-                        'give poses, or choose none, constant or speed')
+                        'give poses, or choose structure, constant or speed')
     return kind(*ground_truth, *parameters)
 
 
@@ -300,9 +369,11 @@ def _made_of(config: OdometryConfig) -> tuple[Callable[..., ScaleSource], tuple[
     share = config.scale_uncertainty
     kinds: dict[str, tuple[Callable[..., ScaleSource], tuple[float, ...]]] = {
         'none': (UnitScale, ()),
+        'structure': (Unmeasured, ()),
         'constant': (ConstantScale, (config.scale_value, share)),
         'speed': (SpeedScale, (share,)),
         'camera_height': (CameraHeightScale, (
             config.camera_height, np.radians(config.camera_pitch), share)),
+        'guess': (GuessScale, (share,)),
         'ground_truth': (GroundTruthScale, (share,))}
     return kinds[config.scale]

@@ -13,15 +13,19 @@ from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.core.types import Array
+from djet_ros.odometry.beside import Beside
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import Complaint, has_frame, Health, why_restarted
 from djet_ros.odometry.images import BadMessage, gray_image
-from djet_ros.odometry.messages import Messages, MessageType, stamp_ns
+from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
+from djet_ros.odometry.static_frames import Transform
 from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
+import numpy as np
+from numpy.typing import NDArray
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
 
@@ -44,6 +48,8 @@ class Tracker:
     the resolved name of the images' topic, by which odometry.rectified 'auto' goes; speed_topics
     are where speeds are heard, for people.
 
+    still_mask is what odometry.mask_file leaves out of all images, (H, W) bool.
+
     node is the name by which the diagnostics are told from those of others.
 
     Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
@@ -53,7 +59,8 @@ class Tracker:
 
     def __init__(self, config: Config, message_type: MessageType,
                  scale: ScaleSource | None = None, image_topic: str = '',
-                 speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME) -> None:
+                 speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME,
+                 still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config = config
         # What a face adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
@@ -61,7 +68,9 @@ class Tracker:
         self._image_topic = image_topic
         self._speed_topics = speed_topics
         self._scale = scale or scale_source(config.odometry)
-        self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale)
+        self._beside = Beside(config.odometry, self._scale, still_mask)
+        self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale,
+                                        self._beside.gyro, self._beside.guess)
         self._node = node
         self._mounting: Array | None = None
         self._messages = Messages(message_type, config.odometry, node)
@@ -79,6 +88,7 @@ class Tracker:
         """
         self._odometry.reset()
         self._scale.reset()
+        self._beside.reset()
         self._forget()
 
     def _forget(self) -> None:
@@ -111,6 +121,8 @@ class Tracker:
             self._scale = scale_source(after)
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
+        self._beside.configure(after, self._scale)
+        self._odometry.listen_to(self._beside.gyro, self._beside.guess)
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
         self._path = deque(self._path if before == after else (),
@@ -149,22 +161,36 @@ class Tracker:
             self._drop(reason)
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
-            gray = self._camera.undistort(gray_image(message))
+            raw = gray_image(message)
+            gray = self._camera.undistort(raw)
+            left_out = self._beside.left_out(stamp, raw.shape, self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
-        return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id))
+        return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id,
+                                   left_out))
 
     @property
     def mounted(self) -> bool:
         """Whether all is known of the frame whose pose is asked for."""
         return not self.config.odometry.base_frame or self._mounting is not None
 
-    def mount(self, mounting: Array) -> None:
-        """Take the camera in base_frame (4, 4); until then there is nothing in the odom frame."""
-        self._mounting = mounting
-        self._messages = Messages(self._message_type, self.config.odometry, self._node, mounting)
+    def mount(self, transform: Transform, image_frame: str) -> str:
+        """
+        Ask where the camera is on base_frame; until that is known nothing is in the odom frame.
+
+        image_frame: frame_id of the images. Gives what was found in words, or nothing.
+        """
+        config = self.config.odometry
+        camera, axes = mounted_frame(config, image_frame)
+        found = transform(config.base_frame, camera)
+        if found is None:
+            return ''
+        self._mounting = np.asarray(found @ axes)
+        self._messages = Messages(self._message_type, config, self._node, self._mounting)
+        x, y, z = found[:3, 3]
+        return f'{camera} is at ({x:.3f}, {y:.3f}, {z:.3f}) m on {config.base_frame}'
 
     def pause(self) -> None:
         """Drop all images until ``resume``; whatever is known by then stays known."""
@@ -195,6 +221,34 @@ class Tracker:
         linear = (message.twist.twist if hasattr(message.twist, 'twist') else message.twist).linear
         self._scale.add_speed(stamp_ns(message.header), math.hypot(linear.x, linear.y, linear.z))
 
+    def imu(self, message: Any) -> None:
+        """Take an Imu, for odometry.imu."""
+        self._beside.imu(message)
+
+    def guess(self, message: Any) -> None:
+        """Take an Odometry as a guess, for odometry.guess and odometry.scale 'guess'."""
+        self._beside.other_odometry(message)
+
+    def mask(self, message: Any) -> None:
+        """Take the mask of an image, for odometry.mask."""
+        self._beside.mask(message)
+
+    def lacks(self, image: Any) -> str:
+        """
+        Name what has still to come before an image is worked on, if anything.
+
+        A face waits for it for a moment. What comes later is of no use to that image.
+        """
+        return self._beside.lacks(stamp_ns(image.header))
+
+    def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
+        """Name frames (parent, child) of which a mounting is still wanted, by 'imu' or 'guess'."""
+        return self._beside.wanted_mountings(image_frame)
+
+    def mount_beside(self, what: str, mounting: Array) -> None:
+        """Take a mounting (4, 4) that was wanted."""
+        self._beside.mount(what, mounting)
+
     def count_dropped(self, reason: str, number: int = 1) -> None:
         """Count images that a face received and did not hand on."""
         self.counts.received += number
@@ -204,13 +258,16 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        return self._health.complaints(self._scale, self.mounted)
+        frame = self.last.frame_id if self.last else ''
+        return [*self._health.complaints(self._scale, self.mounted),
+                *self._beside.complaints(frame)]
 
     def diagnosis(self) -> Diagnosis:
         """Say how the odometry is doing."""
         diagnosis = diagnose(self.state, self.detail, self.counts,
                              self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
+        diagnosis.values.update(self._beside.values())
         diagnosis.values.update(self.face_values)
         return diagnosis
 
@@ -228,6 +285,13 @@ class Tracker:
         return Outgoing('debug_image', self._messages.picture(
             self._frame.stamp_ns, self._frame.frame_id,
             debug_image(self._frame.gray, self.last.relative)))
+
+    def landmarks(self) -> Outgoing | None:
+        """Give the landmarks of the last pair; None where none of them carry its scale."""
+        if self._frame is None or self.last is None or self.last.status not in TRACKED \
+                or self.last.stationary or not len(places := self._odometry.landmarks()):
+            return None
+        return Outgoing('landmarks', self._messages.landmarks(self.last, places))
 
     def _without_camera(self, stamp: int) -> list[Outgoing]:
         """Drop an image for want of a camera; an unusable CameraInfo stays the problem."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.fusion import agrees, fused, Turn
+from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
-from djet_ros.odometry.scale import Length, scale_source, ScaleSource
+from djet_ros.odometry.guess import as_start, Guess
+from djet_ros.odometry.inertial import Gyro
+from djet_ros.odometry.scale import Length, Scale, scale_source, ScaleSource
+from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.uncertainty import (
     compose,
     motion_covariance,
@@ -24,6 +29,13 @@ TRACKED = (Status.OK, Status.NO_PARALLAX)
 # Statuses of a frame at which the odometry started or restarted, without a pair.
 STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
 
+# Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
+# that are where they were if the camera stands in front of traffic.
+_CELL, _STILL = 32, 0.2
+
+# Radians by which a camera that stands still turns from frame to frame.
+_STILL_TO_WITHIN = 2e-4
+
 
 @dataclass(frozen=True)
 class OdometryResult:
@@ -33,9 +45,12 @@ class OdometryResult:
     stamp_ns, frame_id: of the frame; status; previous_stamp_ns: of the reference frame that it
     was related to, None where it restarted; relative: the estimator's answer for that pair;
     motion: (4, 4) the current camera in the reference camera; pose: (4, 4) the current camera in
-    the first camera (the last known one where the motion could not be estimated);
+    the first camera (where the motion could not be estimated the last known one, turned as far
+    as a gyro tells);
     motion_covariance, pose_covariance: (6, 6) in ROS order; scale: length that a unit translation
-    was given; scale_known: whether that is metres; stationary: whether the camera stood still.
+    was given; scale_known: whether that means anything, in metres if `metric` and otherwise in the
+    one unit of the track; measured: whether its source measured it, and not landmarks alone;
+    stationary: whether the camera stood still.
 
     since_ns: stamp of the newest frame that was where the reference frame is, which is later
     where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
@@ -56,6 +71,13 @@ class OdometryResult:
     stationary: bool = False
     since_ns: int | None = None
     since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    metric: bool = True
+    measured: bool = True
+
+    @property
+    def scale_kind(self) -> Scale:
+        """Tell what the length of the translation is in."""
+        return Length(self.scale, 0.0, self.scale_known, self.metric).scale
 
 
 class VisualOdometry:
@@ -73,10 +95,18 @@ class VisualOdometry:
 
     def __init__(self, estimator: EstimatorConfig | None = None,
                  odometry: OdometryConfig | None = None,
-                 scale: ScaleSource | None = None) -> None:
+                 scale: ScaleSource | None = None, gyro: Gyro | None = None,
+                 guess: Guess | None = None) -> None:
         odometry = odometry or OdometryConfig()
+        self._one_scale = OneScale()
+        self._last: Frame | None = None
         self.configure(estimator or EstimatorConfig(), odometry, scale or scale_source(odometry))
+        self.listen_to(gyro, guess)
         self.reset()
+
+    def listen_to(self, gyro: Gyro | None, guess: Guess | None) -> None:
+        """Go by what a gyro and another odometry tell, from the next frame on."""
+        self._gyro, self._guess = gyro, guess
 
     def configure(self, estimator: EstimatorConfig, odometry: OdometryConfig,
                   scale: ScaleSource) -> None:
@@ -84,12 +114,20 @@ class VisualOdometry:
         self._config = odometry
         self._estimator = TwoViewEstimator(estimator)
         self._scale = scale
+        anew = self._one_scale.configure(estimator, scale, odometry.scale_uncertainty)
+        if anew and self._last is not None:
+            self._one_scale.begin(self._view)
+
+    def landmarks(self) -> Array:
+        """Places (M, 3) of the landmarks that carry the scale, in the newest tracked camera."""
+        return self._one_scale.landmarks()
 
     def reset(self) -> None:
         """Forget everything; the next frame is the first."""
-        self._last: Frame | None = None
+        self._last = None
+        self._one_scale.reset()
         self._prior: RelativePose | None = None
-        self._bad_pairs = 0
+        self._bad_pairs = self._since_ns = self._known_ns = 0
         self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
 
     def process(self, frame: Frame) -> OdometryResult:
@@ -100,18 +138,25 @@ class VisualOdometry:
         if last and frame.stamp_ns == last.stamp_ns:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
         # Features are found once: now for the current frame, next time for the reference.
-        view = self._estimator.view(frame.gray, frame.K)
+        view = self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
         if status is not Status.OK:
             return self._start(frame, view, status, backwards=bool(
                 last and frame.stamp_ns < last.stamp_ns))
 
-        # The pair: the motion before it is one of its starting poses.
-        relative = self._estimator.estimate(self._view, view, self._prior)
-        length = self._length(frame, view, relative)
-        if self._stands_still(relative):
-            return self._stay(frame, relative, length)
+        # The pair: the motion before it, and what others know, are some of its starting poses.
+        known = self._known(frame)
+        relative = self._estimator.estimate(self._view, view, self._prior, known)
+        # While the camera stood there was no way, whatever a wheel's noise may add up to.
+        span = self._since_ns, frame.stamp_ns
+        self._scale.observe(*span, self._view, view, relative)
+        if self._stands_still(frame, relative):
+            return self._stay(frame, relative, self._one_scale.of_rest(span))
+        relative = self._weighed(frame, relative, known.turn)
         if relative.status not in TRACKED:
-            return self._lose(frame, view, relative, length)
+            return self._lose(frame, view, relative, self._one_scale.of_rest(span))
+
+        # Its length in the one scale of the track, by what frames share or by what measures it.
+        length = self._one_scale.of_step(span, view, relative)
 
         # Integrate the motion and its uncertainty; this frame is the next reference.
         motion = camera_motion(relative, length.value)
@@ -119,17 +164,58 @@ class VisualOdometry:
         result = self._result(frame, relative.status, relative, length, motion, covariance)
         self._pose, self._pose_covariance = result.pose, result.pose_covariance
         self._refer_to(frame, view)
+        self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs = relative, 0
         return result
 
-    def _length(self, frame: Frame, view: View, relative: RelativePose) -> Length:
-        """Length of the translation; what the pair itself shows of it is seen first."""
-        # While the camera stood there was no way, whatever a wheel's noise may add up to.
-        span = self._since_ns, frame.stamp_ns
-        self._scale.observe(*span, self._view, view, relative)
-        return self._scale.between(*span)
+    def _known(self, frame: Frame) -> Known:
+        """Collect what others than the images tell of the way to a frame."""
+        # Where the camera stood still, it came about after that.
+        motion = self._guess.motion(self._since_ns, frame.stamp_ns) if self._guess else None
+        trusted = self._gyro is not None and self._gyro.fits
+        return Known(self._turn(frame) if trusted else None,
+                     None if motion is None else as_start(motion))
 
-    def _stands_still(self, relative: RelativePose) -> bool:
+    def _turn(self, frame: Frame) -> Turn | None:
+        return self._gyro.turn(self._since_ns, frame.stamp_ns) if self._gyro else None
+
+    def _weighed(self, frame: Frame, relative: RelativePose, turn: Turn | None) -> RelativePose:
+        """Weigh the gyro into a pair, and learn its bias; refuse a pair that turned otherwise."""
+        if self._gyro is None or relative.status not in TRACKED:
+            return relative
+        told = turn or self._turn(frame)
+        if told is None:
+            return relative
+        agreed = agrees(told, relative)
+        self._gyro.judge(agreed)
+        if agreed:
+            self._gyro.learn(self._since_ns, frame.stamp_ns, relative.R,
+                             relative.covariance_6[:3, :3])
+        if turn is None:
+            return relative
+        # What turned otherwise was not the camera, but something that fills the image.
+        return fused(relative, turn) if agreed else replace(
+            relative, status=Status.DEGENERATE, t=np.zeros(3))
+
+    def _stands_still(self, frame: Frame, relative: RelativePose) -> bool:
+        return self._nothing_moved(relative) or self._only_others_moved(frame, relative)
+
+    def _only_others_moved(self, frame: Frame, relative: RelativePose) -> bool:
+        """
+        Tell traffic from a motion of the camera: the gyro felt nothing, and much did not move.
+
+        A part of the matches all over the image has to be where it was. Slow motion does not
+        pass for standstill for long, as the reference frame stays and displacements add up.
+        """
+        if self._gyro is None or not len(relative.x) or not self._gyro.at_rest(
+                self._since_ns, frame.stamp_ns):
+            return False
+        still = np.linalg.norm(relative.y - relative.x, axis=1) < self._config.standstill
+        cells = np.floor_divide(relative.x, _CELL)
+        spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
+        return bool(still.mean() > _STILL and spread > _STILL)
+
+    def _nothing_moved(self, relative: RelativePose) -> bool:
         # Two equal images are DEGENERATE to most estimators, for want of any residual.
         if relative.status not in (*TRACKED, Status.DEGENERATE) or not len(relative.x):
             return False
@@ -146,20 +232,39 @@ class VisualOdometry:
             self._scale.reset()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
-            self._pose_covariance = compose(self._pose, self._pose_covariance, np.eye(4),
-                                            UNKNOWN_MOTION)
+            motion, covariance = self._carried(frame)
+            self._pose_covariance = compose(self._pose, self._pose_covariance, motion, covariance)
+            self._pose = self._pose @ motion
+        if backwards or status is Status.FIRST_FRAME:
+            self._known_ns = frame.stamp_ns
         self._refer_to(frame, view)
+        self._one_scale.begin(view)
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
             UNKNOWN_MOTION, self._pose_covariance, 0.0, False)
+
+    def _carried(self, frame: Frame) -> tuple[Array, Array]:
+        """Motion (4, 4) and covariance (6, 6) where the images tell none: the gyro's rotation."""
+        motion, covariance = np.eye(4), UNKNOWN_MOTION.copy()
+        if self._gyro is not None and self._gyro.fits and (turn := self._turn(frame)) is not None:
+            motion[:3, :3] = turn.R.T
+            # An error of the bias is the same all along: n steps err n times as much as one.
+            before = (self._since_ns - self._known_ns) / (frame.stamp_ns - self._since_ns)
+            covariance[3:, 3:] = (1 + 2 * before) * turn.R.T @ turn.covariance @ turn.R
+        return motion, covariance
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
         self._bad_pairs = 0
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
                               standstill_covariance(relative, length), stationary=True)
+        if self._gyro is not None:
+            self._gyro.learn(self._since_ns, frame.stamp_ns, np.eye(3),
+                             np.eye(3) * _STILL_TO_WITHIN**2)
         self._since_ns, self._since_covariance = frame.stamp_ns, result.motion_covariance
+        self._known_ns = frame.stamp_ns
+        self._forget()
         return result
 
     def _lose(self, frame: Frame, view: View, relative: RelativePose,
@@ -167,15 +272,26 @@ class VisualOdometry:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
         given_up = self._bad_pairs >= self._config.max_lost
-        result = self._result(frame, relative.status, relative, length, np.eye(4), UNKNOWN_MOTION)
+        motion, covariance = self._carried(frame)
+        result = self._result(frame, relative.status, relative, length, motion, covariance)
         if given_up:
             self._refer_to(frame, view)
-            self._prior, self._pose_covariance = None, result.pose_covariance
+            self._one_scale.begin(view)
+            self._prior, self._pose = None, result.pose
+            self._pose_covariance = result.pose_covariance
         return result
 
     def _refer_to(self, frame: Frame, view: View) -> None:
         self._reference, self._view = frame, view
-        self._since_ns, self._since_covariance = frame.stamp_ns, np.zeros((6, 6))
+        self._since_ns = frame.stamp_ns
+        self._since_covariance = np.zeros((6, 6))
+        self._forget()
+
+    def _forget(self) -> None:
+        """Let go of what others measured before the newest frame that a pair may begin at."""
+        for one in (self._gyro, self._guess):
+            if one is not None:
+                one.forget_before(self._since_ns)
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
                 motion: Array, covariance: Array, stationary: bool = False) -> OdometryResult:
@@ -183,7 +299,8 @@ class VisualOdometry:
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             self._pose @ motion, covariance,
             compose(self._pose, self._pose_covariance, motion, covariance), length.value,
-            length.known, stationary, self._since_ns, self._since_covariance)
+            length.known, stationary, self._since_ns, self._since_covariance, length.metric,
+            length.measured)
 
 
 def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:

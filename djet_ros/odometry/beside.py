@@ -1,0 +1,190 @@
+"""What comes beside the images, message by message: a gyro, another odometry, masks."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.types import Array
+from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.guess import Guess
+from djet_ros.odometry.health import Complaint
+from djet_ros.odometry.inertial import Gyro, GyroNoise
+from djet_ros.odometry.masks import Masks
+from djet_ros.odometry.messages import mounted_frame, pose_of, stamp_ns
+from djet_ros.odometry.scale import GuessScale, ScaleSource
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+# Images over which it is told whether something comes in time, and those that tell nothing yet.
+_WINDOW, _FEW = 30, 5
+
+# Share of the samples of a gyro that may be of no use before somebody should look at it.
+_REFUSED = 0.02
+
+_CLOCKS = ('stamped by the clock of the images (use_sim_time on both sides or on none), and not '
+           'later than 0.1 s after them')
+
+
+class Beside:
+    """
+    Takes messages and hands them on to those that go by them.
+
+    gyro and guess are None where nobody asked for them.
+    """
+
+    def __init__(self, config: OdometryConfig, scale: ScaleSource,
+                 still_mask: NDArray[np.bool_] | None = None) -> None:
+        self.gyro: Gyro | None = None
+        self.guess: Guess | None = None
+        self._masks = Masks(still_mask)
+        self._frames: dict[str, str] = {}
+        self.configure(config, scale)
+        self.reset()
+
+    def configure(self, config: OdometryConfig, scale: ScaleSource) -> None:
+        """Take other parameters; what was learnt stays as far as it is still asked for."""
+        self._config = config
+        noise = GyroNoise(config.imu_noise, config.imu_bias_walk)
+        offset = round(config.imu_offset * 1e9)
+        if not config.imu:
+            self.gyro = None
+        elif self.gyro is None:
+            self.gyro = Gyro(noise, offset)
+        else:
+            self.gyro.configure(noise, offset)
+        if self.gyro is not None and (quaternion := config.imu_quaternion()) is not None:
+            self.gyro.mount(Rotation.from_quat(quaternion).as_matrix())
+        if isinstance(scale, GuessScale):
+            if self.guess is not None and self.guess.mounting is not None:
+                scale.guess.mount(self.guess.mounting)
+            self.guess = scale.guess
+        elif not config.guess:
+            self.guess = None
+        else:
+            self.guess = self.guess or Guess()
+
+    def reset(self) -> None:
+        """Forget what was measured; mountings and the gyro's bias stay."""
+        self._masks.reset()
+        self._samples = 0
+        # What each of the newest images had to do without.
+        self._lacking: deque[str] = deque(maxlen=_WINDOW)
+        for one in (self.gyro, self.guess):
+            if one is not None:
+                one.reset()
+
+    # What comes
+
+    def imu(self, message: Any) -> None:
+        """Take an Imu; of it the rates."""
+        if self.gyro is None:
+            return
+        self._samples += 1
+        self._frames['imu'] = message.header.frame_id
+        rate = message.angular_velocity
+        self.gyro.add(stamp_ns(message.header), np.array([rate.x, rate.y, rate.z], np.float64))
+
+    def other_odometry(self, message: Any) -> None:
+        """Take an Odometry; of it the pose."""
+        if self.guess is None:
+            return
+        self._frames['guess'] = message.child_frame_id
+        self.guess.add(*pose_of(message))
+
+    def mask(self, message: Any) -> None:
+        """Take the mask of an image."""
+        self._masks.add(message)
+
+    # What an image needs
+
+    def lacks(self, stamp: int) -> str:
+        """Name what has still to come for an image, if anything."""
+        if self.gyro is not None and not self.gyro.covers(stamp):
+            return 'imu'
+        if self.guess is not None and not self.guess.covers(stamp):
+            return 'guess'
+        return 'mask' if self._config.mask and not self._masks.has(stamp) else ''
+
+    def left_out(self, stamp: int, shape: tuple[int, ...], camera: Camera
+                 ) -> NDArray[np.bool_] | None:
+        """Give the mask of an image that is worked on now; see ``Masks.of``."""
+        self._lacking.append(self.lacks(stamp))
+        return self._masks.of(stamp, shape, camera)
+
+    def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
+        """Name the frames (parent, child) of which a mounting is still to be found, by topic."""
+        camera, _ = mounted_frame(self._config, image_frame)
+        wanted = {}
+        if self.gyro is not None and self.gyro.to_camera is None and 'imu' in self._frames:
+            wanted['imu'] = camera, self._frames['imu']
+        if self.guess is not None and self.guess.mounting is None and 'guess' in self._frames:
+            wanted['guess'] = self._frames['guess'], camera
+        return wanted
+
+    def mount(self, what: str, mounting: Array) -> None:
+        """Take a mounting (4, 4) that was wanted."""
+        # The images' axes in the frame that was asked for.
+        _, axes = mounted_frame(self._config, '')
+        if what == 'imu' and self.gyro is not None:
+            self.gyro.mount((axes.T @ mounting)[:3, :3])
+        elif what == 'guess' and self.guess is not None:
+            self.guess.mount(mounting @ axes)
+
+    # What people are told
+
+    def values(self) -> dict[str, str]:
+        """Give what diagnostics say of it."""
+        if self.gyro is None:
+            return {}
+        bias, sigma = self.gyro.bias, np.sqrt(np.diag(self.gyro.bias_covariance))
+        return {'gyro samples': str(self._samples),
+                **{f'gyro samples: {why}': str(n) for why, n in sorted(
+                    self.gyro.refused.items())},
+                'gyro bias (deg/s)': ' '.join(f'{value:.4f}' for value in np.degrees(bias)),
+                'gyro bias, sigma (deg/s)': ' '.join(
+                    f'{value:.4f}' for value in np.degrees(sigma))}
+
+    def complaints(self, image_frame: str) -> list[Complaint]:
+        """Say what there is to mend."""
+        return [one for one in (
+            *map(self._late, ('imu', 'guess', 'mask')), *self._mountings(image_frame),
+            self._samples_refused(), self._misfit()) if one is not None]
+
+    def _late(self, what: str) -> Complaint | None:
+        if len(self._lacking) < _FEW or self._lacking.count(what) * 2 < len(self._lacking):
+            return None
+        seen = 'no sample has come' if what == 'imu' and not self._samples else (
+            f'{self._lacking.count(what)} of the newest {len(self._lacking)} images were worked '
+            'on without it')
+        return Complaint(f'no {what} in time', 'WARN', (
+            f"odometry asks for '{what}', and {seen}; publish it, {_CLOCKS}"))
+
+    def _mountings(self, image_frame: str) -> list[Complaint]:
+        return [Complaint(f'no mounting of {what}', 'WARN', (
+            f"nobody knows where '{child}' is on '{parent}', and '{what}' is of no use until "
+            'somebody does; publish it by robot_state_publisher or by tf2_ros '
+            f'static_transform_publisher --frame-id {parent} --child-frame-id {child}'
+            + (', or set odometry.imu_rotation' if what == 'imu' else '')))
+            for what, (parent, child) in self.wanted_mountings(image_frame).items()
+            if len(self._lacking) >= _FEW]
+
+    def _samples_refused(self) -> Complaint | None:
+        if self.gyro is None:
+            return None
+        worst = self.gyro.refused.most_common(1)
+        if not worst or worst[0][1] < max(_REFUSED * self._samples, _FEW):
+            return None
+        why, number = worst[0]
+        return Complaint('gyro samples of no use', 'WARN', (
+            f'{number} of {self._samples} samples: {why}; check the driver of the IMU'))
+
+    def _misfit(self) -> Complaint | None:
+        if self.gyro is None or self.gyro.fits:
+            return None
+        return Complaint('gyro does not fit', 'WARN', (
+            'most of the newest turns are others than the images tell, and the gyro is not gone '
+            'by; check how the IMU is mounted (odometry.imu_rotation or tf) and odometry.'
+            'imu_offset, both of which djet lab imu-offset finds from a recording'))

@@ -1,0 +1,257 @@
+"""
+A gyro beside the camera: how it turned between two images, and what is wrong with its rates.
+
+Rates are integrated on SO(3) as if they were linear between two samples (Magnus expansion to the
+fourth order; Blanes et al., Physics Reports 2009), from the stamp of one image to that of the
+other. A Kalman filter learns the bias, which wanders, from what the images tell of the same turn.
+
+What an image calls t is t + offset to the IMU, as Kalibr's timeshift_cam_imu has it.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections import Counter, deque
+from dataclasses import dataclass
+from itertools import pairwise
+
+from djet_ros.core.fusion import difference, Turn
+from djet_ros.core.types import Array
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# Samples that are kept: a minute and more of the fastest IMUs.
+_KEPT = 100_000
+
+# A hole between two samples beyond which nobody knows what happened in it.
+_LONGEST_HOLE_NS = 250_000_000
+
+# Stamps that go back by more belong to another time, as when a bag begins again.
+_BACK_NS = 500_000_000
+
+# rad/s that no gyro measures, and from which on equal values in a row are the end of its range.
+_FASTEST, _FAST = 200.0, 3.0
+_EQUAL_IN_A_ROW = 3
+
+# Standard deviation of a bias that nobody has measured yet, in rad/s: cheap gyros, warming up.
+_BIAS_AT_FIRST = 0.02
+
+# Standard deviation by which an interpolated rate is off, as a share of its change.
+_INTERPOLATION = 1 / 6
+
+# Standard deviations within which a turn is none, and factor within which noise is noise.
+_AT_REST, _NOISE_AT_REST = 4.0, 3.0
+
+# Pairs by which a gyro is judged, and those that are too few for that.
+_JUDGED, _FEW = 50, 20
+
+# rad: a turn that is known worse than this says nothing of rest.
+_TELLING = np.radians(0.1)
+
+
+@dataclass(frozen=True)
+class GyroNoise:
+    """
+    What a data sheet says of a gyro.
+
+    density: of white noise, rad/s/√Hz; walk: of the bias, rad/s²/√Hz.
+    """
+
+    density: float
+    walk: float
+
+
+@dataclass(frozen=True)
+class _Integral:
+    """
+    Of rates between two stamps, bias taken off, along the IMU's axes.
+
+    turn: (3, 3) the IMU at the end in the IMU at the start; by_bias: (3, 3) by what rotation
+    vector from the right a unit of bias falsifies it; seconds; interpolation: variance in rad
+    squared; spread: (3,) standard deviation of the rates; samples: how many.
+    """
+
+    turn: Array
+    by_bias: Array
+    seconds: float
+    interpolation: float
+    spread: Array
+    samples: int
+
+
+class Gyro:
+    """Takes rates as they come, and tells turns of the camera once it knows how it is mounted."""
+
+    def __init__(self, noise: GyroNoise, offset_ns: int = 0) -> None:
+        self.configure(noise, offset_ns)
+        self.to_camera: Array | None = None
+        self.bias, self.bias_covariance = np.zeros(3), np.eye(3) * _BIAS_AT_FIRST**2
+        self._learnt_ns: int | None = None
+        self._verdicts: deque[bool] = deque(maxlen=_JUDGED)
+        self.reset()
+
+    def configure(self, noise: GyroNoise, offset_ns: int) -> None:
+        """Take other parameters; what was measured and learnt stays."""
+        self.noise, self.offset_ns = noise, offset_ns
+
+    def reset(self) -> None:
+        """Forget all samples; the bias is the device's, and stays known."""
+        self._stamps: list[int] = []
+        self._rates: dict[int, Array] = {}
+        self._saturated: list[int] = []
+        self._equal = 0
+        self._latest: tuple[tuple[object, ...], _Integral | None] | None = None
+        self.refused: Counter[str] = Counter()
+
+    def mount(self, to_camera: Array) -> None:
+        """Take the rotation (3, 3) of the IMU's axes to those of the camera."""
+        self.to_camera = to_camera
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Give the stamp of the newest sample, by the clock of the images."""
+        return self._stamps[-1] - self.offset_ns if self._stamps else None
+
+    def add(self, stamp_ns: int, rate: Array) -> None:
+        """Take a rate (3,) in rad/s; what is of no use is counted in ``refused``."""
+        if not (np.abs(rate) < _FASTEST).all():
+            self.refused['not a rate'] += 1
+            return
+        if self._stamps and stamp_ns < self._stamps[-1] - _BACK_NS:
+            refused = self.refused
+            self.reset()
+            self.refused = refused + Counter({'stamps went back': 1})
+        if stamp_ns in self._rates:
+            self.refused['equal stamp'] += 1
+            return
+        self._note_saturation(stamp_ns, rate)
+        if self._stamps and stamp_ns < self._stamps[-1]:
+            self.refused['out of order'] += 1  # and of use all the same
+        insort(self._stamps, stamp_ns)
+        self._rates[stamp_ns] = rate
+        if len(self._stamps) > 2 * _KEPT:
+            self._drop(_KEPT)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Let go of what was before an image that no other will be related to."""
+        first = bisect_right(self._stamps, stamp_ns + self.offset_ns) - 1
+        if first > 0:
+            self._drop(first)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Tell whether there is a sample at the stamp of an image, or after it."""
+        return self.newest_ns is not None and self.newest_ns >= stamp_ns
+
+    def turn(self, start_ns: int, end_ns: int) -> Turn | None:
+        """Tell how the camera turned between two images; None where that was not measured."""
+        if self.to_camera is None or (integral := self._integral(start_ns, end_ns)) is None:
+            return None
+        C, by_bias = self.to_camera, self.to_camera @ integral.by_bias
+        measured = (self.noise.density**2 * integral.seconds + integral.interpolation
+                    + self.noise.walk**2 * integral.seconds**3 / 3)
+        covariance = measured * np.eye(3) + by_bias @ self._bias_at(end_ns) @ by_bias.T
+        return Turn(C @ integral.turn.T @ C.T, covariance)
+
+    def learn(self, start_ns: int, end_ns: int, R: Array, covariance: Array) -> None:
+        """
+        Learn the bias from a rotation that the images tell, R (3, 3) and its covariance (3, 3).
+
+        Both as those of a RelativePose.
+        """
+        turn = self.turn(start_ns, end_ns)
+        integral = self._integral(start_ns, end_ns)
+        if turn is None or integral is None or self.to_camera is None \
+                or not np.isfinite(covariance).all():
+            return
+        # R_true = exp(J db) R_told, with db what the bias is beyond what it was taken for.
+        J, P = self.to_camera @ integral.by_bias, self._bias_at(end_ns)
+        noise = turn.covariance - J @ P @ J.T + covariance
+        gain = P @ J.T @ np.linalg.inv(J @ P @ J.T + noise)
+        keep = np.eye(3) - gain @ J
+        self.bias = self.bias - gain @ difference(turn, R)
+        self.bias_covariance = keep @ P @ keep.T + gain @ noise @ gain.T
+        self._learnt_ns = end_ns
+
+    def at_rest(self, start_ns: int, end_ns: int) -> bool:
+        """Tell whether the gyro felt nothing between two images, and would have felt a turn."""
+        turn, integral = self.turn(start_ns, end_ns), self._integral(start_ns, end_ns)
+        if turn is None or integral is None or integral.samples < _EQUAL_IN_A_ROW:
+            return False
+        sigma = float(np.sqrt(np.linalg.eigvalsh(turn.covariance)[-1]))
+        white = self.noise.density * np.sqrt(integral.samples / integral.seconds)
+        angle = float(np.linalg.norm(difference(turn, np.eye(3))))
+        return bool(sigma < _TELLING and angle < _AT_REST * sigma
+                    and (integral.spread < _NOISE_AT_REST * white).all())
+
+    def judge(self, agreed: bool) -> None:
+        """Take whether the images told the same turn, as far as both knew it."""
+        self._verdicts.append(agreed)
+
+    @property
+    def fits(self) -> bool:
+        """Whether most of the newest turns were those that the images told."""
+        return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
+
+    def _bias_at(self, end_ns: int) -> Array:
+        """Covariance (3, 3) of the bias, which wanders since it was learnt."""
+        seconds = 0.0 if self._learnt_ns is None else abs(end_ns - self._learnt_ns) * 1e-9
+        return self.bias_covariance + self.noise.walk**2 * seconds * np.eye(3)
+
+    def _integral(self, start_ns: int, end_ns: int) -> _Integral | None:
+        """Give the integral of the rates, which several ask for in turn."""
+        asked = start_ns, end_ns, self.offset_ns, self.bias.tobytes(), len(self._stamps)
+        if self._latest is None or self._latest[0] != asked:
+            self._latest = asked, self._integrated(start_ns, end_ns)
+        return self._latest[1]
+
+    def _integrated(self, start_ns: int, end_ns: int) -> _Integral | None:
+        """Integrate the rates; None where samples are missing, or at the end of their range."""
+        start, end = start_ns + self.offset_ns, end_ns + self.offset_ns
+        first, last = bisect_right(self._stamps, start) - 1, bisect_left(self._stamps, end)
+        if first < 0 or last >= len(self._stamps) or end <= start:
+            return None
+        stamps = self._stamps[first:last + 1]
+        if max(b - a for a, b in pairwise(stamps)) > _LONGEST_HOLE_NS \
+                or self._is_saturated(stamps[0], stamps[-1]):
+            return None
+        # Seconds from the start: absolute ones would lose digits.
+        seconds = np.array([(stamp - start) * 1e-9 for stamp in stamps])
+        rates = np.array([self._rates[stamp] for stamp in stamps]) - self.bias
+        inside = (seconds > 0) & (seconds < (end - start) * 1e-9)
+        times = np.array([0.0, *seconds[inside], (end - start) * 1e-9])
+        knots = np.stack([np.interp(times, seconds, axis) for axis in rates.T], axis=1)
+        return _integrate(times, knots, rates)
+
+    def _note_saturation(self, stamp_ns: int, rate: Array) -> None:
+        """Take values that stay the same at a high rate for the end of the gyro's range."""
+        before = self._rates[self._stamps[-1]] if self._stamps else np.zeros(3)
+        same = bool(((rate == before) & (np.abs(rate) > _FAST)).any())
+        self._equal = self._equal + 1 if same else 0
+        if self._equal + 1 >= _EQUAL_IN_A_ROW:
+            self.refused['end of its range'] += 1
+            self._saturated.append(stamp_ns)
+
+    def _is_saturated(self, start: int, end: int) -> bool:
+        place = bisect_left(self._saturated, start)
+        return place < len(self._saturated) and self._saturated[place] <= end
+
+    def _drop(self, number: int) -> None:
+        """Drop the oldest samples."""
+        for stamp in self._stamps[:number]:
+            del self._rates[stamp]
+        del self._stamps[:number]
+        del self._saturated[:bisect_left(self._saturated, self._stamps[0])]
+
+
+def _integrate(times: Array, knots: Array, rates: Array) -> _Integral:
+    """Integrate rates (M, 3) at times (M,), linear in between; rates (N, 3): as measured."""
+    h = np.diff(times)[:, None]
+    before, after = knots[:-1], knots[1:]
+    steps = Rotation.from_rotvec(
+        h * (before + after) / 2 + h**2 / 12 * np.cross(before, after)).as_matrix()
+    turn, by_bias = np.eye(3), np.zeros((3, 3))
+    for step, seconds in zip(steps, h.ravel().tolist()):
+        turn, by_bias = turn @ step, step.T @ by_bias + seconds * np.eye(3)
+    off = _INTERPOLATION * h * np.linalg.norm(after - before, axis=1, keepdims=True)
+    return _Integral(turn, by_bias, float(times[-1]), float((off**2).sum()), rates.std(0),
+                     len(rates))

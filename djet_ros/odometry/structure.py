@@ -1,0 +1,149 @@
+"""
+One scale along a track: lengths of steps by the landmarks that frames share, metres by a source.
+
+Landmarks tell how the lengths of steps compare (`djet_ros.core.window`), up to one factor. A
+source that measures metres is an observation of that factor. A Kalman filter over its logarithm
+brings both together: the factor hardly changes from step to step, so single measurements may be
+coarse or missing, and where the source falls silent the last factor goes on, less and less sure.
+"""
+
+from __future__ import annotations
+
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.core.window import Addition, Window
+from djet_ros.odometry.scale import Length, ScaleSource, unknown
+import numpy as np
+
+# Standard deviation of the factor's logarithm where a track was torn: the camera may go on faster
+# or slower than it did.
+_TORN = 0.5
+
+# From here on a factor is no knowledge of metres any more.
+_LOST = 0.35
+
+# By how much the factor wanders in a step, as a share of how unsure the step's own length is: what
+# neighbouring steps err alike passes on to all that follow.
+_WANDERING = 0.5
+
+# Single metric lengths differ from one another by this at least (bumps, time stamps).
+_LEAST_NOISE = 0.02
+
+# Normalised squared innovation (1 expected) beyond which a length is not believed, and how many
+# of them in a row are no accident.
+_SURPRISE, _IN_A_ROW = 16.0, 8
+
+# A length below this, in metres, says that the camera stands, and nothing of the factor.
+_STANDING = 0.01
+
+
+class OneScale:
+    """
+    The one scale of a track, from its landmarks and from a source.
+
+    share: standard deviation that all metric lengths have in common, as a share of them.
+    """
+
+    def __init__(self) -> None:
+        self._estimator: EstimatorConfig | None = None
+        self.reset()
+
+    def configure(self, estimator: EstimatorConfig, source: ScaleSource, share: float) -> bool:
+        """Take other parameters; tells whether the track has to begin anew for them."""
+        self._source, self._share = source, share
+        if estimator == self._estimator:
+            return False
+        self._estimator, self._window = estimator, Window(estimator)
+        return True
+
+    def reset(self) -> None:
+        """Forget the factor; the next step makes a new unit."""
+        self._speed: float | None = None
+        self._log, self._variance, self._metric = 0.0, 0.0, False
+        self._surprises = 0
+
+    def begin(self, view: View) -> None:
+        """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
+        if not self._source.carried:
+            return
+        self._window.start(view)
+        if self._speed is not None:
+            self._variance += _TORN**2
+
+    def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Length:
+        """Length of a step whose motion was estimated, from the newest frame of the track on."""
+        measured = self._source.between(*span_ns)
+        if not self._source.carried:
+            return measured
+        seconds = (span_ns[1] - span_ns[0]) * 1e-9
+        guess = 1.0 if self._speed is None else self._speed * seconds
+        addition = self._added(current, relative, guess)
+        if addition is None:
+            return measured if measured.known else unknown(guess * float(np.exp(self._log)))
+        own = min(addition.sigma / addition.length, 1.0)
+        if relative.t.any():  # without parallax, only a turn is sure
+            self._speed = addition.length / seconds
+        self._variance += (_WANDERING * own)**2
+        self._metric = bool(self._metric and self._variance < _LOST**2)
+        if measured.known and self._source.exact:
+            self._set(measured, addition.length)
+            return measured
+        if measured.known and measured.value > _STANDING:
+            self._observe(measured, addition.length, own)
+        value = addition.length * float(np.exp(self._log))
+        # The factor of a relative scale is that of the whole track, and no error of a step.
+        common = np.hypot(np.sqrt(self._variance), self._share) if self._metric else 0.0
+        return Length(value, value * float(np.hypot(own, common)), True, self._metric,
+                      measured.known)
+
+    def of_rest(self, span_ns: tuple[int, int]) -> Length:
+        """Length that a step would have had where the camera stands, or the motion is unknown."""
+        measured = self._source.between(*span_ns)
+        if measured.known or not self._source.carried or self._speed is None:
+            return measured
+        usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * float(np.exp(self._log))
+        return Length(usual, usual, True, self._metric, False)
+
+    def landmarks(self) -> Array:
+        """Places (M, 3) of landmarks in the camera of the newest step, in its lengths' unit."""
+        if self._speed is None or not self._source.carried:
+            return np.empty((0, 3))
+        return self._window.landmarks() * float(np.exp(self._log))
+
+    def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
+        """Add a frame to the window; None where no length comes of it, and it begins anew."""
+        if not self._window.is_new or relative.t.any():
+            try:
+                addition = self._window.add(view, relative, guess)
+            except np.linalg.LinAlgError:  # of matches that do not hold together
+                addition = None
+            if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
+                return addition
+        self.begin(view)
+        return None
+
+    def _observe(self, measured: Length, length: float, own: float) -> None:
+        """Take a length in metres as an observation of the logarithm of the factor."""
+        observed = float(np.log(measured.value / length))
+        # What all measurements have in common does not become surer by their number.
+        noise = max((measured.sigma / measured.value)**2 - self._share**2, _LEAST_NOISE**2)
+        noise += own**2
+        if not self._metric:
+            self._log, self._variance, self._metric = observed, noise, True
+            return
+        off = observed - self._log
+        if off**2 > _SURPRISE * (self._variance + noise):
+            self._surprises += 1
+            if self._surprises < _IN_A_ROW:
+                return
+            self._variance += off**2
+        self._surprises = 0
+        gain = self._variance / (self._variance + noise)
+        self._log += gain * off
+        self._variance *= 1 - gain
+
+    def _set(self, measured: Length, length: float) -> None:
+        """Take a length that is exactly known."""
+        if measured.value > _STANDING:
+            self._log, self._variance = float(np.log(measured.value / length)), 0.0
+            self._metric = True
