@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from djet_ros.core.types import Array
 from djet_ros.posegraph.pose_graph import PoseGraph
+from djet_ros.posegraph.units import with_one_unit
 import gtsam
 import numpy as np
 
@@ -22,10 +23,15 @@ _TRUSTED = ('odometry', 'unknown')
 
 @dataclass(frozen=True)
 class OptimisedGraph:
-    """The graph with optimised poses; trust: (E,) its edges' final weights, 0 to 1."""
+    """
+    The graph with optimised poses; trust: (E,) its edges' final weights, 0 to 1.
+
+    factors: (N,) by which lengths in the unit at each vertex are in that of the first; see units.
+    """
 
     graph: PoseGraph
     trust: Array
+    factors: Array
 
     def rejected(self, kind: str) -> int:
         """Count the edges of a kind that the robust kernel trusts by less than a half."""
@@ -42,6 +48,7 @@ def optimise(graph: PoseGraph) -> OptimisedGraph:
     odometry had drifted. DjetError names an edge whose covariance can't be inverted.
     """
     graph.check()
+    graph, factors = with_one_unit(graph)
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setLossType(gtsam.GncLossType.GM)
     # The first factor holds the first pose.
@@ -51,7 +58,8 @@ def optimise(graph: PoseGraph) -> OptimisedGraph:
     parameters.setRelativeCostTol(0.0)
     optimizer = gtsam.GncLMOptimizer(factor_graph(graph), initial_values(graph.poses), parameters)
     poses = poses_of(optimizer.optimize(), len(graph.poses))
-    return OptimisedGraph(replace(graph, poses=poses), np.asarray(optimizer.getWeights())[1:])
+    return OptimisedGraph(replace(graph, poses=poses), np.asarray(optimizer.getWeights())[1:],
+                          factors)
 
 
 def factor_graph(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:

@@ -16,6 +16,7 @@ from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 from djet_ros.posegraph.steps import Step
+from djet_ros.posegraph.units import in_unit
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -104,6 +105,8 @@ class KeyframeMap:
         self._found: list[Edge] = []
         self._unsought: deque[_Unsought] = deque()
         self._sought = 0
+        # Whether all lengths so far are in metres, so that no unit of them drifts.
+        self._metric = True
 
     @property
     def edges(self) -> list[Edge]:
@@ -127,6 +130,7 @@ class KeyframeMap:
         one is no keyframe; the next one may be.
         """
         offset = self._offset(step)
+        self._metric = self._metric and (step.metric or not step.scale_known)
         frame = None
         if (offset is None or offset.is_far(self._slam)) and len(self._unsought) < _WAITING:
             frame = image(step.stamp_ns)
@@ -184,7 +188,7 @@ class KeyframeMap:
         # keyframe will have one.
         if number < self.first or before is None or before.kind != 'odometry':
             return False
-        found = [*self._finder.links(number), *self._finder.loops(number)]
+        found = [*self._finder.links(number), *self._finder.loops(number, units=not self._metric)]
         self._found += found
         return bool(found)
 
@@ -200,7 +204,9 @@ class KeyframeMap:
         for keyframe, pose in zip(self.keyframes, optimised.graph.poses):
             keyframe.pose = pose
         self.distrusted = optimised.rejected('loop')
-        here = self.keyframes[self.newest.keyframe - self.first].pose @ self.newest.motion
+        newest = self.newest.keyframe - self.first
+        here = self.keyframes[newest].pose @ in_unit(
+            self.newest.motion, float(optimised.factors[newest]))
         self.correction = here @ np.linalg.inv(self._newest_step.pose)
         self.optimisations += 1
         return optimised

@@ -15,7 +15,14 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
-from djet_ros.odometry.messages import MessageFactory, MessageType, OPTICAL_TO_BODY, stamp_ns
+from djet_ros.odometry.messages import (
+    MessageFactory,
+    MessageType,
+    mounted_frame,
+    OPTICAL_TO_BODY,
+    stamp_ns,
+)
+from djet_ros.odometry.static_frames import Transform
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.keyframe_map import KeyframeMap
 from djet_ros.posegraph.step_messages import StepMessages
@@ -30,9 +37,10 @@ class LiveSlam:
     Closes loops while the odometry goes on.
 
     config: slam, and what it shares with the odometry (estimator, odometry.frame_convention,
-    odometry.rectified, odometry.scale_uncertainty); message_type gives the class for a type name;
-    image_topic is the resolved name of the images' topic, by which odometry.rectified 'auto' goes;
-    node is the name by which the diagnostics are told from those of others.
+    odometry.camera_frame, odometry.base_frame, odometry.rectified, odometry.scale_uncertainty);
+    message_type gives the class for a type name; image_topic is the resolved name of the images'
+    topic, by which odometry.rectified 'auto' goes; node is the name by which the diagnostics are
+    told from those of others.
 
     Outgoing topics: /tf (the odometry's frame in the map, for each frame that was tracked), path
     (the optimised poses of the keyframes and of the newest frame), /diagnostics.
@@ -46,9 +54,11 @@ class LiveSlam:
         self._messages = MessageFactory(message_type)
         self._node = node
         self._rectified = means_rectified(config.odometry.rectified, image_topic)
-        self._turn = np.eye(4)
+        # The camera's optical frame in the frame that poses are of.
+        self._mounting = np.eye(4)
         if config.odometry.frame_convention == 'body':
-            self._turn[:3, :3] = OPTICAL_TO_BODY
+            self._mounting[:3, :3] = OPTICAL_TO_BODY
+        self.mounted = not config.odometry.base_frame
         self._info: Any = None
         self._camera: Camera | None = None
         self._images: OrderedDict[int, Any] = OrderedDict()
@@ -66,10 +76,33 @@ class LiveSlam:
         # Why the newest message could not be used, for a log; None when it could.
         self.problem: DjetError | None = None
         self.rejected: Counter[str] = Counter()
-        self._steps = StepMessages(self.config.odometry.frame_convention)
+        self._steps = self._new_steps()
         self._last: Step | None = None
         self._path_stamp = self._said_stamp = -np.inf
         self._said = ''
+
+    def _new_steps(self) -> StepMessages:
+        config = self.config.odometry
+        return StepMessages(config.frame_convention, config.base_frame,
+                            self._mounting if config.base_frame else None)
+
+    def mount(self, transform: Transform) -> str:
+        """
+        Ask where the camera is on base_frame; no odometry can be used until that is known.
+
+        Gives, in words, what is missing for it, or nothing.
+        """
+        if not self._images:
+            return 'no image has come that tells the frame of the camera'
+        config = self.config.odometry
+        newest = next(reversed(self._images.values()))
+        camera, axes = mounted_frame(config, newest.header.frame_id)
+        found = transform(config.base_frame, camera)
+        if found is None:
+            return f"tf does not know where '{camera}' is on '{config.base_frame}'"
+        self._mounting, self.mounted = np.asarray(found @ axes), True
+        self._steps = self._new_steps()
+        return ''
 
     # What comes in
 
@@ -149,6 +182,8 @@ class LiveSlam:
         """Level (OK, WARN, ERROR) and words for what it is doing."""
         if self.problem is not None:
             return 'ERROR', 'message rejected'
+        if not self.mounted:
+            return 'WARN', 'waiting for the mounting of the camera on tf'
         if self._last is None:
             return 'WARN', 'waiting for odometry'
         if not self.map.keyframes:
@@ -217,7 +252,7 @@ class LiveSlam:
             for stamp, pose in poses]))
 
     def _turned(self, pose: Array) -> Array:
-        return np.asarray(self._turn @ pose @ self._turn.T)
+        return np.asarray(self._mounting @ pose @ np.linalg.inv(self._mounting))
 
     def _reject(self, topic: str, problem: DjetError) -> None:
         self.rejected[topic] += 1

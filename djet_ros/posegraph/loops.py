@@ -11,7 +11,6 @@ from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rays, unit
-from djet_ros.core.hamming import smooth
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
@@ -95,8 +94,12 @@ class EdgeFinder:
         if relative.status is Status.OK and self._is_sure(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
-    def loops(self, current: int) -> Iterator[Edge]:
-        """Propose keyframes that look like this one, and give those that geometry bears out."""
+    def loops(self, current: int, units: bool = False) -> Iterator[Edge]:
+        """
+        Propose keyframes that look like this one, and give those that geometry bears out.
+
+        units: whether to compare the units of lengths at both ends, see ``unit_change``.
+        """
         config, here = self._config, current - self._first
         latest = self._stamps[here] - config.loop_gap * 1e9
         before = self._first + bisect_left(self._stamps, latest, hi=here)
@@ -104,16 +107,37 @@ class EdgeFinder:
         votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
         for place in best[votes[best] >= config.loop_votes].tolist():
-            yield from self._loop(current, place)
+            yield from self._loop(current, place, units)
 
-    def _loop(self, current: int, place: int) -> Iterator[Edge]:
+    def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
         view, other = self._view(current), self._view(place)
         # The estimator takes both views to be of one camera.
         if not np.array_equal(view.K, other.K):
             return
         relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_sure(relative):
-            yield _edge(current, place, relative, self._length(current, view, relative), 'loop')
+            length = self._length(current, view, relative)
+            edge = _edge(current, place, relative, length, 'loop')
+            yield edge if not units else replace(
+                edge, stretch=self._stretch(current, place, relative, length))
+
+    def _stretch(self, current: int, place: int, loop: RelativePose,
+                 length: Length) -> tuple[float, float] | None:
+        """Compare the units at both ends of a loop, by points that the steps to both saw too."""
+        depths = [self._depths(number) for number in (current, place)]
+        if not length.known or depths[0] is None or depths[1] is None:
+            return None
+        return unit_change(*depths[0], loop, length.value, *depths[1],
+                           self._view(current).K)
+
+    def _depths(self, number: int) -> tuple[RelativePose, float] | None:
+        """Motion from a keyframe back to its neighbour, and its length; None if not known."""
+        step = self._before.get(number)
+        if step is None or step.source not in self._kept or not step.scale_known:
+            return None
+        back = self._near.estimate(self._view(number), self._view(step.source))
+        length = float(np.linalg.norm(step.motion[:3, 3]))
+        return (back, length) if back.status is Status.OK and length else None
 
     def _length(self, current: int, view: View, relative: RelativePose) -> Length:
         """Length of a loop's translation, by the points that the last odometry edge saw too."""
@@ -137,7 +161,7 @@ class EdgeFinder:
 
     def _view(self, keyframe: int) -> View:
         frame, features = self._kept[keyframe]
-        return View(frame.gray, frame.K, features, smooth(frame.gray))
+        return self._wide.view(frame.gray, frame.K, features)
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
@@ -167,9 +191,44 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
                   float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
 
 
+def unit_change(step: RelativePose, step_length: float, loop: RelativePose, loop_length: float,
+                other: RelativePose, other_length: float, K: Array) -> tuple[float, float] | None:
+    """
+    Tell how much larger the unit of lengths is at the far end of a loop than at the near one.
+
+    step: from the loop's first view to another, other: from its second view to another, with
+    their lengths, each in the unit of its place; the loop's is in the first one's. A point that
+    all three saw has two depths in the second view. Gives the logarithm of the ratio of the units
+    and its standard deviation; None where too few points are shared.
+    """
+    _, here, there = np.intersect1d(_pixels(step), _pixels(loop), return_indices=True)
+    depths, parallax = _inverse_depths(step, K)
+    depths, parallax = depths[here] / step_length, parallax[here]
+    x, y = (points[loop.inliers][there] for points in (loop.x, loop.y))
+    # Depth at the far end, times the inverse depth at the near one.
+    ahead = (rays(K, x) @ loop.R.T)[:, 2] + depths * loop_length * loop.t[2]
+    _, seen, again = np.intersect1d(_numbers(y), _pixels(other), return_indices=True)
+    others, far_parallax = _inverse_depths(other, K)
+    sure = (np.minimum(parallax[seen], far_parallax[again]) > _LEAST_PARALLAX) & (
+        depths[seen] > 0) & (ahead[seen] > 0) & (others[again] > 0)
+    if sure.sum() < _LEAST_SHARED:
+        return None
+    there, near, far = others[again][sure], depths[seen][sure], ahead[seen][sure]
+    ratios = np.log(there / other_length * far / near)
+    ratio = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
+    places = len(np.unique(x[seen][sure] // CELL, axis=0))
+    return ratio, max(1.2533 * spread * float(np.sqrt(CAUTIOUS_INFLATION / places)), 1e-3)
+
+
 def _pixels(relative: RelativePose) -> NDArray[np.int64]:
     """Numbers (M,) for the inliers, equal where the pixels in the first view are."""
-    columns, rows = np.rint(4 * relative.x[relative.inliers]).astype(np.int64).T
+    return _numbers(relative.x[relative.inliers])
+
+
+def _numbers(points: Array) -> NDArray[np.int64]:
+    """Numbers (M,) of pixels (M, 2), equal where these are."""
+    columns, rows = np.rint(4 * points).astype(np.int64).T
     return np.asarray(columns + (rows << 20))
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
+from djet_ros.odometry.scale import Scale
 from djet_ros.posegraph.backend import OptimisedGraph
 from djet_ros.posegraph.keyframe_images import frame_finder, KeyframeFile
 from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
 from djet_ros.posegraph.pose_graph import PoseGraph
-from djet_ros.posegraph.steps import graph_of, Step
+from djet_ros.posegraph.steps import graph_of, scale_of, Step
+from djet_ros.posegraph.units import in_unit
 from djet_ros.recordings.recording import Recording
 import numpy as np
 
@@ -28,17 +30,18 @@ class Slam:
     What came of a run.
 
     frames: graph of all frames, as the odometry made it; offsets: of each frame from its keyframe;
-    optimised: the graph of the keyframes with links and loops.
+    optimised: the graph of the keyframes with links and loops; scale: what lengths are in.
     """
 
     frames: PoseGraph
     offsets: Sequence[KeyframeOffset]
     optimised: OptimisedGraph
+    scale: Scale
 
     @property
-    def scale_known(self) -> bool:
+    def metric(self) -> bool:
         """Whether the odometry's lengths are in metres."""
-        return all(edge.scale_known for edge in self.frames.edges if edge.kind == 'odometry')
+        return self.scale is Scale.METRIC
 
     def before(self) -> Array:
         """Poses (N, 4, 4) of all frames by odometry."""
@@ -46,8 +49,9 @@ class Slam:
 
     def after(self) -> Array:
         """Poses (N, 4, 4) of all frames, each moved with its keyframe."""
-        keyframes = self.optimised.graph.poses
-        return np.array([keyframes[offset.keyframe] @ offset.motion for offset in self.offsets])
+        keyframes, factors = self.optimised.graph.poses, self.optimised.factors
+        return np.array([keyframes[offset.keyframe] @ in_unit(
+            offset.motion, factors[offset.keyframe]) for offset in self.offsets])
 
 
 def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
@@ -73,7 +77,7 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
             offsets.append(growing.newest)
             if progress is not None:
                 progress(number, len(steps))
-        return Slam(frames, offsets, growing.optimise())
+        return Slam(frames, offsets, growing.optimise(), scale_of(steps))
 
 
 def travelled(poses: Array) -> float:

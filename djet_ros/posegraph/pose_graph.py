@@ -93,7 +93,8 @@ class Edge(Motion):
 
     source, target: indices of vertices; kind: 'odometry' (of neighbouring frames), 'link' (over
     more than one keyframe), 'loop' (of a place seen again) or 'unknown' (not estimated, and the
-    covariance says so).
+    covariance says so); stretch: of a loop, how much larger the unit of lengths is at the target
+    than at the source, as a logarithm and its standard deviation, where that is known.
     """
 
     source: int
@@ -102,6 +103,7 @@ class Edge(Motion):
     covariance: Array
     kind: str = 'odometry'
     scale_known: bool = True
+    stretch: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from djet_ros.odometry.messages import (
     pose_of,
     stamp_ns,
 )
+from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.steps import Step
@@ -45,14 +46,18 @@ class StepMessages:
     """
     Brings together the Odometry, the relative pose and the status of one stamp.
 
-    convention: 'optical' or 'body', of the axes in messages. missing: of how many frames only a
-    part came.
+    convention: 'optical' or 'body', of the axes in messages; base_frame: whose odometry it is, if
+    not the camera's, with the camera's optical frame in it, mounting (4, 4). missing: of how many
+    frames only a part came.
     """
 
-    def __init__(self, convention: str) -> None:
-        self._turn = np.eye(4)
+    def __init__(self, convention: str, base_frame: str = '', mounting: Array | None = None
+                 ) -> None:
+        self._axes = np.eye(4)
         if convention == 'body':
-            self._turn[:3, :3] = OPTICAL_TO_BODY.T
+            self._axes[:3, :3] = OPTICAL_TO_BODY
+        self._base_frame = base_frame
+        self._mounting = self._axes if mounting is None else mounting
         self.missing = 0
         self._parts: dict[int, _Parts] = {}
         self._newest = -1
@@ -102,25 +107,28 @@ class StepMessages:
         """Give the step of a frame; none for a bad pair, which may be bridged."""
         _, pose = pose_of(parts.odometry)
         frame = parts.odometry.header.frame_id
+        here = _of_camera(pose, self._mounting)
         if said.status in STARTED:
-            return [Step(said.stamp_ns, said.status, self._turned(pose), odom_frame=frame)]
+            return [Step(said.stamp_ns, said.status, here, odom_frame=frame)]
         if said.status not in TRACKED:
             return []
-        if parts.odometry.child_frame_id != parts.relative.header.frame_id:
+        expected = self._base_frame or parts.relative.header.frame_id
+        if parts.odometry.child_frame_id != expected:
             raise DjetError(
-                f"the odometry is of '{parts.odometry.child_frame_id}' and the relative poses of "
-                f"'{parts.relative.header.frame_id}'; a pose graph needs both of the camera: "
-                'leave odometry.base_frame empty')
+                f"the odometry is of '{parts.odometry.child_frame_id}', and not of '{expected}'; "
+                'give both nodes the same odometry.base_frame and odometry.frame_convention')
         _, motion = pose_of(parts.relative)
         if not np.isfinite(motion).all():
             raise DjetError(f'the relative pose of {said.stamp_ns} ns holds no pose')
         covariance = np.asarray(parts.relative.pose.covariance, np.float64).reshape(6, 6)
-        step = Step(said.stamp_ns, said.status, self._turned(pose), said.reference_ns,
-                    self._turned(motion), rotated(self._turn[:3, :3], covariance),
-                    said.length_known, frame)
+        step = Step(said.stamp_ns, said.status, here, said.reference_ns,
+                    _of_camera(motion, self._axes), rotated(self._axes[:3, :3].T, covariance),
+                    said.scale is not Scale.UNKNOWN, frame, said.scale is Scale.METRIC)
         if step.tracked:
             step.check(f'odometry edge to {said.stamp_ns} ns')
         return [step]
 
-    def _turned(self, pose: Array) -> Array:
-        return np.asarray(self._turn @ pose @ self._turn.T)
+
+def _of_camera(pose: Array, mounting: Array) -> Array:
+    """Pose (4, 4) of the optical frame in where it began, from that of what it is mounted on."""
+    return np.asarray(np.linalg.inv(mounting) @ pose @ mounting)

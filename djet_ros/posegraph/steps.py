@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from djet_ros.core.types import Array, Status
+from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
@@ -20,7 +21,7 @@ class Step(Motion):
     stamp_ns, status: of the frame; pose (4, 4): the camera in the odometry's frame;
     previous_stamp_ns: of the frame that it was related to, or None; motion (4, 4), covariance
     (6, 6): from there to here, where that is known; odom_frame: name of the odometry's frame,
-    where messages say it.
+    where messages say it; metric: whether a known length is in metres.
     """
 
     stamp_ns: int
@@ -31,6 +32,7 @@ class Step(Motion):
     covariance: Array = field(default_factory=lambda: UNKNOWN_MOTION)
     scale_known: bool = False
     odom_frame: str = ''
+    metric: bool = True
 
     @property
     def tracked(self) -> bool:
@@ -41,6 +43,14 @@ class Step(Motion):
     def restarted(self) -> bool:
         """Whether the odometry restarted, so that its frame may be another than before."""
         return self.status in STARTED
+
+
+def scale_of(steps: Iterable[Step]) -> Scale:
+    """Tell what all lengths of a trajectory are in: unknown where one of them is."""
+    steps = [step for step in steps if step.status is Status.OK]
+    if not all(step.scale_known for step in steps):
+        return Scale.UNKNOWN
+    return Scale.METRIC if all(step.metric for step in steps) else Scale.RELATIVE
 
 
 def graph_of(steps: Sequence[Step]) -> PoseGraph:

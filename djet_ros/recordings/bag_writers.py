@@ -55,8 +55,8 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     Write a sequence as a rosbag2 folder.
 
     Topics: /camera/image_rect (mono8; image_raw where it is distorted), /camera/camera_info,
-    /ground_truth/pose (camera in the first camera, where the sequence knows it) and /tf_static
-    (map to camera_first, REP 103).
+    /ground_truth/pose (camera in the first camera, where the sequence knows it), /imu/data_raw
+    (where it has one) and /tf_static (map to camera_first, REP 103; camera to imu).
     ``progress`` is called with the number of frames written so far. The bag appears under its
     name when it is complete; a failure or an interrupt leaves nothing (a kill a hidden folder
     beside it), and with ``overwrite`` leaves the old bag. Raises DjetError where ``out`` exists
@@ -64,7 +64,7 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
-    recording = SequenceRecording(sequence)
+    recording = SequenceRecording(sequence, imu=True)
     with _left_whole(out), appearing(out, overwrite, is_bag, 'bag folder') as folder:
         writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
         with writer:

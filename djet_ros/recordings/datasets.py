@@ -1,4 +1,4 @@
-"""Other public layouts as FrameSequence: TUM RGB-D and EuRoC (ASL); and which one a path has."""
+"""Other public layouts as FrameSequence: TUM RGB-D, EuRoC, TUM-VI, 7-Scenes; which it is."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
-from djet_ros.recordings.kitti import check_rigid, KittiSequence
+from djet_ros.recordings.imu import ImuTrack, read_asl_imu
+from djet_ros.recordings.kitti import check_rigid, KittiSequence, STAMP_OFFSET_NS
+from djet_ros.recordings.kitti_raw import is_kitti_raw, kitti_raw
 from djet_ros.recordings.text import (
     increasing,
     lines,
     nanoseconds,
+    number_rows,
     numbers,
     stamped,
     stamped_rows,
@@ -37,16 +40,24 @@ TUM_CAMERAS = {
     '3': (535.4, 539.2, 320.1, 247.6),
 }
 
+# The camera that 7-Scenes tells, and the pace at which a Kinect records.
+SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
+SEVEN_SCENES_PERIOD_NS = 33_333_333
+
+# What ASL and Kalibr call OpenCV's two models, and how many numbers these have.
+ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_bob', (4,)),
+              'none': ('plumb_bob', (0,)), 'equidistant': ('equidistant', (4,))}
+
 
 def tum_rgbd(folder: Path) -> FrameSequence:
     """
-    Open a TUM RGB-D folder: rgb.txt, rgb/*.png and perhaps groundtruth.txt.
+    Open a TUM RGB-D folder: rgb.txt, the images that it lists and perhaps groundtruth.txt.
 
     The camera is taken from ``calibration.txt`` ("fx fy cx cy [k1 k2 p1 p2 k3]"), or from
     the folder's name (freiburg1 to 3). Ground truth is the camera's optical frame.
     """
     stamps, paths = _listed_images(folder / 'rgb.txt', folder, nanoseconds)
-    K, distortion = _tum_camera(folder)
+    K, distortion = _camera_beside(folder, _tum_camera(folder))
     poses = None
     if (truth := folder / 'groundtruth.txt').exists():
         known, known_poses = read_tum(truth)
@@ -54,35 +65,80 @@ def tum_rgbd(folder: Path) -> FrameSequence:
     return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, poses, distortion)
 
 
+def seven_scenes(folder: Path) -> FrameSequence:
+    """
+    Open a sequence of 7-Scenes: frame-*.color.png (or .jpg), each with its frame-*.pose.txt.
+
+    It tells no stamps: the images follow one another at 30 Hz. ``calibration.txt`` goes before
+    the camera that the data set tells.
+    """
+    paths = _seven_scenes_images(folder)
+    K, distortion = _camera_beside(folder, SEVEN_SCENES_CAMERA)
+    stamps = STAMP_OFFSET_NS + np.arange(len(paths), dtype=np.int64) * SEVEN_SCENES_PERIOD_NS
+    poses = np.full((len(paths), 4, 4), np.nan)
+    for index, path in enumerate(paths):
+        truth = path.with_name(f'{path.name.partition(".")[0]}.pose.txt')
+        if truth.exists():
+            rows = number_rows(truth, 4)
+            if len(rows) != 4:
+                raise DjetError(f'{truth} has {len(rows)} rows, a pose has 4')
+            check_rigid(rows[None], truth)
+            poses[index] = rows
+    return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, from_first(poses),
+                         distortion)
+
+
 def euroc(folder: Path) -> FrameSequence:
     """
-    Open an EuRoC (ASL) folder: mav0/cam0 and perhaps mav0/state_groundtruth_estimate0.
+    Open an EuRoC or TUM-VI (ASL) folder: mav0/cam0, perhaps with ground truth and an IMU.
 
-    Ground truth is moved from the body to the camera by T_BS of cam0/sensor.yaml.
+    The camera is that of cam0/sensor.yaml or, as TUM-VI has it, of dso/camchain.yaml. Ground
+    truth (state_groundtruth_estimate0, or mocap0) is moved from the body, which is the IMU, to
+    the camera.
     """
     mav = folder / 'mav0' if (folder / 'mav0').is_dir() else folder
     camera = mav / 'cam0'
     stamps, paths = _listed_images(camera / 'data.csv', camera / 'data', whole_nanoseconds)
-    K, distortion, camera_in_body = _asl_camera(camera / 'sensor.yaml')
+    chain = next((path for path in (mav.parent / 'dso' / 'camchain.yaml', mav / 'camchain.yaml')
+                  if path.exists()), None)
+    if chain is not None and not (camera / 'sensor.yaml').exists():
+        K, distortion, model, camera_in_body = _kalibr_camera(chain)
+    else:
+        K, distortion, model, camera_in_body = _asl_camera(camera / 'sensor.yaml')
     poses = None
     if (truth := mav / 'state_groundtruth_estimate0' / 'data.csv').exists():
-        poses = from_first(poses_at(*_asl_states(truth, camera_in_body), stamps, LONGEST_GAP_NS))
-    return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, poses, distortion)
+        poses = from_first(poses_at(*_asl_states(truth, camera_in_body, 17), stamps,
+                                    LONGEST_GAP_NS))
+    elif (truth := mav / 'mocap0' / 'data.csv').exists():
+        poses = from_first(poses_at(*_asl_states(truth, camera_in_body, 8), stamps,
+                                    LONGEST_GAP_NS))
+    return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, poses, distortion,
+                         model, _asl_imu(mav / 'imu0', camera_in_body))
 
 
 def open_sequence(path: Path) -> FrameSequence:
-    """Open a folder of KITTI, TUM RGB-D, EuRoC or VAROS, whichever it is."""
+    """Open a folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, EuRoC, TUM-VI or VAROS."""
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
     if varos_camera(path) is not None:
         return VarosSequence(path)
     if (path / 'mav0').is_dir() or (path / 'cam0').is_dir():
         return euroc(path)
+    if is_kitti_raw(path):
+        return kitti_raw(path)
+    if _seven_scenes_images(path):
+        return seven_scenes(path)
     like_kitti = any(any(path.glob(f'{depth}image_0')) for depth in ('', '*/', 'sequences/*/'))
     if path.is_dir() and not like_kitti:
-        raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0), TUM RGB-D '
-                        '(rgb.txt), EuRoC (mav0) or VAROS (vehicle0)')
+        raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0, or raw: '
+                        'image_00/data), TUM RGB-D (rgb.txt), 7-Scenes (frame-*.color.png), EuRoC '
+                        'or TUM-VI (mav0), or VAROS (vehicle0)')
     return KittiSequence(path)
+
+
+def _seven_scenes_images(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob('frame-*.color.*')
+                  if path.suffix in ('.png', '.jpg', '.jpeg'))
 
 
 def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
@@ -106,38 +162,87 @@ def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
     return increasing(np.array(stamps, dtype=np.int64), path), paths
 
 
-def _tum_camera(folder: Path) -> tuple[Array, Sequence[float]]:
-    file = folder / 'calibration.txt'
+def _tum_camera(folder: Path) -> Sequence[float]:
+    named = re.search('freiburg([123])', folder.resolve().name)
+    return TUM_CAMERAS[named[1]] if named else ()
+
+
+def _camera_beside(folder: Path, published: Sequence[float]) -> tuple[Array, Sequence[float]]:
+    """Give the camera of calibration.txt, or else the one that a data set has published."""
+    file, values = folder / 'calibration.txt', tuple(published)
     if file.exists():
         _, text = next(lines(file), (0, ''))
         try:
             values = tuple(numbers(text))
         except ValueError as error:
             raise DjetError(f'{file}: {error}') from error
-    else:
-        named = re.search('freiburg([123])', folder.resolve().name)
-        values = TUM_CAMERAS[named[1]] if named else ()
     if len(values) not in (4, 8, 9):
         raise DjetError(f"{folder} has no known camera; write 'fx fy cx cy', perhaps with "
                         f"'k1 k2 p1 p2 k3', into {file}")
     return _camera(values[:4], values[4:], file)
 
 
-def _asl_camera(path: Path) -> tuple[Array, Sequence[float], Array]:
+def _asl_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
+    """Camera matrix, distortion and its model, and the camera in the body (4, 4)."""
     sensor = read_yaml(path)
     try:
-        model = sensor.get('distortion_model', 'radial-tangential')
+        named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
-        camera_in_body = np.array(sensor['T_BS']['data'], dtype=np.float64).reshape(4, 4)
+        camera_in_body = _rigid(sensor['T_BS']['data'])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
                         f'{one_line(error)}') from error
-    if model != 'radial-tangential' or len(intrinsics) != 4 or len(distortion) not in (0, 4, 5):
-        raise DjetError(f"{path}: distortion model '{model}' with {len(intrinsics)} and "
-                        f'{len(distortion)} numbers; radial-tangential with 4 and 4 is known')
     check_rigid(camera_in_body[None], path)
-    return *_camera(intrinsics, distortion, path), camera_in_body
+    model = _model(path, named, intrinsics, distortion)
+    return *_camera(intrinsics, distortion, path), model, camera_in_body
+
+
+def _kalibr_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
+    """Give the same from the first camera of Kalibr's chain, in which T_cam_imu is the inverse."""
+    chain = read_yaml(path)
+    try:
+        camera = chain['cam0']
+        named = camera['distortion_model']
+        intrinsics = [float(value) for value in camera['intrinsics']]
+        distortion = [float(value) for value in camera['distortion_coeffs']]
+        body_in_camera = _rigid(camera['T_cam_imu'])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DjetError(f'{path} is no camera chain of Kalibr (cam0: intrinsics, T_cam_imu): '
+                        f'{one_line(error)}') from error
+    check_rigid(body_in_camera[None], path)
+    model = _model(path, named, intrinsics, distortion)
+    return *_camera(intrinsics, distortion, path), model, np.asarray(np.linalg.inv(body_in_camera))
+
+
+def _rigid(values: object) -> Array:
+    return np.array(values, dtype=np.float64).reshape(4, 4)
+
+
+def _model(path: Path, named: object, intrinsics: Sequence[float], distortion: Sequence[float]
+           ) -> str:
+    model, counts = ASL_MODELS.get(str(named), ('', ()))
+    if len(intrinsics) != 4 or len(distortion) not in counts:
+        raise DjetError(f"{path}: distortion model '{one_line(named, 40)}' with "
+                        f'{len(intrinsics)} and {len(distortion)} numbers; radial-tangential and '
+                        'equidistant with 4 and 4 are known')
+    return model
+
+
+def _asl_imu(folder: Path, camera_in_body: Array) -> ImuTrack | None:
+    """Give what the IMU felt; its axes are those of its sensor.yaml, or the body's."""
+    if not (folder / 'data.csv').exists():
+        return None
+    imu_in_body = np.eye(4)
+    if (path := folder / 'sensor.yaml').exists():
+        sensor = read_yaml(path)
+        try:
+            imu_in_body = _rigid(sensor['T_BS']['data'])
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise DjetError(f'{path} is no ASL sensor description (T_BS): '
+                            f'{one_line(error)}') from error
+        check_rigid(imu_in_body[None], path)
+    return read_asl_imu(folder / 'data.csv', camera_in_body[:3, :3].T @ imu_in_body[:3, :3])
 
 
 def _camera(intrinsics: Sequence[float], distortion: Sequence[float], path: Path
@@ -148,8 +253,9 @@ def _camera(intrinsics: Sequence[float], distortion: Sequence[float], path: Path
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), distortion
 
 
-def _asl_states(path: Path, camera_in_body: Array) -> tuple[NDArray[np.int64], Array]:
-    stamps, rows = stamped_rows(path, 17, whole_nanoseconds)
+def _asl_states(path: Path, camera_in_body: Array, columns: int
+                ) -> tuple[NDArray[np.int64], Array]:
+    stamps, rows = stamped_rows(path, columns, whole_nanoseconds)
     # ASL writes quaternions w x y z.
     bodies = poses_from_quaternions(rows[:, :3], rows[:, [4, 5, 6, 3]], path)
     return increasing(stamps, path), bodies @ camera_in_body

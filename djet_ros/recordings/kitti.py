@@ -7,6 +7,7 @@ from pathlib import Path
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.imu import ImuTrack, read_asl_imu
 from djet_ros.recordings.text import (
     check_positions,
     increasing,
@@ -30,7 +31,8 @@ class KittiSequence(FrameSequence):
     A folder ``.../sequences/NN`` with ``image_0/*.png``, ``calib.txt`` and ``times.txt``.
 
     The left gray camera (already rectified). Stamps are those of times.txt
-    plus STAMP_OFFSET_NS. Ground truth is taken from ``poses`` or, where it exists, from
+    plus STAMP_OFFSET_NS. Rendered sequences may have an ``imu.csv`` as EuRoC has it, and a row
+    ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, where it exists, from
     ``../../poses/NN.txt``, and expressed in the first camera of the range start <= i < end.
     Raises DjetError where the folder does not keep to the layout.
     """
@@ -47,28 +49,43 @@ class KittiSequence(FrameSequence):
         truth = None
         if (file := _poses_file(self.folder, poses)) is not None:
             truth = from_first(_poses(file, len(paths))[chosen])
-        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth)
+        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth,
+                         imu=_imu(self.folder))
 
 
 def read_camera(path: Path) -> Array:
     """Camera matrix K (3, 3) from the row P0 of a calib.txt; DjetError where it makes none."""
+    number, P = _calibration(path, 'P0', 'it must give the 3x4 projection of camera 0')
+    if min(P[0, 0], P[1, 1]) <= 0 or P[2].tolist() != [0, 0, 1, 0] or P[1, 0] != 0:
+        raise DjetError(f'{path} line {number}: P0 is no projection of a rectified camera '
+                        f'(focal lengths {P[0, 0]:g} and {P[1, 1]:g}, last row '
+                        f'{" ".join(f"{v:g}" for v in P[2])})')
+    return P[:, :3].copy()
+
+
+def _calibration(path: Path, name: str, meaning: str) -> tuple[int, Array]:
+    """Line and matrix (3, 4) of a row of a calib.txt; DjetError where there is none."""
     rows = [(number, text.partition(':')[2]) for number, text in lines(path)
-            if text.partition(':')[0].strip() == 'P0']
+            if text.partition(':')[0].strip() == name]
     if not rows:
-        raise DjetError(f"{path} has no line 'P0:'; it must give the 3x4 projection of camera 0")
+        raise DjetError(f"{path} has no line '{name}:'; {meaning}")
     number, row = rows[0]
     try:
         values = numbers(row)
     except ValueError as error:
         raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
     if len(values) != 12:
-        raise DjetError(f'{path} line {number}: P0 has {len(values)} numbers, 12 belong there')
-    P = np.array(values).reshape(3, 4)
-    if min(P[0, 0], P[1, 1]) <= 0 or P[2].tolist() != [0, 0, 1, 0] or P[1, 0] != 0:
-        raise DjetError(f'{path} line {number}: P0 is no projection of a rectified camera '
-                        f'(focal lengths {P[0, 0]:g} and {P[1, 1]:g}, last row '
-                        f'{" ".join(f"{v:g}" for v in P[2])})')
-    return P[:, :3].copy()
+        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers, 12 belong there')
+    return number, np.array(values).reshape(3, 4)
+
+
+def _imu(folder: Path) -> ImuTrack | None:
+    if not (folder / 'imu.csv').exists():
+        return None
+    _, pose = _calibration(folder / 'calib.txt', 'Tr_imu_to_cam',
+                           'it must give the 3x4 pose of the IMU of imu.csv in camera 0')
+    check_rigid(np.vstack([pose, np.eye(4)[3]])[None], folder / 'calib.txt')
+    return read_asl_imu(folder / 'imu.csv', pose[:, :3], STAMP_OFFSET_NS)
 
 
 def read_poses(path: Path) -> Array:

@@ -8,18 +8,21 @@ too, so that all of them pass through the same tracker.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 import re
+from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
+from djet_ros.odometry import static_frames
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bags import Bag, BagMessage, is_bag, Topic
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.frame_sequence import FrameSequence
+from djet_ros.recordings.imu import ImuTrack
 from djet_ros.recordings.kitti import KittiSequence, read_poses
 from djet_ros.recordings.text import lines
 from djet_ros.recordings.trajectories import read_tum
@@ -30,28 +33,39 @@ IMAGE_TOPIC = '/camera/image_rect'
 RAW_IMAGE_TOPIC = '/camera/image_raw'
 INFO_TOPIC = '/camera/camera_info'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+IMU_TOPIC = '/imu/data_raw'
+STATIC_FRAMES_TOPIC = '/tf_static'
 CAMERA_FRAME = 'camera'
+IMU_FRAME = 'imu'
 WORLD_FRAME = 'camera_first'
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)
 POSE_TYPES = ('geometry_msgs/msg/PoseStamped', 'nav_msgs/msg/Odometry',
               'geometry_msgs/msg/TransformStamped')
-SPEED_TYPES = ('geometry_msgs/msg/TwistStamped', 'nav_msgs/msg/Odometry')
+
+# What may be recorded beside a camera, by the name of its topic in a live node: its types.
+BESIDE = {
+    'speed': ('geometry_msgs/msg/TwistStamped', 'nav_msgs/msg/Odometry'),
+    'imu': ('sensor_msgs/msg/Imu',),
+    'guess': ('nav_msgs/msg/Odometry',),
+    'mask': IMAGE_TYPES,
+}
 
 
 class Recording(Closing):
     """
-    Images, CameraInfo, perhaps ground truth and speeds, as messages in order.
+    Images, CameraInfo, perhaps ground truth and what else was recorded, as messages in order.
 
-    ``len()`` is the number of images, as far as it is known beforehand. ground_truth_topic and
-    speed_topic are None where there is none, or none is wanted.
+    ``len()`` is the number of images, as far as it is known beforehand. ground_truth_topic is
+    None where there is none. beside: topics of what else is wanted, by names in BESIDE, and
+    under 'frames' that of the static frames, which tell how an IMU is mounted.
     """
 
     image_topic: str
     info_topic: str
     ground_truth_topic: str | None
-    speed_topic: str | None
+    beside: dict[str, str]
 
     @abstractmethod
     def __len__(self) -> int:
@@ -61,17 +75,24 @@ class Recording(Closing):
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yield the messages, or only those of some topics; DjetError where there is damage."""
 
+    def static_frames(self) -> Iterator[Any]:
+        """Yield the TFMessages of /tf_static; DjetError where there is damage."""
+        yield from ()
+
 
 class SequenceRecording(Recording):
     """A sequence of image files as the messages of the bag that would be made of it."""
 
-    def __init__(self, sequence: FrameSequence) -> None:
+    def __init__(self, sequence: FrameSequence, imu: bool = False) -> None:
+        """Take a sequence; imu: whether what its IMU felt is wanted too, where it has one."""
         self._sequence = sequence
+        self._imu = sequence.imu if imu else None
         # By the name everybody knows whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distortion.any() else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
         self.ground_truth_topic = None if sequence.poses is None else GROUND_TRUTH_TOPIC
-        self.speed_topic = None
+        self.beside = {} if self._imu is None else {'imu': IMU_TOPIC,
+                                                    'frames': STATIC_FRAMES_TOPIC}
 
     def __len__(self) -> int:
         """Count the images."""
@@ -81,15 +102,24 @@ class SequenceRecording(Recording):
         """
         Yield ground truth, CameraInfo and image of each frame in turn.
 
-        The image comes last: whoever acts on it then has everything of the same stamp.
+        The image comes last: whoever acts on it then has everything up to its stamp, and the
+        first sample of the IMU beyond it.
         """
-        sequence = self._sequence
+        sequence, felt = self._sequence, 0
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
+            if self._imu is not None and (
+                    topics is None or not set(topics).isdisjoint(self.beside.values())):
+                if index == 0:
+                    yield _imu_frame(stamp, self._imu)
+                for sample in self._imu.until(felt, stamp):
+                    yield _imu_message(self._imu, sample)
+                    felt = sample + 1
             if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
                 yield _ground_truth(stamp, sequence.poses[index])
             if topics is None or self.image_topic in topics:
                 yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
-                    stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion))
+                    stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion,
+                    sequence.model))
                 yield BagMessage(self.image_topic, stamp, MAKE.picture(
                     stamp, CAMERA_FRAME, sequence.raw(index)))
 
@@ -99,14 +129,14 @@ class SequenceRecording(Recording):
 
 class BagRecording(Recording):
     """
-    The camera in a bag, with its ground truth and its speeds where they are wanted.
+    The camera in a bag, with its ground truth and what else is wanted.
 
     Topics that aren't named are found; DjetError lists the choices where that is not possible.
     """
 
     def __init__(self, path: Path, image_topic: str | None = None, info_topic: str | None = None,
-                 poses: Path | None = None, speed: bool = False,
-                 speed_topic: str | None = None) -> None:
+                 poses: Path | None = None, beside: Mapping[str, str | None] | None = None,
+                 strict: bool = True) -> None:
         """Open the bag and choose the topics; see ``open_recording``."""
         self.bag = Bag(path)
         try:
@@ -120,7 +150,7 @@ class BagRecording(Recording):
             self.info_topic = self._info_topic(info_topic)
             self.ground_truth_topic = (self._ground_truth_topic() if poses is None
                                        else GROUND_TRUTH_TOPIC)
-            self.speed_topic = self._speed_topic(speed_topic) if speed else None
+            self.beside = dict(self._beside(beside or {}, strict))
             self._poses = None if poses is None else _read_truth(poses, self._count)
         except BaseException:
             self.close()
@@ -133,7 +163,7 @@ class BagRecording(Recording):
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yield the messages in the order of recording, and what the file of poses adds."""
         wanted = {topic for topic in (self.image_topic, self.info_topic, self.ground_truth_topic,
-                                      self.speed_topic)
+                                      *self.beside.values())
                   if topic and (topics is None or topic in topics)}
         if self._poses is None:
             yield from self.bag.messages(wanted)
@@ -156,19 +186,32 @@ class BagRecording(Recording):
             if message.topic in wanted:
                 yield message
 
+    def static_frames(self) -> Iterator[Any]:
+        """Yield the TFMessages of /tf_static; DjetError where there is damage."""
+        if static_frames.TOPIC in {topic.name for topic in self._fitting((static_frames.TYPE,))}:
+            for one in self.bag.messages({static_frames.TOPIC}):
+                yield one.message
+
     def close(self) -> None:
         """Close the bag."""
         self.bag.close()
 
-    def _speed_topic(self, name: str | None) -> str:
-        # The bag's own ground truth is no speed, even where other poses replace it.
-        fitting = [topic.name for topic in self._fitting(SPEED_TYPES)
-                   if topic.name != self._ground_truth_topic()]
-        chosen = [topic for topic in fitting if name in (None, topic)]
-        if len(chosen) != 1:
-            raise DjetError(f"{self.bag.path}: scale 'speed' needs one topic of speeds; "
-                            f'choose one with --speed-topic from: {", ".join(fitting) or "none"}')
-        return chosen[0]
+    def _beside(self, wanted: Mapping[str, str | None], strict: bool
+                ) -> Iterator[tuple[str, str]]:
+        """Find the topics of what is wanted by name; where that is not strict, those there are."""
+        for what, name in wanted.items():
+            # The bag's own ground truth is no measurement, even where other poses replace it.
+            fitting = [topic.name for topic in self._fitting(BESIDE[what]) if topic.name not in (
+                self._ground_truth_topic(), self.image_topic)
+                and (what != 'mask' or 'mask' in topic.name)]
+            chosen = [topic for topic in fitting if name in (None, topic)]
+            if len(chosen) == 1:
+                yield what, chosen[0]
+            elif strict:
+                raise DjetError(f"{self.bag.path}: one topic of '{what}' is needed; choose one "
+                                f'with --{what}-topic from: {", ".join(fitting) or "none"}')
+        if wanted and any(topic.name == STATIC_FRAMES_TOPIC for topic in self._topics):
+            yield 'frames', STATIC_FRAMES_TOPIC
 
     def _fitting(self, types: Collection[str]) -> list[Topic]:
         return [topic for topic in self._topics if topic.msgtype in types]
@@ -211,21 +254,26 @@ class BagRecording(Recording):
 
 
 def open_recording(path: Path, image_topic: str | None = None, info_topic: str | None = None,
-                   poses: Path | None = None, speed: bool = False,
-                   speed_topic: str | None = None) -> Recording:
+                   poses: Path | None = None, beside: Mapping[str, str | None] | None = None,
+                   strict: bool = True) -> Recording:
     """
-    Open a bag, or a folder in the layout of KITTI, TUM RGB-D or EuRoC.
+    Open a bag, or a folder of image files in one of the layouts of ``open_sequence``.
 
     poses: ground truth instead of the recording's own, as KITTI (one row per image) or TUM
-    (stamped) file; speed: whether speeds are wanted too. Raises DjetError.
+    (stamped) file; beside: what else is wanted, by names in BESIDE, each with its topic or, where
+    that is to be found, None; strict: whether it has to be there. Raises DjetError.
     """
+    beside = beside or {}
     if is_bag(path) or not path.exists():
-        return BagRecording(path, image_topic, info_topic, poses, speed, speed_topic)
-    if image_topic or info_topic or speed:
-        raise DjetError(f'{path} is a folder of images; topics and scale speed are for bags')
-    if poses is not None:
-        return SequenceRecording(KittiSequence(path, poses))
-    return SequenceRecording(open_sequence(path))
+        return BagRecording(path, image_topic, info_topic, poses, beside, strict)
+    if strict and (image_topic or info_topic or beside.keys() - {'imu'} or any(beside.values())):
+        raise DjetError(f'{path} is a folder of images; topics, speeds, guesses and masks by '
+                        'stamp are for bags')
+    sequence = KittiSequence(path, poses) if poses is not None else open_sequence(path)
+    if strict and 'imu' in beside and sequence.imu is None:
+        raise DjetError(f'{path} holds nothing of an IMU; leave odometry.imu out, or give a '
+                        'recording that has one')
+    return SequenceRecording(sequence, 'imu' in beside)
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
@@ -242,3 +290,17 @@ def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Arra
 
 def _ground_truth(stamp: int, pose: Array) -> BagMessage:
     return BagMessage(GROUND_TRUTH_TOPIC, stamp, MAKE.pose_in(stamp, WORLD_FRAME, pose))
+
+
+def _imu_frame(stamp: int, imu: ImuTrack) -> BagMessage:
+    """Tell how the IMU is turned against the camera; where it is does not matter to its rates."""
+    pose = np.eye(4)
+    pose[:3, :3] = imu.to_camera
+    return BagMessage(STATIC_FRAMES_TOPIC, stamp,
+                      MAKE.frame(stamp, CAMERA_FRAME, IMU_FRAME, pose))
+
+
+def _imu_message(imu: ImuTrack, index: int) -> BagMessage:
+    stamp = int(imu.stamps_ns[index])
+    return BagMessage(IMU_TOPIC, stamp, MAKE.imu(
+        stamp, IMU_FRAME, imu.rates[index], imu.accelerations[index]))

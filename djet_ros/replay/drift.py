@@ -60,6 +60,12 @@ def drift(truth: Array, estimate: Array) -> Drift | None:
                  len(first), int(length.max()))
 
 
+def one_factor(places: Array, truth: Array) -> float:
+    """Factor that makes a path (N, 3) as large as the true one (N, 3), by their spread."""
+    here, there = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
+    return float(there / here) if here > 0 else 1.0
+
+
 def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
     """First and last frames (M,) of all segments of a path (N, 3), and their lengths (M,)."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))

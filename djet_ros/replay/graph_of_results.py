@@ -14,6 +14,7 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
+from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.pose_graph import PoseGraph
@@ -58,7 +59,7 @@ class _Row(NamedTuple):
     stamp_ns: int
     status: Status
     previous_stamp_ns: int | None
-    scale_known: bool
+    scale: Scale
 
 
 def _rows(path: Path) -> list[_Row]:
@@ -70,7 +71,8 @@ def _rows(path: Path) -> list[_Row]:
                 continue
             previous = row['previous_stamp_ns']
             rows.append(_Row(int(row['stamp_ns']), Status(row['status']),
-                             int(previous) if previous else None, row['scale_known'] == '1'))
+                             int(previous) if previous else None,
+                             Scale(row['scale_kind'] or Scale.UNKNOWN)))
         except (KeyError, TypeError, ValueError) as error:
             raise DjetError(f'{path} line {number} is no row of a replay: {error}') from error
     return rows
@@ -102,6 +104,7 @@ def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array
                 raise DjetError(f'{folder}: the motion to the frame of {row.stamp_ns} ns is '
                                 'missing from the bag; replay the recording once more')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       *motions[row.stamp_ns], row.scale_known)
+                       *motions[row.stamp_ns], row.scale is not Scale.UNKNOWN,
+                       metric=row.scale is Scale.METRIC)
         elif row.status in STARTED or row.stamp_ns in references:
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -14,18 +16,23 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.diagnostics import Counts
-from djet_ros.odometry.messages import pose_of, stamp_ns
-from djet_ros.odometry.scale import scale_source, ScaleSource
+from djet_ros.odometry.messages import mounted_frame, pose_of, stamp_ns
+from djet_ros.odometry.scale import Scale, scale_source, ScaleSource
+from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.posegraph.steps import Step
+from djet_ros.posegraph.steps import scale_of, Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
-from djet_ros.replay.drift import drift
+from djet_ros.replay.drift import drift, one_factor
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
 import numpy as np
+
+# Recorded nanoseconds for which an image waits for what belongs to it.
+_PATIENCE_NS = 10**9
 
 
 class Outcome(NamedTuple):
@@ -50,10 +57,14 @@ class Replay:
         self._config = config
         self._folder = folder
         self._name = name
-        # A recording has no tf: the poses are those of the camera.
-        of_camera = replace(config, odometry=replace(config.odometry, base_frame=''))
-        self._tracker = Tracker(of_camera, message_type, _scale(recording, config),
-                                recording.image_topic)
+        self._frames = _static_frames(recording) if config.odometry.base_frame else StaticFrames()
+        self._tracker = Tracker(config, message_type, _scale(recording, config),
+                                recording.image_topic,
+                                still_mask=still_mask(config.odometry.mask_file))
+        self._names = {topic: what for what, topic in recording.beside.items()}
+        # Images that wait for what belongs to them, which may be recorded after them, and the
+        # CameraInfo between them.
+        self._waiting: deque[BagMessage] = deque()
         self._truth = GroundTruth()
         self._log = _Log()
 
@@ -63,7 +74,11 @@ class Replay:
         complete, problem = False, 'broken off'
         try:
             for message in self._recording.messages():
-                if self._take(message) and progress is not None:
+                for _ in range(self._take(message)):
+                    if progress is not None:
+                        progress()
+            for _ in range(self._work_off(None)):
+                if progress is not None:
                     progress()
             complete, problem = True, self._complaint()
         except DjetError as error:
@@ -77,25 +92,49 @@ class Replay:
         self._folder.finish(summary)
         return Outcome(summary, problem or None)
 
-    def _take(self, message: BagMessage) -> bool:
-        """Hand one message on; tell whether it was an image."""
-        recording, tracker = self._recording, self._tracker
-        if message.topic == recording.image_topic:
-            self._image(message)
-            return True
-        if message.topic == recording.info_topic:
-            self._publish(tracker.camera_info(message.message), message.stamp_ns)
-            if tracker.counts.rejected_infos and tracker.problem:
-                raise tracker.problem
+    def _take(self, message: BagMessage) -> int:
+        """Hand one message on; give how many images were worked on."""
+        recording, what = self._recording, self._names.get(message.topic)
+        if message.topic in (recording.image_topic, recording.info_topic):
+            self._waiting.append(message)
         elif message.topic == recording.ground_truth_topic:
             self._truth.add(*pose_of(message.message))
-        elif message.topic == recording.speed_topic:
-            tracker.speed(message.message)
-        return False
+        elif what == 'frames':
+            self._frames.add(message.message)
+        elif what is not None:
+            getattr(self._tracker, what)(message.message)
+        return self._work_off(message.stamp_ns)
+
+    def _work_off(self, now_ns: int | None) -> int:
+        """Work on the images for which all is there, or that have waited long enough; count."""
+        done = 0
+        while self._waiting:
+            first = self._waiting[0]
+            if first.topic == self._recording.info_topic:
+                self._info(self._waiting.popleft())
+                continue
+            if now_ns is not None and now_ns - first.stamp_ns < _PATIENCE_NS \
+                    and self._tracker.lacks(first.message):
+                break
+            self._image(self._waiting.popleft())
+            done += 1
+        return done
+
+    def _info(self, message: BagMessage) -> None:
+        tracker = self._tracker
+        self._publish(tracker.camera_info(message.message), message.stamp_ns)
+        if tracker.counts.rejected_infos and tracker.problem:
+            raise tracker.problem
 
     def _image(self, message: BagMessage) -> None:
         tracker, log = self._tracker, self._log
         number, processed = tracker.counts.received, tracker.counts.processed
+        frame = message.message.header.frame_id
+        for what, (parent, child) in tracker.wanted_mountings(frame).items():
+            if (mounting := self._frames.transform(parent, child)) is not None:
+                tracker.mount_beside(what, mounting)
+        if not tracker.mounted:
+            self._mount(frame)
         started = perf_counter()
         outgoing = tracker.image(message.message)
         seconds = perf_counter() - started
@@ -103,7 +142,8 @@ class Replay:
             result = tracker.last
             log.steps.append(Step(result.stamp_ns, result.status, result.pose,
                                   result.previous_stamp_ns, result.motion,
-                                  result.motion_covariance, result.scale_known))
+                                  result.motion_covariance, result.scale_known,
+                                  metric=result.metric))
             self._folder.add_frame(number, result, seconds)
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
@@ -113,6 +153,16 @@ class Replay:
                 # The first image that could be used decides whether any can.
                 raise tracker.problem
             log.first_problem = log.first_problem or f'image {number}: {tracker.problem}'
+
+    def _mount(self, image_frame: str) -> None:
+        """Find the camera on base_frame; without it there would be no odometry at all."""
+        if not self._tracker.mount(self._frames.transform, image_frame):
+            config = self._config.odometry
+            camera, _ = mounted_frame(config, image_frame)
+            raise DjetError(
+                f"odometry.base_frame is '{config.base_frame}', and no /tf_static in {self._name} "
+                f"tells where '{camera}' is on it; record it too, or leave base_frame empty "
+                "(--base-frame '') for the poses of the camera")
 
     def _publish(self, outgoing: list[Outgoing], stamp: int) -> None:
         for one in outgoing:
@@ -139,7 +189,7 @@ class Replay:
         return {
             'source': self._name, 'image_topic': self._recording.image_topic,
             'method': config.estimator.method, 'preset': config.preset,
-            'scale': config.odometry.scale,
+            'scale': config.odometry.scale, 'scale_kind': self._log.scale.value,
             'pairs_of_known_scale': sum(step.tracked and step.scale_known
                                         for step in self._log.steps),
             'frames': counts.processed, 'pairs': len(self._log.pairs()),
@@ -170,16 +220,21 @@ class Replay:
             self._plot(truth)
 
     def _plot(self, truth: Array) -> None:
-        """Draw the trajectory; without a scale its lengths are those of the ground truth."""
+        """Draw the trajectory; what is not known of its lengths is taken from the ground truth."""
         log, unit = self._log, 'm'
         title = f'{Path(self._name).name}: {self._config.estimator.method}, {self._config.preset}'
         estimate = np.array([step.pose for step in log.steps])
         known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
-        if not log.metric and known.size:
+        if log.scale is Scale.UNKNOWN and known.size:
             estimate = log.with_lengths_of(truth)
             title += '\n(lengths of the steps from ground truth)'
-        elif not log.metric:
+        elif log.scale is Scale.UNKNOWN:
             unit = 'steps of unit length'
+        elif log.scale is Scale.RELATIVE and known.size:
+            estimate[:, :3, 3] *= one_factor(estimate[known, :3, 3], truth[known, :3, 3])
+            title += '\n(one scale for all of it from ground truth)'
+        elif log.scale is Scale.RELATIVE:
+            unit = 'lengths of the first step'
         # The two agree where the ground truth begins.
         positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
             if known.size else None
@@ -194,9 +249,9 @@ class _Log:
     first_problem: str | None = None
 
     @property
-    def metric(self) -> bool:
-        """Whether all lengths are known."""
-        return all(step.scale_known or step.status is not Status.OK for step in self.steps)
+    def scale(self) -> Scale:
+        """Tell what all lengths are in."""
+        return scale_of(self.steps)
 
     def pairs(self) -> list[Step]:
         return [step for step in self.steps if step.previous_stamp_ns is not None]
@@ -205,14 +260,18 @@ class _Log:
         """
         Drift over the frames whose true pose (N, 4, 4) is known; None where the way is too short.
 
-        Without a scale, lengths mean nothing; the drift of the rotation does not need them.
+        Without a scale, lengths mean nothing; the drift of the rotation does not need them. A
+        relative scale takes the one factor that serves the whole path best.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
-        found = drift(truth[known], np.array([step.pose for step in self.steps])[known])
+        poses = np.array([step.pose for step in self.steps])[known]
+        if self.scale is Scale.RELATIVE:
+            poses[:, :3, 3] *= one_factor(poses[:, :3, 3], truth[known][:, :3, 3])
+        found = drift(truth[known], poses)
         if found is None:
             return None
-        return {**asdict(found),
-                'translation_percent': found.translation_percent if self.metric else None}
+        return {**asdict(found), 'translation_percent':
+                None if self.scale is Scale.UNKNOWN else found.translation_percent}
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
@@ -231,6 +290,16 @@ class _Log:
             poses.append(pose)
             at[step.stamp_ns] = i
         return np.array(poses)
+
+
+def _static_frames(recording: Recording) -> StaticFrames:
+    """Read where frames are on one another, as far as the recording can be read."""
+    frames = StaticFrames()
+    # Damage is said where the images come to it.
+    with suppress(DjetError):
+        for message in recording.static_frames():
+            frames.add(message)
+    return frames
 
 
 def _scale(recording: Recording, config: Config) -> ScaleSource:

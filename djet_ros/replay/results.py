@@ -40,7 +40,7 @@ _FILES = (SUMMARY, PLOT, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.c
           'config.yaml')
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
-           'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_known',
+           'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
            'ms')
 
 
@@ -135,7 +135,7 @@ def _details(result: OdometryResult) -> tuple[Any, ...]:
             relative.culled, relative.iterations,
             f'{np.median(residuals):.4f}' if residuals.size else '',
             f'{hamming.mean():.3f}' if hamming.size else '',
-            repr(float(result.scale)), int(result.scale_known))
+            repr(float(result.scale)), result.scale_kind.value)
 
 
 def _cells(values: NDArray[np.float64]) -> list[str]:

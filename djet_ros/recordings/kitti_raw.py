@@ -1,0 +1,192 @@
+"""
+Drives of KITTI's raw data (Geiger et al., IJRR 2013), as they are downloaded.
+
+A drive holds image_00/data/*.png and image_00/timestamps.txt; the folder above it, or the drive,
+the calibration: calib_cam_to_cam.txt and, where the GPS/IMU is to be of use (oxts),
+calib_velo_to_cam.txt and calib_imu_to_velo.txt.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, UTC
+from pathlib import Path
+
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.odometry.interpolation import poses_at
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.imu import ImuTrack
+from djet_ros.recordings.text import (
+    check_positions,
+    increasing,
+    lines,
+    number_rows,
+    numbers,
+    stamped,
+)
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+_EARTH_RADIUS = 6378137.0
+
+# A gap in the GPS/IMU wider than this is not bridged; the synchronised one has a sample an image.
+_LONGEST_GAP_NS = 250_000_000
+
+# Columns of a file of oxts: place, attitude, accelerations and rates along the unit's own axes.
+_COLUMNS, _ACCELERATIONS, _RATES = 30, slice(11, 14), slice(17, 20)
+
+_IMAGES = Path('image_00') / 'data'
+
+
+def is_kitti_raw(folder: Path) -> bool:
+    """Tell whether a folder is a drive of the raw data."""
+    return (folder / _IMAGES).is_dir()
+
+
+def kitti_raw(folder: Path) -> FrameSequence:
+    """
+    Open a drive: the left gray camera, rectified (…_sync) or as it was recorded (…_extract).
+
+    Ground truth and IMU are those of oxts, where it and its calibration are there. Stamps are
+    taken for UTC. Raises DjetError.
+    """
+    paths = sorted((folder / _IMAGES).glob('*.png'))
+    if not paths:
+        raise DjetError(f'{folder / _IMAGES} holds no *.png; give a drive of the raw data')
+    images = ImageFiles(paths)
+    stamps = _stamps(folder / 'image_00' / 'timestamps.txt')
+    if len(stamps) != len(paths):
+        raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} '
+                        'images; there must be one for each')
+    increasing(stamps, folder / 'image_00' / 'timestamps.txt')
+    K, distortion, rectifying = _camera(_beside(folder, 'calib_cam_to_cam.txt'), images.size)
+    poses = imu = None
+    if (unit_in_camera := _unit_in_camera(folder, rectifying)) is not None:
+        known, rows = _oxts(folder / 'oxts')
+        if (np.diff(known) > 0).all():
+            units = _unit_poses(rows, folder)
+            poses = from_first(poses_at(known, units @ np.linalg.inv(unit_in_camera), stamps,
+                                        _LONGEST_GAP_NS))
+        imu = ImuTrack(known, rows[:, _RATES], rows[:, _ACCELERATIONS], unit_in_camera[:3, :3])
+    return FrameSequence(f'KITTI raw {folder.resolve().name}', images, K, stamps, poses,
+                         distortion.tolist(), imu=imu)
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """Find a file of the calibration in the drive, or in the day's folder above it."""
+    places = (folder / name, folder.resolve().parent / name)
+    found = next((path for path in places if path.exists()), None)
+    if found is None:
+        raise DjetError(f'{places[1]} is missing; copy it there, from the calibration of the day')
+    return found
+
+
+def _stamps(path: Path) -> NDArray[np.int64]:
+    return np.array([stamped(path, number, text, clock_nanoseconds)
+                     for number, text in lines(path)], np.int64)
+
+
+def clock_nanoseconds(text: str) -> int:
+    """Nanoseconds since 1970 of a UTC clock such as '2011-09-26 13:02:25.964389445'."""
+    whole, _, rest = text.partition('.')
+    if len(rest) > 9 or (rest and not (rest.isascii() and rest.isdecimal())):
+        raise ValueError(f"'{text[:40]}' is no stamp of the form 2011-09-26 13:02:25.964389445")
+    try:
+        clock = datetime.strptime(whole, '%Y-%m-%d %H:%M:%S').replace(tzinfo=UTC)
+    except ValueError:
+        raise ValueError(f"'{text[:40]}' is no stamp of the form 2011-09-26 13:02:25.964389445"
+                         ) from None
+    if not 1970 < clock.year < 2038:
+        raise ValueError(f"'{text[:40]}' is no stamp between 1971 and 2037")
+    return int(clock.timestamp()) * 10**9 + int(rest.ljust(9, '0'))
+
+
+def _calibration(path: Path, *counts: tuple[str, int]) -> list[Array]:
+    """Numbers of some rows 'name: …' of a calibration file, and how many each must have."""
+    rows = {text.partition(':')[0].strip(): text.partition(':')[2] for _, text in lines(path)}
+    found = []
+    for name, count in counts:
+        try:
+            values = numbers(rows[name])
+        except KeyError:
+            raise DjetError(f"{path} has no line '{name}:'; is it whole?") from None
+        except ValueError as error:
+            raise DjetError(f'{path}: {name}: {error}; mend or replace the file') from error
+        if len(values) != count:
+            raise DjetError(f'{path}: {name} has {len(values)} numbers, {count} belong there')
+        found.append(np.array(values))
+    return found
+
+
+def _camera(path: Path, size: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Camera matrix, distortion, and rotation to the images' axes, of images of a size."""
+    rectified, raw = _calibration(path, ('S_rect_00', 2), ('S_00', 2))
+    if tuple(rectified) == size:
+        P, R = _calibration(path, ('P_rect_00', 12), ('R_rect_00', 9))
+        K, distortion, turn = P.reshape(3, 4)[:, :3], np.zeros(5), R.reshape(3, 3)
+    elif tuple(raw) == size:
+        K, distortion = _calibration(path, ('K_00', 9), ('D_00', 5))
+        K, turn = K.reshape(3, 3), np.eye(3)
+    else:
+        raise DjetError(f'{path} is for images of {_size(rectified)} or {_size(raw)}, these are '
+                        f'{_size(np.array(size))}; give the calibration of the same day')
+    if min(K[0, 0], K[1, 1]) <= 0 or K[2].tolist() != [0, 0, 1]:
+        raise DjetError(f'{path}: fx fy cx cy = {K[0, 0]:g} {K[1, 1]:g} {K[0, 2]:g} {K[1, 2]:g} '
+                        'is no camera')
+    return K.copy(), distortion, turn
+
+
+def _size(size: Array) -> str:
+    return f'{size[0]:g}x{size[1]:g}'
+
+
+def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
+    """GPS/IMU in the camera (4, 4); None where there is none, or nobody knows where it is."""
+    day = folder.resolve().parent
+    names = ('calib_imu_to_velo.txt', 'calib_velo_to_cam.txt')
+    if not (folder / 'oxts' / 'timestamps.txt').exists() or not all(
+            (folder / name).exists() or (day / name).exists() for name in names):
+        return None
+    pose = np.eye(4)
+    for name in names:
+        R, T = _calibration(_beside(folder, name), ('R', 9), ('T', 3))
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = R.reshape(3, 3), T
+        pose = step @ pose
+    turn = np.eye(4)
+    turn[:3, :3] = rectifying
+    # The files have too few digits for a rotation.
+    pose = turn @ pose
+    U, _, Vt = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = U @ Vt
+    return pose
+
+
+def _oxts(folder: Path) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (M,) and rows (M, 30) of the GPS/IMU."""
+    stamps = _stamps(folder / 'timestamps.txt')
+    paths = sorted((folder / 'data').glob('*.txt'))
+    if len(stamps) != len(paths):
+        raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} files '
+                        'data/*.txt; there must be one for each')
+    rows = [number_rows(path, _COLUMNS) for path in paths]
+    wrong = next((path for path, row in zip(paths, rows, strict=True) if len(row) != 1), None)
+    if wrong is not None:
+        raise DjetError(f'{wrong} has no single line of {_COLUMNS} numbers')
+    return stamps, np.concatenate(rows) if rows else np.empty((0, _COLUMNS))
+
+
+def _unit_poses(rows: Array, folder: Path) -> Array:
+    """Poses (M, 4, 4) of the unit over a Mercator map, as the data's own tools have them."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if not len(rows):
+        return poses
+    latitude, longitude, altitude, roll, pitch, yaw = rows[:, :6].T
+    scale = np.cos(np.radians(latitude[0]))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        north = scale * _EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+    poses[:, :3, 3] = np.stack([scale * np.radians(longitude) * _EARTH_RADIUS, north, altitude], 1)
+    check_positions(poses[:, :3, 3], folder / 'oxts' / 'data')
+    poses[:, :3, :3] = Rotation.from_euler('ZYX', np.stack([yaw, pitch, roll], 1)).as_matrix()
+    return poses
