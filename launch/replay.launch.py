@@ -28,7 +28,7 @@ def generate_launch_description():
         DeclareLaunchArgument('loop', default_value='false', choices=['true', 'false'],
                               description='begin again at the end'),
         # As djet kitti-to-bag names the images, and so that every image is worked on.
-        *arguments('image', 'params_file', 'rviz', image='/camera/image_rect',
+        *arguments('image', 'params_file', 'base_frame', 'rviz', image='/camera/image_rect',
                    params_file=PathJoinSubstitution([CONFIG, 'replay.yaml'])),
         IncludeLaunchDescription(PythonLaunchDescriptionSource(vo), launch_arguments={
             'use_sim_time': 'true'}.items()),

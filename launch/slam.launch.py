@@ -5,10 +5,10 @@ from launch import LaunchDescription
 
 
 def generate_launch_description():
-    """Describe both nodes; together they publish map -> odom -> camera."""
+    """Describe both nodes; together they publish map -> odom -> camera or base_frame."""
     return LaunchDescription([
-        *arguments('image', 'camera_info', 'params_file', 'slam_params_file', 'namespace',
-                   'log_level', 'respawn', 'use_sim_time'),
+        *arguments('image', 'camera_info', 'params_file', 'slam_params_file', 'base_frame',
+                   'namespace', 'log_level', 'respawn', 'use_sim_time'),
         node('vo_node', 'vo_node', 'params_file', ros__publish_tf=True),
         node('pose_graph_node', 'pose_graph_node', 'params_file', 'slam_params_file'),
     ])

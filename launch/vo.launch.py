@@ -10,8 +10,8 @@ from launch_ros.actions import Node
 def generate_launch_description():
     """Describe the node and, if asked for, RViz."""
     return LaunchDescription([
-        *arguments('image', 'camera_info', 'params_file', 'namespace', 'name', 'log_level',
-                   'respawn', 'use_sim_time', 'rviz'),
+        *arguments('image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
+                   'log_level', 'respawn', 'use_sim_time', 'rviz'),
         node('vo_node', LaunchConfiguration('name'), 'params_file'),
         Node(package='rviz2', executable='rviz2', name='rviz_of_vo', parameters=[sim_time()],
              arguments=['-d', PathJoinSubstitution([CONFIG, 'vo.rviz'])],

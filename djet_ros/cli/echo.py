@@ -25,6 +25,8 @@ _SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames rec
           'frames processed', 'frames dropped', 'frames rejected', 'frames lost on the way',
           'matches', 'inliers', 'median residual (px)')
 
+_UNITS = {'metric': 'm', 'relative': 'lengths of the first step'}
+
 _COLOURS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 
@@ -92,7 +94,7 @@ class Monitor:
     @property
     def length(self) -> str:
         """Length of the path, in metres where they are known."""
-        unit = 'm' if self.values.get('scale') == 'known' else 'steps of unit length'
+        unit = _UNITS.get(self.values.get('scale', ''), 'steps of unit length')
         return f'{self.path_length:.1f} {unit}'
 
     def table(self) -> Table:

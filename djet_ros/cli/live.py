@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
-from djet_ros.config.flat import flat, parse_value, with_values
+from djet_ros.config.flat import flat, parse_value
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
+from djet_ros.live.parameters import with_live_values
 
 DESCRIPTION = f"""\
 Do on a ROS 2 graph, where no ROS is installed, what 'ros2 run djet_ros vo_node' does where it is:
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:
     """Read file and command line; the boolean is use_sim_time."""
-    config = load_yaml(args.params) if args.params else Config()
+    config = load_yaml(args.params, take=with_live_values) if args.params else Config()
     known = flat(config)
     values: dict[str, Any] = {}
     use_sim_time = False
@@ -59,4 +60,4 @@ def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:
             use_sim_time = text == 'true'
         else:
             values[name] = parse_value(known[name], text) if name in known else text
-    return with_values(config, values), use_sim_time
+    return with_live_values(config, values), use_sim_time

@@ -30,10 +30,12 @@ LAB = {
     'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
     'closure': 'how well the rotations of three frames agree: no ground truth needed',
+    'coverage': 'are poses as sure as they say? errors against covariances, scene by scene',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
     'soak': 'run many frames through the odometry: does memory or latency grow?',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",
     'surfaces': 'draw one match on its Hamming surface, round by round',
+    'imu-offset': "find the offset of an IMU's clock, and how it is mounted, from a recording",
     'render': 'render a scene with exact ground truth as a KITTI sequence',
 }
 

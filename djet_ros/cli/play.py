@@ -10,7 +10,7 @@ import sys
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
 from djet_ros.cli.options import add_topics
 from djet_ros.errors import DjetError
-from djet_ros.recordings.recording import open_recording
+from djet_ros.recordings.recording import BESIDE, open_recording
 
 DESCRIPTION = f"""\
 Publish the images of a recording, their CameraInfo and the ground truth, at the pace of the
@@ -22,7 +22,8 @@ subscriber that asks for it, the player rather waits than loses an image; Camera
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='BAG',
-                        help='rosbag2, ROS 1 bag, or folder in KITTI, TUM RGB-D or EuRoC layout')
+                        help='rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, '
+                        '7-Scenes, EuRoC or TUM-VI')
     parser.add_argument('--rate', type=float, default=1.0, metavar='R',
                         help='times the recorded pace (default: %(default)s)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
@@ -42,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.names import Names
     from djet_ros.dds.player import Player
     names = Names('player', args.remap)
-    source = open_recording(args.source, args.image_topic, args.info_topic)
+    source = open_recording(args.source, args.image_topic, args.info_topic,
+                            beside=dict.fromkeys(BESIDE), strict=False)
     try:
         with Graph() as graph:
             player = Player(graph, source, names, args.rate, args.clock)

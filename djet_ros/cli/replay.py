@@ -12,10 +12,10 @@ from djet_ros.cli.options import add_output, add_topics
 from djet_ros.cli.terminal import new_table, progress_bar, spread
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
-from djet_ros.recordings.recording import open_recording
+from djet_ros.recordings.recording import BESIDE, open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import PLOT, ResultsFolder
 from rich.console import Console
@@ -31,13 +31,15 @@ is told per 100 m, as the KITTI benchmark has it, where the way is that long.
 
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
           'odometry.camera_height', 'odometry.camera_pitch', 'odometry.rectified',
-          'odometry.frame_convention')
+          'odometry.frame_convention', 'odometry.base_frame', 'odometry.imu', 'odometry.guess',
+          'odometry.mask', 'odometry.mask_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE',
-                        help='rosbag2, ROS 1 bag, or folder in KITTI, TUM RGB-D or EuRoC layout')
+                        help='rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, '
+                        '7-Scenes, EuRoC or TUM-VI')
     add_output(parser, 'folder of the results')
     add_replay_options(parser, _FLAGS)
 
@@ -51,7 +53,7 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth instead of the recording's own: a TUM file, or a KITTI "
                         'file with a row for each image')
-    add_topics(parser, 'image', 'info', 'speed')
+    add_topics(parser, 'image', 'info', *BESIDE)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,13 +77,21 @@ def configured(args: argparse.Namespace) -> Config:
 def replayed(args: argparse.Namespace, config: Config, recording: Path, folder: Path) -> Outcome:
     """Replay a recording, of which the options tell the topics and poses, into a folder."""
     source = open_recording(recording, args.image_topic, args.info_topic, args.poses,
-                            speed=config.odometry.scale == 'speed', speed_topic=args.speed_topic)
+                            beside={what: getattr(args, f'{what}_topic')
+                                    for what in _wanted_beside(config.odometry)})
     try:
         with ResultsFolder(folder, config, args.overwrite) as results, \
                 progress_bar('replay', len(source)) as advance:
             return Replay(source, config, results, str(recording)).run(advance)
     finally:
         source.close()
+
+
+def _wanted_beside(config: OdometryConfig) -> list[str]:
+    """Name what the odometry goes by beside the images."""
+    wanted = {'speed': config.scale == 'speed', 'imu': config.imu,
+              'guess': config.guess or config.scale == 'guess', 'mask': config.mask}
+    return [what for what, is_wanted in wanted.items() if is_wanted]
 
 
 def _table(summary: dict[str, Any]) -> Table:

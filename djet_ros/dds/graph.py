@@ -8,7 +8,11 @@ from pathlib import Path
 import re
 from typing import Any, Self
 
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
 from cyclonedds.core import (
     DDSException,
     InstanceState,
@@ -173,6 +177,7 @@ class Graph:
         self._subscriptions: list[Subscription] = []
         self._waiting = WaitSet(self._participant)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._listeners = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
 
     def close(self) -> None:
         """Leave the graph, and tell the others; nothing can be sent or heard any more."""
@@ -245,18 +250,24 @@ class Graph:
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""
         return [Offer(f'participant {one.participant_key}', _ros_type(one.type_name),
-                      _profile(one.qos)) for one in self._alive()
+                      _profile(one.qos)) for one in _alive(self._publications)
                 if one.topic_name == f'rt{topic}']
+
+    def listeners_without(self, dds_topic: str, user_data: str) -> set[str]:
+        """Give who subscribes to a topic, by its DDS name, and does not say this of itself."""
+        return {str(one.key) for one in _alive(self._listeners)
+                if one.topic_name == dds_topic and user_data not in _user_data(one)}
 
     def published(self, ros_type: str) -> list[str]:
         """Give the topics over which somebody sends messages of a ROS type."""
-        return sorted({one.topic_name.removeprefix('rt') for one in self._alive()
+        return sorted({one.topic_name.removeprefix('rt') for one in _alive(self._publications)
                        if one.topic_name.startswith('rt/')
                        and one.type_name == dds_type_name(ros_type)})
 
-    def _alive(self) -> list[Any]:
-        return [one for one in self._publications.read(1000)
-                if one.sample_info.instance_state == InstanceState.Alive]
+
+def _alive(reader: BuiltinDataReader) -> list[Any]:
+    return [one for one in reader.read(1000)
+            if one.sample_info.instance_state == InstanceState.Alive]
 
 
 def _domain_id(environment: Mapping[str, str]) -> int:

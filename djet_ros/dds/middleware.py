@@ -11,13 +11,19 @@ from djet_ros.core.types import Array
 from djet_ros.dds.graph import Graph, Publisher, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
-from djet_ros.errors import DjetError
 from djet_ros.live.middleware import Offer, Profile
 from djet_ros.live.topics import IMAGE_TYPES
 from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
+from djet_ros.odometry.static_frames import StaticFrames, TOPIC, TYPE
 from djet_ros.recordings.decoding import message_type
 
 _GARBAGE_LOG_PERIOD = 5.0
+
+# Seconds between two looks for clients that can't be answered.
+_LOOK_PERIOD = 1.0
+
+# Messages of static frames that may wait; each robot_state_publisher has one.
+_FRAMES_DEPTH = 100
 
 _LEVELS = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}
 
@@ -36,7 +42,8 @@ class DdsMiddleware:
         self._graph = graph
         self._names = names
         self._clock: int | None = None
-        self._last_garbage = -float('inf')
+        self._frames = StaticFrames()
+        self._last_garbage = self._last_look = -float('inf')
         self._services: list[TriggerServer] = []
         if use_sim_time:
             self._clock = 0
@@ -85,13 +92,14 @@ class DdsMiddleware:
         return self._graph.published(kind)
 
     def follow_frames(self) -> None:
-        """Refuse: without tf2 nobody knows where the frames are."""
-        raise DjetError('odometry.base_frame needs tf2, which comes with ROS: run vo_node, or '
-                        'leave it empty for the poses of the camera')
+        """Hear what /tf_static says from now on; frames that move are for tf2, which ROS has."""
+        # Whoever publishes there latches its newest message.
+        self._graph.listen(TOPIC, TYPE, self._frames.add,
+                           Profile(depth=_FRAMES_DEPTH, latched=True), garbage=self._note_garbage)
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Know nothing."""
-        return None
+        """Give a frame in another (4, 4), or None where /tf_static has not told it."""
+        return self._frames.transform(parent, child)
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
@@ -101,6 +109,10 @@ class DdsMiddleware:
     def spin(self, seconds: float) -> None:
         """Wait for messages, at most for some time, and hand them out."""
         self._graph.spin(seconds)
+        if monotonic() - self._last_look >= _LOOK_PERIOD:
+            self._last_look = monotonic()
+            for service in self._services:
+                service.look_for_strangers()
 
     def _take_clock(self, message: Any) -> None:
         self._clock = ns_of_time(message.clock)

@@ -9,6 +9,7 @@ from time import monotonic
 from djet_ros.dds.graph import Graph, Publisher
 from djet_ros.dds.names import Names
 from djet_ros.live.middleware import Profile
+from djet_ros.odometry.static_frames import TOPIC, TYPE
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import MAKE, message_type
 from djet_ros.recordings.recording import Recording
@@ -17,6 +18,8 @@ from djet_ros.recordings.recording import Recording
 _STREAM = Profile(depth=None)
 # A CameraInfo is also for who comes late.
 _LATCHED = Profile(depth=1, latched=True)
+# So are frames, of which each message has some.
+_FRAMES = Profile(depth=100, latched=True)
 
 # Seconds between a subscription's appearance here and this publisher's appearance there.
 _SETTLE = 0.5
@@ -45,20 +48,30 @@ class Player:
         self._clock = graph.advertise('/clock', 'rosgraph_msgs/msg/Clock') if clock else None
         self.played = Played()
         self._advertise()
+        self._tell_static_frames()
 
     def _advertise(self) -> None:
         """Advertise all topics before the first message, so that none is lost."""
         recording = self._recording
         missing = {recording.image_topic, recording.info_topic,
-                   recording.ground_truth_topic} - {None}
+                   recording.ground_truth_topic, *recording.beside.values()} - {None}
         for one in recording.messages():
             if one.topic in missing:
                 missing.discard(one.topic)
                 self._publishers[one.topic] = self._graph.advertise(
                     self._names.resolve(one.topic), one.message.__msgtype__,
-                    _LATCHED if one.topic == recording.info_topic else _STREAM)
+                    _LATCHED if one.topic == recording.info_topic
+                    else _FRAMES if one.topic == recording.beside.get('frames') else _STREAM)
             if not missing:
                 return
+
+    def _tell_static_frames(self) -> None:
+        """Publish the newest of each static frame at once, and for who comes late."""
+        newest = {one.child_frame_id: one for message in self._recording.static_frames()
+                  for one in message.transforms}
+        if newest:
+            self._frames = self._graph.advertise(TOPIC, TYPE, _LATCHED)
+            self._frames.publish(message_type(TYPE)(transforms=list(newest.values())))
 
     @property
     def image_topic(self) -> str:

@@ -111,14 +111,14 @@ class Face:
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
         return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
 
-    def wants_debug_image(self) -> bool:
-        """Tell whether anybody subscribes to the debug image."""
-        output = self._outputs.get('debug_image')
+    def wants(self, topic: str) -> bool:
+        """Tell whether anybody subscribes to an output."""
+        output = self._outputs.get(topic)
         return output is not None and bool(output.listeners)
 
-    def mounting(self, base: str, camera: str) -> Array | None:
-        """Give the camera in the base frame (4, 4), or None where tf does not know it yet."""
-        return self._middleware.transform(base, camera)
+    def transform(self, parent: str, child: str) -> Array | None:
+        """Give a frame in another (4, 4), or None where tf does not know it yet."""
+        return self._middleware.transform(parent, child)
 
     # Inputs and outputs
 

@@ -20,6 +20,8 @@ class GraphFace(Face):
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
+        if config.odometry.base_frame:
+            middleware.follow_frames()
         image, info = self.image_topics(config.ros)
         topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
         self.session: GraphSession = GraphSession(

@@ -120,7 +120,13 @@ class GraphSession:
 
     def _take(self, what: str, do: Callable[[], list[Outgoing]]) -> None:
         self._heard[what] = monotonic()
-        self._put(do)
+        self._put(lambda: do() if self._mounted() else [])
+
+    def _mounted(self) -> bool:
+        """Tell whether the mounting of the camera is known, where one is needed."""
+        if not self._slam.mounted and (missing := self._slam.mount(self._wiring.transform)):
+            self._log.warn('mounting', f'{missing}; until then the odometry is not used')
+        return self._slam.mounted
 
     def _put(self, do: Callable[[], list[Outgoing]]) -> None:
         self._queue.put(_Task(do, monotonic()))

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware
-from djet_ros.live.parameters import for_a_live_graph
 from djet_ros.live.session import Session
-from djet_ros.live.topics import odometry_outputs, SPEED_TYPES
+from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.mask_files import still_mask
+
+# Messages beside the images that the middleware keeps while an image waits for room: seconds of
+# the fastest IMU.
+_DEPTH = 2000
 
 
 class OdometryFace(Face):
@@ -20,16 +26,16 @@ class OdometryFace(Face):
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
-        for_a_live_graph(config)
-        if config.odometry.base_frame:
-            middleware.follow_frames()
+        self._follows_frames = False
         image, info = self.image_topics(config.ros)
         self.session: Session = Session(
             Tracker(config, middleware.message_type, image_topic=image,
                     node=middleware.node.strip('/'),
-                    speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES))), self,
+                    speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES)),
+                    still_mask=still_mask(config.odometry.mask_file)), self,
             {'image': image, 'camera_info': info})
         self._hears_speed = False
+        self._hears_beside: set[str] = set()
         self._connect(config)
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
         for name in ('reset', 'pause', 'resume'):
@@ -43,8 +49,21 @@ class OdometryFace(Face):
         self.session.configure(config)
 
     def _connect(self, config: Config) -> None:
-        """Make the publishers and the speed subscriptions that a configuration asks for."""
+        """Make the publishers and the subscriptions that a configuration asks for."""
         self.advertise(odometry_outputs(config.ros))
+        odometry = config.odometry
+        wanted = {'imu': odometry.imu, 'mask': odometry.mask,
+                  'guess': odometry.guess or odometry.scale == 'guess'}
+        frames = bool(odometry.base_frame) or wanted['guess'] or (
+            odometry.imu and odometry.imu_quaternion() is None)
+        if frames and not self._follows_frames:
+            self._follows_frames = True
+            self._middleware.follow_frames()
+        for what in [what for what in wanted if wanted[what] and what not in self._hears_beside]:
+            self._hears_beside.add(what)
+            self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
+                        getattr(self.session, what),
+                        replace(input_profile(config.ros), depth=_DEPTH))
         if config.odometry.scale == 'speed' and not self._hears_speed:
             self._hears_speed = True
             for topic, kind in SPEED_TYPES.items():

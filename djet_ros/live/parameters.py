@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
-from djet_ros.config.flat import section
+from collections.abc import Mapping
+from typing import Any
+
+from djet_ros.config.flat import FlatParameter, section, with_values
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 
 # What a subscription or the queue was made with holds for its life; and nobody who knows the odom
-# frame could follow it to other axes.
+# frame could follow it to other axes. A mask is read once.
 FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
-         'ros.queue_size', 'odometry.frame_convention', 'odometry.base_frame')
+         'ros.queue_size', 'odometry.frame_convention', 'odometry.base_frame',
+         'odometry.mask_file')
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
 SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
-          'odometry.frame_convention', 'ros.image_transport', 'ros.qos_reliability',
-          'ros.queue_policy')
+          'odometry.frame_convention', 'odometry.camera_frame', 'odometry.base_frame',
+          'ros.image_transport', 'ros.qos_reliability', 'ros.queue_policy')
 
 # What the odometry goes by; what belongs to another node is no unknown name.
 ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')
                      for item in section(Config(), part))
 
 
-def for_a_live_graph(config: Config) -> Config:
-    """Refuse what can't be had on a live graph."""
-    if config.odometry.scale == 'ground_truth':
-        raise DjetError("odometry.scale is 'ground_truth', which only a recording has; choose "
-                        'none, constant, speed or camera_height')
-    return config
+# Values that only a recording has, by parameter.
+_OFFLINE = {'odometry.scale': 'ground_truth'}
+
+
+def live_choices(item: FlatParameter) -> tuple[str, ...]:
+    """Give the values to choose from on a live graph; none where there is nothing to choose."""
+    return tuple(one for one in item.description.choices if one != _OFFLINE.get(item.name))
+
+
+def with_live_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """Give the configuration with values changed as ``with_values`` does, for a live graph."""
+    for item in section(config, 'odometry'):
+        offered, value = live_choices(item), values.get(item.name)
+        if offered and isinstance(value, str) and value not in offered:
+            why = ', which only a recording has' if value == _OFFLINE.get(item.name) else ''
+            raise DjetError(f"{item.name} is '{value}'{why}; choose from {', '.join(offered)}")
+    return with_values(config, values)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from time import monotonic, time_ns
 from typing import Any, NamedTuple, Protocol
 
@@ -18,7 +18,6 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.diagnostics import LEVELS, State
-from djet_ros.odometry.health import optical_frame
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -31,8 +30,11 @@ _LOG_PERIOD = 5.0
 # Seconds after which diagnostics come also where no image makes the tracker say them.
 _DIAGNOSTICS_PERIOD = 1.0
 
-# Speeds that may wait for the next frame.
-_WAITING_SPEEDS = 10_000
+# Messages of what comes beside the images that may wait for the next one.
+_WAITING_BESIDE = 10_000
+
+# Seconds for which an image waits for what belongs to it: the gyro's rates, its mask.
+_PATIENCE = 0.1
 
 _LATENCIES = 100
 
@@ -52,11 +54,11 @@ class Wiring(Protocol):
     def why_silent(self, topic: str) -> str:
         """Say what is seen of a topic over which nothing comes."""
 
-    def wants_debug_image(self) -> bool:
-        """Tell whether anybody looks at the debug image."""
+    def wants(self, topic: str) -> bool:
+        """Tell whether anybody listens to an output that is made for listeners alone."""
 
-    def mounting(self, base: str, camera: str) -> Array | None:
-        """Give the camera in the base frame (4, 4), or None where tf does not know it yet."""
+    def transform(self, parent: str, child: str) -> Array | None:
+        """Give a frame in another (4, 4), or None where tf does not know it yet."""
 
 
 class _Received(NamedTuple):
@@ -133,7 +135,9 @@ class Session:
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        self._speeds: deque[Any] = deque(maxlen=_WAITING_SPEEDS)
+        # What came beside the images, each with the name of the tracker's method that takes it.
+        self._beside: deque[tuple[str, Any]] = deque(maxlen=_WAITING_BESIDE)
+        self._came = Event()
         self._counted_drops = self._lost = 0
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
@@ -154,6 +158,7 @@ class Session:
         An image whose messages are being published at this moment is published as a whole.
         """
         self._stopping = True
+        self._came.set()
         self._queue.close()
         self._queue.clear()
         if self._worker.is_alive():
@@ -177,7 +182,23 @@ class Session:
 
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed."""
-        self._speeds.append(message)
+        self._take('speed', message)
+
+    def imu(self, message: Any) -> None:
+        """Take an Imu."""
+        self._take('imu', message)
+
+    def guess(self, message: Any) -> None:
+        """Take an Odometry as a guess of where the camera went."""
+        self._take('guess', message)
+
+    def mask(self, message: Any) -> None:
+        """Take the mask of the image that has its stamp."""
+        self._take('mask', message)
+
+    def _take(self, what: str, message: Any) -> None:
+        self._beside.append((what, message))
+        self._came.set()
 
     def count_lost(self, number: int) -> None:
         """Count images that were sent and never came."""
@@ -192,7 +213,7 @@ class Session:
             # An image that has left the queue may wait for the lock just now.
             self._forgotten = monotonic()
             self._queue.clear()
-            self._speeds.clear()
+            self._beside.clear()
             self._latencies.clear()
             self._log.clear()
             self._counted_drops, self._lost = self._queue.dropped, 0
@@ -274,6 +295,7 @@ class Session:
     def _work(self) -> None:
         try:
             while (received := self._queue.get()) is not None:
+                self._await_what_belongs_to(received)
                 with self._turnstile:
                     pass
                 with self._lock:
@@ -288,24 +310,47 @@ class Session:
         self._count_drops()
         tracker.face_values = self._face_values()
         self._take_info(received.info)
-        while self._speeds:
-            tracker.speed(self._speeds.popleft())
+        self._hand_on()
+        frame = received.image.header.frame_id
         if not tracker.mounted:
-            self._mount(received.image.header.frame_id)
+            self._mount(frame)
+        self._mount_beside(frame)
         self._publish(tracker.image(received.image))
         self._latencies.add(received.at)
         self._log_trouble()
-        if self._wiring.wants_debug_image() and (picture := tracker.debug_image()):
-            self._publish([picture])
+        for topic, make in (('debug_image', tracker.debug_image),
+                            ('landmarks', tracker.landmarks)):
+            if self._wiring.wants(topic) and (made := make()):
+                self._publish([made])
+
+    def _await_what_belongs_to(self, received: _Received) -> None:
+        """Wait a moment for what an image is to be worked on with, if it has not come yet."""
+        end = received.at + _PATIENCE
+        while not self._stopping and received.at > self._forgotten:
+            self._came.clear()
+            with self._lock:
+                self._hand_on()
+                lacking = self._tracker.lacks(received.image)
+            left = end - monotonic()
+            if not lacking or left <= 0:
+                return
+            self._came.wait(left)
+
+    def _hand_on(self) -> None:
+        """Give the tracker what came beside the images."""
+        while self._beside:
+            what, message = self._beside.popleft()
+            getattr(self._tracker, what)(message)
+
+    def _mount_beside(self, image_frame: str) -> None:
+        for what, (parent, child) in self._tracker.wanted_mountings(image_frame).items():
+            if (mounting := self._wiring.transform(parent, child)) is not None:
+                self._tracker.mount_beside(what, mounting)
+                self._note(f'{child} is on {parent} as tf says')
 
     def _mount(self, image_frame: str) -> None:
-        config = self._tracker.config.odometry
-        camera = optical_frame(config, image_frame)
-        mounting = self._wiring.mounting(config.base_frame, camera)
-        if mounting is not None:
-            self._tracker.mount(mounting)
-            x, y, z = mounting[:3, 3]
-            self._note(f'{camera} is at ({x:.3f}, {y:.3f}, {z:.3f}) m on {config.base_frame}')
+        if found := self._tracker.mount(self._wiring.transform, image_frame):
+            self._note(found)
 
     def _count_drops(self) -> None:
         new = self._queue.dropped - self._counted_drops

@@ -15,6 +15,13 @@ SPEED_TYPES = {
     'speed_odometry': 'nav_msgs/msg/Odometry',
 }
 
+# Of the odometry, with the parameter odometry.<topic>.
+BESIDE_TYPES = {
+    'imu': 'sensor_msgs/msg/Imu',
+    'guess': 'nav_msgs/msg/Odometry',
+    'mask': IMAGE_TYPES['raw'],
+}
+
 # Those without a leading slash are below the node's name.
 _ODOMETRY_OUTPUTS = {
     'relative_pose': 'geometry_msgs/msg/PoseStamped',
@@ -22,6 +29,7 @@ _ODOMETRY_OUTPUTS = {
     'relative_pose_status': 'diagnostic_msgs/msg/DiagnosticArray',
     'odometry': 'nav_msgs/msg/Odometry',
     'debug_image': 'sensor_msgs/msg/Image',
+    'landmarks': 'sensor_msgs/msg/PointCloud2',
     '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
     'path': 'nav_msgs/msg/Path',
     '/tf': 'tf2_msgs/msg/TFMessage',

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from launch.actions import DeclareLaunchArgument
+from launch import LaunchContext
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitution import Substitution
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -26,6 +27,8 @@ _ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
                     {'default_value': PathJoinSubstitution([CONFIG, 'vo.yaml'])}),
     'slam_params_file': ('YAML file with parameters of pose_graph_node',
                          {'default_value': PathJoinSubstitution([CONFIG, 'slam.yaml'])}),
+    'base_frame': ('frame of the vehicle whose pose is wanted, such as base_link; tf knows the '
+                   'camera on it; empty: as the parameters say', {'default_value': ''}),
     'namespace': ('namespace of nodes and topics, such as the name of a camera',
                   {'default_value': ''}),
     'name': ('name of the odometry node', {'default_value': 'vo_node'}),
@@ -49,18 +52,25 @@ def sim_time() -> dict[str, ParameterValue]:
     return {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
 
 
-def node(executable: str, name: str | Substitution, *files: str, **parameters: Any) -> Node:
+def node(executable: str, name: str | Substitution, *files: str, **parameters: Any
+         ) -> OpaqueFunction:
     """
     Describe a node of ours on the camera that the arguments name.
 
     files: arguments that hold a parameter file; parameters: on top of these, with __ for a dot.
     """
-    return Node(
-        package='djet_ros', executable=executable, name=name, output='screen',
-        namespace=LaunchConfiguration('namespace'), respawn=LaunchConfiguration('respawn'),
-        respawn_delay=2.0,
-        remappings=[(topic, LaunchConfiguration(topic)) for topic in ('image', 'camera_info')],
-        parameters=[*(ParameterFile(LaunchConfiguration(file)) for file in files),
-                    {key.replace('__', '.'): value for key, value in parameters.items()},
-                    sim_time()],
-        ros_arguments=['--log-level', LaunchConfiguration('log_level')])
+    def describe(context: LaunchContext) -> list[Node]:
+        values = {key.replace('__', '.'): value for key, value in parameters.items()}
+        # An empty one would take away what a file says.
+        if base_frame := LaunchConfiguration('base_frame').perform(context):
+            values['odometry.base_frame'] = base_frame
+        return [Node(
+            package='djet_ros', executable=executable, name=name, output='screen',
+            namespace=LaunchConfiguration('namespace'), respawn=LaunchConfiguration('respawn'),
+            respawn_delay=2.0,
+            remappings=[(topic, LaunchConfiguration(topic)) for topic in ('image', 'camera_info')],
+            parameters=[*(ParameterFile(LaunchConfiguration(file)) for file in files), values,
+                        sim_time()],
+            ros_arguments=['--log-level', LaunchConfiguration('log_level')])]
+
+    return OpaqueFunction(function=describe)

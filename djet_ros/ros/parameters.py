@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
-from djet_ros.config.flat import flat, FlatParameter, from_flat, why_unknown, with_values
+from djet_ros.config.flat import flat, FlatParameter, from_flat, why_unknown
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import FIXED, for_a_live_graph, ODOMETRY, SHARED
+from djet_ros.live.parameters import FIXED, live_choices, ODOMETRY, SHARED, with_live_values
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -32,7 +32,7 @@ class Parameters:
     def __init__(self, node: Node) -> None:
         self._node = node
         given = _given(node)
-        self.config = _live(from_flat(given))
+        self.config = _possible(with_live_values(Config(), given))
         _declare(node, (item for item in flat(self.config).values() if item.name in ODOMETRY),
                  given)
 
@@ -47,7 +47,7 @@ class Parameters:
         """Make integers floats where those belong, and let a preset set its values."""
         values = _values(parameters)
         try:
-            config = with_values(self.config, values)
+            config = with_live_values(self.config, values)
         except DjetError:
             # To be refused by _check, which can say why.
             return parameters
@@ -58,14 +58,14 @@ class Parameters:
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
-            _live(with_values(self.config, _values(parameters)))
+            _possible(with_live_values(self.config, _values(parameters)))
         except DjetError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _take(self, parameters: list[Parameter]) -> None:
         if values := _values(parameters):
-            config = with_values(self.config, values)
+            config = with_live_values(self.config, values)
             self._apply(config)
             self.config = config
 
@@ -106,10 +106,10 @@ def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any
 
 def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDescriptor:
     """Describe a parameter to ROS: text, range, choices, and whether it can change."""
-    says = item.description
+    says, choices = item.description, live_choices(item)
     result = ParameterDescriptor(
         description=says.text, read_only=read_only or item.name in FIXED,
-        additional_constraints=f'one of: {", ".join(says.choices)}' if says.choices else '')
+        additional_constraints=f'one of: {", ".join(choices)}' if choices else '')
     if says.minimum is None or says.maximum is None:
         return result
     if item.kind is int:
@@ -121,9 +121,8 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
     return result
 
 
-def _live(config: Config) -> Config:
-    """Refuse what can't be had on a live graph, or not in this ROS."""
-    for_a_live_graph(config)
+def _possible(config: Config) -> Config:
+    """Refuse what can't be had in this ROS."""
     if config.ros.publish_tf and find_spec('tf2_msgs') is None:
         raise DjetError('ros.publish_tf is true, and the package tf2_msgs is not installed: '
                         'apt install ros-$ROS_DISTRO-tf2-msgs')

@@ -46,7 +46,10 @@ def _table(figures: dict[str, Any]) -> Table:
     table = new_table(f"{figures['pairs']} pairs, medians", '', 'one thread', 'all cores')
     table.add_row('pipeline over OpenCV chain',
                   *(f"{run['pipeline_over_opencv']:.2f}" for run in both))
+    table.add_row('the same, preset fast', *(f"{run['fast_over_opencv']:.2f}" for run in both))
     table.add_row('pairs per second', *(f"{run['pairs_per_second']:.1f}" for run in both))
+    table.add_row('the same, preset fast', *(f"{run['fast_pairs_per_second']:.1f}"
+                                             for run in both))
     for stage in figures['stages_ms']:
         table.add_row(f'{stage} [ms]', *(f"{run['stages_ms'][stage]:.1f}" for run in both))
     table.add_row(f'D-JET stage, {QUOTED_POINTS} points [ms]', f"{figures['djet_stage_ms']:.1f}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import groupby
 import os
 from pathlib import Path
@@ -14,11 +15,10 @@ from typing import Any
 from djet_ros.cli.options import add_frames, add_output
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags, flag_values
-from djet_ros.core.estimator_config import PRESETS
 from djet_ros.errors import DjetError
 from djet_ros.lab.methods import Method
-from djet_ros.lab.pairs import PairRecord
-from djet_ros.lab.runner import dask_workers, local_workers, run
+from djet_ros.lab.pairs import evaluate_chunk, PairRecord
+from djet_ros.lab.runner import chunks_of, dask_workers, local_workers, run
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
@@ -38,7 +38,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
                         help='a KITTI sequence or a folder of them, a bag with ground truth, or a '
                         'folder of TUM RGB-D, EuRoC or VAROS')
     add_output(parser, 'folder of the results')
-    parser.add_argument('--presets', metavar='LIST', default=','.join(PRESETS),
+    parser.add_argument('--presets', metavar='LIST', default='best,paper',
                         help='parameters to run with (default: %(default)s)')
     add_frames(parser)
     parser.add_argument('--stride', type=int, default=1, metavar='N',
@@ -69,11 +69,14 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
     try:
         datasets = open_datasets(args.sources, selection, workspace)
         args.output.mkdir(parents=True, exist_ok=True)
-        with RecordStore(args.output, datasets, competing, overwrite=args.overwrite) as store:
+        settings = {'sequences': [dataset.settings() for dataset in datasets],
+                    'methods': [method.settings() for method in competing]}
+        with RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store:
             workers = (dask_workers(args.scheduler) if args.scheduler
                        else local_workers(args.workers))
             with workers as executor, progress_bar('pairs') as progress:
-                records = run(executor, datasets, competing, store, progress)
+                records = run(executor, chunks_of(datasets),
+                              partial(evaluate_chunk, methods=list(competing)), store, progress)
         yield datasets, records
     finally:
         shutil.rmtree(workspace, ignore_errors=True)

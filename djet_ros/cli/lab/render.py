@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 import re
 
 from djet_ros.cli.options import add_overwrite
 from djet_ros.cli.terminal import progress_bar
+from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import render_sequence, SCENES
+from djet_ros.lab.scenes.imu import Mems
 
 DESCRIPTION = """\
 Render images, calibration, times and true camera poses into OUT, in the layout of the KITTI
-odometry benchmark.
+odometry benchmark, and beside them imu.csv: what an IMU on the camera would measure.
 """
+
+_MEMS = {
+    'rate': 'samples per second',
+    'gyro': 'density of the white noise of the gyro, rad/s per root of Hz',
+    'gyro_walk': 'random walk of its bias, rad/s² per root of Hz',
+    'gyro_bias': 'standard deviation of its bias at the start, rad/s',
+    'accelerometer': 'density of the white noise of the accelerometer, m/s² per root of Hz',
+    'accelerometer_walk': 'random walk of its bias, m/s³ per root of Hz',
+    'accelerometer_bias': 'standard deviation of its bias at the start, m/s²',
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--size', type=_size, metavar='WxH',
                         help='pixels of a picture (default: as suits the scene: 1241x376, as '
                              'KITTI has, 960x540 or 640x480)')
+    imu = parser.add_argument_group('IMU')
+    for name, text in _MEMS.items():
+        imu.add_argument(f'--{name.replace("_", "-")}', dest=f'mems.{name}', type=float,
+                         metavar='X', default=getattr(Mems, name),
+                         help=f'{text} (default: %(default)g)')
     add_overwrite(parser)
 
 
@@ -39,11 +57,20 @@ def run(args: argparse.Namespace) -> int:
     """Render, with a progress bar on stderr, and say what was written."""
     with progress_bar(args.scene) as progress:
         folder = render_sequence(args.scene, args.out, args.frames, args.seed, args.size,
-                                 progress, overwrite=args.overwrite)
+                                 progress, overwrite=args.overwrite, mems=_mems(args))
     frames = len(list((folder / 'image_0').iterdir()))
     width, height = args.size or SCENES[args.scene].size
     print(f'{folder}: {frames} frames of {width}x{height} with ground truth')
     return 0
+
+
+def _mems(args: argparse.Namespace) -> Mems:
+    values = {name: getattr(args, f'mems.{name}') for name in _MEMS}
+    for name, value in values.items():
+        if not (math.isfinite(value) and value >= 0 and (name != 'rate' or 1 <= value <= 10_000)):
+            raise DjetError(f'--{name.replace("_", "-")} is {value:g}; it must not be negative, '
+                            'and the rate lies between 1 and 10000')
+    return Mems(**values)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,0 +1,186 @@
+"""``djet lab coverage``: whether poses are as sure as their covariances say."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed, Executor
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
+import json
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+
+from djet_ros.cli.options import add_frames, add_output, split
+from djet_ros.cli.terminal import new_table, progress_bar
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import from_flat
+from djet_ros.errors import DjetError
+from djet_ros.lab.coverage import (
+    cover_chunk,
+    Coverage,
+    coverage_rows,
+    CoverageRow,
+    draw_reliability,
+    LEVELS,
+    PAIRS_PER_CHUNK,
+    SURE_DIRECTION,
+    SURE_ROTATION,
+)
+from djet_ros.lab.pairs import FAILURE
+from djet_ros.lab.runner import chunks_of, local_workers, run as run_chunks
+from djet_ros.lab.scenes import render_sequence, SCENES
+from djet_ros.lab.sequences import Dataset, open_datasets, Selection
+from djet_ros.lab.store import RecordStore
+from djet_ros.recordings.outputs import write_whole
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+DESCRIPTION = """\
+Estimate all neighbouring frames, each pair alone and in a row as the odometry does, and hold the
+errors against the covariances: the share of poses inside their 50 to 99.9 % ellipsoids, scene by
+scene, a reliability plot, and the list of pairs that are wrong and sure. Rendered scenes are kept
+in OUTPUT/scenes. A run that was broken off is taken up where it ended.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument('sources', nargs='*', type=Path, metavar='SOURCE',
+                        help='sequences with ground truth: folders or bags')
+    parser.add_argument('--scenes', default='', metavar='LIST',
+                        help=f'scenes to render, or all: of {", ".join(SCENES)}')
+    parser.add_argument('--seeds', type=_seeds, default='0-4', metavar='LIST',
+                        help='seeds of these scenes, such as 0,3 or 0-9 (default: %(default)s)')
+    parser.add_argument('--frames', type=int, default=17, metavar='N',
+                        help='frames of each rendered scene (default: %(default)s)')
+    add_output(parser, 'folder of the results')
+    add_frames(parser)
+    parser.add_argument('--workers', type=int, metavar='N',
+                        help='processes on this machine (default: one for each core)')
+    add_flags(parser, ('estimator.method',))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render what is missing, estimate, and show how reliable the covariances are."""
+    scenes = list(SCENES) if args.scenes == 'all' else split(args.scenes)
+    if unknown := [name for name in scenes if name not in SCENES]:
+        raise DjetError(f"--scenes has '{unknown[0]}'; choose of {', '.join(SCENES)}, or all")
+    if (args.workers is not None and args.workers < 1) or args.frames < 2:
+        raise DjetError(f'--workers is {args.workers} and --frames {args.frames}; at least one '
+                        'worker and two frames are needed')
+    if not scenes and not args.sources:
+        raise DjetError('there is nothing to measure; name a SOURCE or --scenes')
+    args.output.mkdir(parents=True, exist_ok=True)
+    with local_workers(args.workers) as executor:
+        rendered = _rendered(executor, args.output / 'scenes',
+                             [(name, seed) for name in scenes for seed in args.seeds], args.frames)
+        with _opened(args, rendered) as datasets:
+            records = _records(args, datasets, executor)
+    rows = coverage_rows(records)
+    _show(rows, records)
+    path = args.output / 'coverage.json'
+    write_whole(path, json.dumps({'levels': LEVELS, 'rows': [asdict(row) for row in rows]},
+                                 indent=1) + '\n')
+    draw_reliability(records, args.output / 'reliability.png')
+    print(f'figures: {path}\nplot: {args.output / "reliability.png"}')
+    return 0
+
+
+def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
+             executor: Executor) -> list[Coverage]:
+    config = from_flat(flag_values(args)).estimator
+    settings = {'sequences': [dataset.settings() for dataset in datasets],
+                'estimator': asdict(config)}
+    with (RecordStore(args.output, Coverage, settings, overwrite=args.overwrite) as store,
+          progress_bar('pairs') as progress):
+        return run_chunks(executor, chunks_of(datasets, PAIRS_PER_CHUNK),
+                          partial(cover_chunk, config=config), store, progress)
+
+
+@contextmanager
+def _opened(args: argparse.Namespace, rendered: Sequence[Path]) -> Iterator[list[Dataset]]:
+    """Open all sequences; frames of bags are good within the context."""
+    workspace = (args.output / f'.frames-{os.getpid()}').resolve()
+    try:
+        yield [*open_datasets([*args.sources, *rendered],
+                              Selection(args.start, args.end), workspace)]
+    finally:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+def _rendered(executor: Executor, folder: Path, wanted: Sequence[tuple[str, int]],
+              frames: int) -> list[Path]:
+    """Render scenes and seeds that an earlier run has not, and give their folders."""
+    places = [folder / f'{name}-{seed}-{frames}' for name, seed in wanted]
+    # Poses are written last: where they are, the rest is.
+    missing = [executor.submit(render_sequence, name, place, frames, seed, overwrite=True)
+               for (name, seed), place in zip(wanted, places) if not _whole(place)]
+    with progress_bar('scenes', len(missing)) as progress:
+        _await(missing, progress)
+    return [next(place.glob('sequences/*')) for place in places]
+
+
+def _await(futures: Sequence[Any], progress: Callable[..., None]) -> None:
+    try:
+        for future in as_completed(futures):
+            future.result()
+            progress()
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _whole(place: Path) -> bool:
+    return any(place.glob('poses/*.txt'))
+
+
+def _seeds(text: str) -> list[int]:
+    """Give the numbers of a text such as 0,3-5."""
+    try:
+        ends = [[int(end) for end in part.split('-')] for part in split(text)]
+        return [seed for end in ends for seed in range(end[0], end[-1] + 1)]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is no list of seeds such as 0,3 or 0-9") from error
+
+
+def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
+    console = Console()
+    for start in dict.fromkeys(row.start for row in rows):
+        console.print(_shares([row for row in rows if row.start == start],
+                              f'poses inside their own ellipsoids, pairs {start}'))
+    print('given up: with no pose; right: of those, the ones whose best guess was right\n'
+          f'failed: {FAILURE}\n'
+          f'sure: of those, the ones that claim better than {SURE_ROTATION:g} and '
+          f'{SURE_DIRECTION:g} deg\n'
+          'median: of e^T C^-1 e, over its expectation; bounds of shares are in coverage.json')
+    if wrong := [record for record in records if record.wrong_and_sure]:
+        console.print(_list_of(wrong))
+
+
+def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
+    table = Table(title=title, title_justify='left', box=SIMPLE_HEAD, padding=0)
+    for heading in ('', 'pairs', 'OK', 'given up', 'right', 'failed', 'sure', 'median',
+                    *(f'{100 * level:g} %' for level in LEVELS)):
+        table.add_column(heading, justify='right' if heading else 'left', no_wrap=True)
+    for row in rows:
+        table.add_row(row.scene, *map(str, (
+            row.pairs, row.told, row.given_up, row.needlessly, row.failed, row.wrong_and_sure)),
+            f'{row.median:.2f}', *(f'{100 * share:.1f}' for share, _, _ in row.inside))
+    return table
+
+
+def _list_of(wrong: Sequence[Coverage]) -> Table:
+    table = new_table('wrong and sure', 'sequence', 'frames', 'start', 'rotation deg',
+                      'claimed', 'direction deg', 'claimed', 'inliers')
+    for one in wrong:
+        table.add_row(one.sequence, f'{one.previous} {one.current}', one.start,
+                      f'{one.rotation_error_deg:.2f}', f'{one.rotation_claim_deg:.3f}',
+                      f'{one.direction_error_deg:.1f}', f'{one.direction_claim_deg:.2f}',
+                      f'{one.inliers} of {one.matches}')
+    return table
