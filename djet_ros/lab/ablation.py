@@ -43,10 +43,10 @@ def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
         'loss': [Change(f'loss: {word}', {'loss': name})
                  for name, word in (('none', 'squares'), ('huber', 'Huber'), ('cauchy', 'Cauchy'),
                                     ('geman_mcclure', 'Geman-McClure'))],
-        'rounding': [Change('x not rounded', {'snap_reference': False}),
-                     Change('x on whole pixels', {'snap_reference': True})],
+        'patch': [Change("patches of ORB's size", {'patch_scale': 1.0}),
+                  Change('patches of half the size', {'patch_scale': 0.5})],
         'grading': [Change('bits, as in ORB', {'grading': 0.0}),
-                    Change('graded tests', {'grading': 24.0})],
+                    Change('graded tests', {'grading': EstimatorConfig.grading})],
         'tests': [Change('all 256 tests', {'binary_tests': 256}),
                   Change('128 tests', {'binary_tests': 128})],
         'warp': [Change('patches not warped', {'warp_reference': False}),

@@ -9,39 +9,39 @@ from multiprocessing import get_context, parent_process
 import os
 import signal
 from threading import Thread
+from typing import TypeVar
 
 from djet_ros import threads
 from djet_ros.errors import DjetError
-from djet_ros.lab.methods import Method
-from djet_ros.lab.pairs import evaluate_chunk, PairChunk, PairRecord
+from djet_ros.lab.pairs import PairChunk
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import in_order, RecordStore
 
 # Few enough that a broken run loses little, enough that features of the first frame don't count.
 PAIRS_PER_CHUNK = 5
 
-
-def chunks_of(datasets: Sequence[Dataset]) -> list[PairChunk]:
-    """Cut the pairs of all datasets into chunks."""
-    return [PairChunk(dataset, first, min(PAIRS_PER_CHUNK, dataset.pairs - first))
-            for dataset in datasets for first in range(0, dataset.pairs, PAIRS_PER_CHUNK)]
+R = TypeVar('R')
 
 
-def run(executor: Executor, datasets: Sequence[Dataset], methods: Sequence[Method],
-        store: RecordStore, progress: Callable[[int, int], None]) -> list[PairRecord]:
+def chunks_of(datasets: Sequence[Dataset], most: int = PAIRS_PER_CHUNK) -> list[PairChunk]:
+    """Cut the pairs of all datasets into chunks of at most so many."""
+    return [PairChunk(dataset, first, min(most, dataset.pairs - first))
+            for dataset in datasets for first in range(0, dataset.pairs, most)]
+
+
+def run(executor: Executor, chunks: Sequence[PairChunk], work: Callable[[PairChunk], list[R]],
+        store: RecordStore[R], progress: Callable[[int, int], None]) -> list[R]:
     """
-    Evaluate all pairs that the store does not have yet; gives all records in a fixed order.
+    Do the work of all chunks that the store does not have; gives all records in a fixed order.
 
     progress is called with (pairs done, pairs in all). Raises DjetError where a worker died;
     what was done until then is in the store.
     """
-    chunks = chunks_of(datasets)
     total = sum(chunk.count for chunk in chunks)
     missing = [chunk for chunk in chunks if chunk.name not in store.chunks]
     done = total - sum(chunk.count for chunk in missing)
     progress(done, total)
-    futures = {executor.submit(evaluate_chunk, chunk, list(methods)): chunk
-               for chunk in missing}
+    futures = {executor.submit(work, chunk): chunk for chunk in missing}
     try:
         for future in as_completed(futures):
             chunk = futures[future]
@@ -58,7 +58,7 @@ def run(executor: Executor, datasets: Sequence[Dataset], methods: Sequence[Metho
     return in_order(store, (chunk.name for chunk in chunks))
 
 
-def _keep_finished(futures: dict[Future[list[PairRecord]], PairChunk], store: RecordStore) -> None:
+def _keep_finished(futures: dict[Future[list[R]], PairChunk], store: RecordStore[R]) -> None:
     for future, chunk in futures.items():
         if chunk.name not in store.chunks and future.done() and not future.cancelled() \
                 and future.exception() is None:

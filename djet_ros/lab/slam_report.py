@@ -49,8 +49,8 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     parameters = {full.removeprefix('slam.'): values[full].value for full in PARAMETERS}
     kinds = Counter(edge.kind for edge in graph.edges)
     summary: dict[str, Any] = {
-        'source': name, 'scale': config.odometry.scale, 'scale_known': slam.scale_known,
-        'scale_uncertainty': config.odometry.scale_uncertainty if slam.scale_known else None,
+        'source': name, 'scale': config.odometry.scale, 'scale_kind': slam.scale.value,
+        'scale_uncertainty': config.odometry.scale_uncertainty if slam.metric else None,
         'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
         'rejected': {kind: slam.optimised.rejected(kind) for kind in ('link', 'loop')
                      if kinds[kind]},
@@ -60,11 +60,11 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     if known.sum() > 2:
         StampedTrajectory(frames.stamps_ns[known], truth[known]).write_tum(
             folder / 'truth_tum.txt')
-        summary['errors'] = {which: _error(poses, truth, slam.scale_known)
+        summary['errors'] = {which: _error(poses, truth, slam.metric)
                              for which, poses in ways.items()}
         try:
             for which, errors in summary['errors'].items():
-                errors.update(_evo(folder, which, slam.scale_known))
+                errors.update(_evo(folder, which, slam.metric))
         except DjetError as error:
             # It is not installed, or refuses a way that is straight.
             summary['evo'] = str(error)
@@ -88,7 +88,7 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
     """Draw the way from above, before and after, and both errors along it."""
     ways = {'before': slam.before()[:, :3, 3], 'after': slam.after()[:, :3, 3]}
     if truth is not None:
-        ways = {which: aligned(way, truth[:, :3, 3], slam.scale_known)
+        ways = {which: aligned(way, truth[:, :3, 3], slam.metric)
                 for which, way in ways.items()}
     with figure(path, 7 if truth is None else 12, 6) as page:
         axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
@@ -98,7 +98,7 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
             axes.plot(way[:, 0], way[:, 2], label=which, **_LINES[which])
         axes.plot(*_closed(slam, ways['after'])[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4,
                   label='loop closed')
-        unit = 'm' if slam.scale_known or truth is not None else 'units'
+        unit = 'm' if slam.metric or truth is not None else 'units'
         axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
         axes.legend()
         if truth is not None:

@@ -7,37 +7,40 @@ in which they were done.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 from djet_ros import __version__
 from djet_ros.errors import DjetError
-from djet_ros.lab.methods import Method
-from djet_ros.lab.pairs import PairRecord
-from djet_ros.lab.sequences import Dataset
 from djet_ros.recordings.closing import Closing
 import numpy as np
 
 FILE_NAME = 'records.jsonl'
 
+# A dataclass of plain values and tuples of them.
+R = TypeVar('R')
 
-class RecordStore(Closing):
+
+class RecordStore(Closing, Generic[R]):
     """
     The records of a run in ``folder/records.jsonl``: those of an earlier run, and new ones.
 
-    Raises DjetError where the file is of a run with other settings, unless overwrite is set.
+    kind: the dataclass of a record; settings: what decides the results beside the versions of
+    this package and of its libraries. Raises DjetError where the file is of a run with other
+    settings, unless overwrite is set.
     """
 
-    def __init__(self, folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method], *,
+    def __init__(self, folder: Path, kind: Callable[..., R], settings: Mapping[str, Any], *,
                  overwrite: bool = False) -> None:
         self.path = folder / FILE_NAME
-        self.chunks: dict[str, list[PairRecord]] = {}
-        settings = _settings(datasets, methods)
+        self.chunks: dict[str, list[R]] = {}
+        self._kind = kind
+        settings = _with_versions(settings)
         if self.path.exists() and not overwrite:
             self._read(settings)
             self._file = self.path.open('a', encoding='ascii')
@@ -45,7 +48,7 @@ class RecordStore(Closing):
             self._file = self.path.open('w', encoding='ascii')
             self._write(settings)
 
-    def add(self, chunk: str, records: list[PairRecord]) -> None:
+    def add(self, chunk: str, records: list[R]) -> None:
         """Keep the records of a chunk; they are on disk when this returns."""
         self.chunks[chunk] = records
         self._write({'chunk': chunk, 'records': [_plain(record) for record in records]})
@@ -67,15 +70,18 @@ class RecordStore(Closing):
                             f'({", ".join(other)}); choose another folder, or --overwrite')
         for number, line in enumerate(whole[1:], 2):
             content = _parsed(self.path, number, line)
-            self.chunks[content['chunk']] = [_record(values) for values in content['records']]
+            self.chunks[content['chunk']] = [self._record(values)
+                                             for values in content['records']]
+
+    def _record(self, values: dict[str, Any]) -> R:
+        told = {name: float('nan') if value is None else value for name, value in values.items()}
+        return self._kind(**{name: tuple(value) if isinstance(value, list) else value
+                             for name, value in told.items()})
 
 
-def _settings(datasets: Sequence[Dataset], methods: Sequence[Method]) -> dict[str, Any]:
-    return {
-        'djet_ros': __version__,
-        'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__},
-        'sequences': [dataset.settings() for dataset in datasets],
-        'methods': [method.settings() for method in methods]}
+def _with_versions(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {'djet_ros': __version__,
+            'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__}, **settings}
 
 
 def _whole_lines(path: Path) -> list[str]:
@@ -97,18 +103,11 @@ def _parsed(path: Path, number: int, line: str) -> dict[str, Any]:
     return content
 
 
-def _plain(record: PairRecord) -> dict[str, Any]:
+def _plain(record: Any) -> dict[str, Any]:
     return {name: None if isinstance(value, float) and math.isnan(value) else value
             for name, value in asdict(record).items()}
 
 
-def _record(values: dict[str, Any]) -> PairRecord:
-    told: dict[str, Any] = {name: float('nan') if value is None else value
-                            for name, value in values.items()}
-    vectors = {name: tuple(told[name]) for name in ('rotation', 'translation')}
-    return PairRecord(**{**told, **vectors})
-
-
-def in_order(store: RecordStore, chunk_names: Iterable[str]) -> list[PairRecord]:
+def in_order(store: RecordStore[R], chunk_names: Iterable[str]) -> list[R]:
     """Give the records of all chunks, in the order of the names."""
     return [record for name in chunk_names for record in store.chunks[name]]

@@ -135,11 +135,16 @@ def _draw_reference(axes: Axes, trace: Trace, match: int) -> None:
 
 def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     step, y, distances = trace.rounds[index], trace.y[match], DescriptorDistances(trace.config)
-    pixels, centre = (np.rint(points[match]).astype(np.int64) for points in (trace.x, trace.y))
-    reference = distances.reference(distances.seen(trace.previous), pixels[None],
-                                    None if step.warp is None else step.warp[[match]])
-    surface = distances.surfaces(reference, distances.seen(trace.current), centre[None],
-                                 RADIUS)[:, :, 0]
+    x, centre = trace.x[match], np.rint(y).astype(np.int64)
+    if step.warp is None:
+        reference = distances.reference(trace.previous.tested, np.rint(x)[None])
+    else:
+        # As the round saw it, in relation to whole pixels.
+        ahead = step.keypoints[match] - np.rint(step.keypoints[match])
+        reference = distances.reference(
+            trace.previous.tested, (x - np.linalg.solve(step.warp[match], ahead))[None],
+            warp=step.warp[[match]])
+    surface = distances.surfaces(reference, trace.current.tested, centre[None], RADIUS)[:, :, 0]
     panels.draw_patch(axes, trace.current.gray, centre, RADIUS)
     panels.draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:

@@ -65,6 +65,11 @@ class Scene:
         with np.errstate(divide='ignore'):
             return np.asarray(1 / inverse, np.float32)
 
+    @property
+    def level(self) -> Array:
+        """Rotation (3, 3) of the first camera's axes to level ones: x right, y down, z ahead."""
+        return np.asarray(self._to_level[:3, :3])
+
     @cached_property
     def _to_level(self) -> Array:
         return self.path.pose(0)

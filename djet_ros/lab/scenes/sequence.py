@@ -10,11 +10,15 @@ from djet_ros.config.safe_files import read_text
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.catalogue import find, make_scene, suggested_frames
+from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems, TO_CAMERA
 from djet_ros.recordings.trajectories import KittiWriter
 import numpy as np
 from numpy.typing import NDArray
 
 FRAME_PERIOD = 0.1
+_IMU = 'imu.csv'
+_IMU_COLUMNS = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+                'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]')
 # Says what was rendered; a folder without it is not ours to replace.
 _LABEL = 'scene.txt'
 
@@ -22,12 +26,13 @@ _LABEL = 'scene.txt'
 def render_sequence(name: str, out: Path, frames: int | None = None, seed: int = 0,
                     size: tuple[int, int] | None = None,
                     progress: Callable[[int, int], None] | None = None, *,
-                    overwrite: bool = False) -> Path:
+                    overwrite: bool = False, mems: Mems | None = None) -> Path:
     """
     Render a named scene into ``out/sequences/NN`` and its ground truth into ``out/poses/NN.txt``.
 
     frames and size (width, height): as the scene suggests unless given; progress is called with
-    (frames done, frames in all). Gives the sequence's folder. Raises DjetError if it is there
+    (frames done, frames in all). mems: errors of the IMU, which is written into imu.csv where
+    there are three frames or more. Gives the sequence's folder. Raises DjetError if it is there
     already, unless ``overwrite``, or can't be written. Times and poses come last, so that an
     interrupted rendering can't be taken for a whole one.
     """
@@ -39,12 +44,16 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
         _clear(folder, truth, overwrite)
         (folder / _LABEL).write_text(f'djet render {name}: seed {seed}, {len(poses)} frames, '
                                      f'{scene.size[0]}x{scene.size[1]}\n')
-        (folder / 'calib.txt').write_text(f'P0: {_projection(scene.K)}\n')
+        (folder / 'calib.txt').write_text(
+            f'P0: {_projection(scene.K)}\nTr_imu_to_cam: {_projection(TO_CAMERA)}\n')
         for index, pose in enumerate(poses):
             path = folder / 'image_0' / f'{index:06d}.png'
             path.write_bytes(_png(scene.render(pose, index)))
             if progress is not None:
                 progress(index + 1, len(poses))
+        if len(poses) > 2:
+            _write_imu(folder / _IMU, feel(poses, FRAME_PERIOD, mems or Mems(), seed,
+                                           scene.level))
         (folder / 'times.txt').write_text(''.join(f'{i * FRAME_PERIOD:.6e}\n'
                                                   for i in range(len(poses))))
     except OSError as error:
@@ -74,10 +83,21 @@ def _clear(folder: Path, truth: Path, overwrite: bool) -> None:
         raise DjetError(f'{present} was not rendered ({folder / _LABEL} is missing) and is left '
                         'as it is; choose another folder')
     for path in (truth, folder / 'calib.txt', folder / 'times.txt',
-                 *(folder / 'image_0').glob('[0-9]*.png')):
+                 folder / _IMU, *(folder / 'image_0').glob('[0-9]*.png')):
         path.unlink(missing_ok=True)
     (folder / 'image_0').mkdir(parents=True, exist_ok=True)
     truth.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _write_imu(path: Path, felt: FeltMotion) -> None:
+    """Write samples as EuRoC has them, with the true biases at both ends as a comment."""
+    first, last = (' '.join(f'{value:.6e}' for value in felt.rate_biases[i]) for i in (0, -1))
+    rows = ''.join(
+        f'{stamp},{",".join(f"{value:.9e}" for value in (*rate, *force))}\n'
+        for stamp, rate, force in zip(felt.stamps_ns.tolist(), felt.rates.tolist(),
+                                      felt.accelerations.tolist(), strict=True))
+    path.write_text(f'# true bias of the rates in rad/s: {first} at first, {last} at last\n'
+                    f'{_IMU_COLUMNS}\n{rows}')
 
 
 def _png(gray: NDArray[np.uint8]) -> bytes:

@@ -1,0 +1,234 @@
+"""
+Whether poses are as sure as they say: their errors, held against their own covariances.
+
+With the error e of rotation and direction and its covariance C, e^T C^-1 e is chi-squared of five
+degrees of freedom where C is true (normalised estimation error squared, NEES; Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4). So a share q of
+all poses has to lie inside the ellipsoid that holds a Gaussian with probability q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import direction_angle, rotation_angle, sphere_tangents, unit
+from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.lab.pairs import has_failed, PairChunk
+from djet_ros.lab.sequences import opened, plain_name
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.visual_odometry import camera_motion, TRACKED, VisualOdometry
+from djet_ros.replay.pair_errors import has_direction
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import beta, chi2
+
+# Probabilities whose ellipsoids are looked at.
+LEVELS = (0.5, 0.9, 0.95, 0.99, 0.999)
+
+# Standard deviations of rotation and direction, in degrees, that a pose claims to be better than
+# where it is called sure.
+SURE_ROTATION, SURE_DIRECTION = 0.3, 3.0
+
+# How pairs are started: each by itself, or by the odometry, which knows what was before.
+ALONE, IN_A_ROW = 'alone', 'in a row'
+
+# Pairs of an odometry that are run before those of a chunk count, so that it is under way.
+_LEAD = 3
+
+PAIRS_PER_CHUNK = 20
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """
+    A pair of frames, what was claimed about its motion, and how far it was off.
+
+    scene: what is seen, whatever the seed; start: ALONE or IN_A_ROW; previous, current: indices of
+    the frames; errors, and claimed standard deviations, in degrees, NaN where there is none;
+    square: e^T C^-1 e; failed: see ``pairs.FAILURE``, of the best guess where a pose is given up.
+    """
+
+    scene: str
+    sequence: str
+    start: str
+    previous: int
+    current: int
+    status: str
+    failed: bool
+    rotation_error_deg: float
+    direction_error_deg: float
+    rotation_claim_deg: float
+    direction_claim_deg: float
+    square: float
+    matches: int
+    inliers: int
+
+    @property
+    def told(self) -> bool:
+        """Whether a direction and its covariance were told, and are held against the truth."""
+        return self.status == Status.OK.value and bool(np.isfinite(self.square))
+
+    @property
+    def wrong_and_sure(self) -> bool:
+        """Whether the pose is far off, and claims to be exact."""
+        return (self.told and self.failed and self.rotation_claim_deg < SURE_ROTATION
+                and self.direction_claim_deg < SURE_DIRECTION)
+
+    @property
+    def needlessly_given_up(self) -> bool:
+        """Whether the best guess of a pose that was given up was right."""
+        return self.status not in (s.value for s in TRACKED) and not self.failed
+
+
+@dataclass(frozen=True)
+class CoverageRow:
+    """
+    Pairs of one scene and start.
+
+    median: that of the squares, over its expectation; inside: by LEVELS, the share of the told
+    pairs in that ellipsoid, with the bounds that hold the true share with 95 % (Clopper and
+    Pearson, Biometrika 1934); given_up: pairs without a pose, needlessly: with a right guess.
+    """
+
+    scene: str
+    start: str
+    pairs: int
+    told: int
+    failed: int
+    given_up: int
+    needlessly: int
+    wrong_and_sure: int
+    median: float
+    inside: tuple[tuple[float, float, float], ...]
+
+
+def cover_chunk(chunk: PairChunk, config: EstimatorConfig) -> list[Coverage]:
+    """Estimate the pairs of a chunk each by itself, and as an odometry does, in a row."""
+    cv2.setNumThreads(1)
+    return [*_alone(chunk, config), *_in_a_row(chunk, config)]
+
+
+def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
+    sequence, frames = opened(chunk.dataset), chunk.dataset.frames
+    estimator = TwoViewEstimator(config)
+    previous = None
+    for pair in range(chunk.first, chunk.first + chunk.count):
+        previous = previous or estimator.view(sequence.image(frames[pair]), sequence.K)
+        current = estimator.view(sequence.image(frames[pair + 1]), sequence.K)
+        pose = estimator.estimate(previous, current)
+        yield from _covered(chunk, ALONE, frames[pair], frames[pair + 1], pose)
+        previous = current
+
+
+def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
+    sequence, frames = opened(chunk.dataset), chunk.dataset.frames
+    odometry, stamps = VisualOdometry(config), sequence.stamps_ns
+    for number in range(max(chunk.first - _LEAD, 0), chunk.first + chunk.count + 1):
+        current = frames[number]
+        result = odometry.process(Frame(sequence.image(current), sequence.K, int(stamps[current])))
+        if number > chunk.first and result.relative and result.previous_stamp_ns is not None:
+            previous = int(np.searchsorted(stamps, result.previous_stamp_ns))
+            yield from _covered(chunk, IN_A_ROW, previous, current, result.relative)
+
+
+def _covered(chunk: PairChunk, start: str, previous: int, current: int,
+             pose: RelativePose) -> Iterator[Coverage]:
+    """Hold a pose against the truth, where there is any."""
+    poses = opened(chunk.dataset).poses
+    assert poses is not None  # datasets without poses are refused at the start
+    true_motion = np.linalg.inv(poses[previous]) @ poses[current]
+    if not np.isfinite(true_motion).all():
+        return
+    motion, has_pose = camera_motion(pose), len(pose.x) > 0
+    rotation = direction = float('nan')
+    if has_pose:
+        rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
+    if pose.t.any() and has_direction(true_motion):
+        direction = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
+    claims = np.degrees(np.sqrt([np.trace(pose.covariance_5[:3, :3]),
+                                 np.trace(pose.covariance_5[3:, 3:])]))
+    yield Coverage(
+        plain_name(chunk.dataset.folder), chunk.dataset.name, start, previous, current,
+        pose.status.value, has_failed(rotation, direction, true_motion), rotation, direction,
+        float(claims[0]), float(claims[1]),
+        normalised_square(pose, true_motion) if np.isfinite(direction) else float('nan'),
+        len(pose.x), int(pose.inliers.sum()))
+
+
+def normalised_square(pose: RelativePose, true_motion: Array) -> float:
+    """
+    Squared error of a pose over its covariance (5, 5); 5 on average if that is true.
+
+    true_motion: (4, 4) the current camera in the previous one.
+    """
+    R = true_motion[:3, :3].T
+    t = unit(-R @ true_motion[:3, 3])
+    error = np.concatenate([Rotation.from_matrix(R @ pose.R.T).as_rotvec(),
+                            sphere_tangents(pose.t).T @ (t - pose.t)])
+    return float(error @ np.linalg.solve(pose.covariance_5, error))
+
+
+def coverage_rows(records: Iterable[Coverage]) -> list[CoverageRow]:
+    """Sum up records by scene and start, in the order of their first."""
+    groups: dict[tuple[str, str], list[Coverage]] = {}
+    for record in records:
+        groups.setdefault((record.scene, record.start), []).append(record)
+    return [_row(scene, start, group) for (scene, start), group in groups.items()]
+
+
+def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
+    squares = np.array([record.square for record in records if record.told])
+    tracked = [status.value for status in TRACKED]
+    return CoverageRow(
+        scene, start, len(records), len(squares),
+        sum(record.failed for record in records if record.told),
+        sum(record.status not in tracked for record in records),
+        sum(record.needlessly_given_up for record in records),
+        sum(record.wrong_and_sure for record in records),
+        float(np.median(squares) / chi2.median(5)) if len(squares) else float('nan'),
+        tuple(share_with_bounds(int((squares <= chi2.ppf(level, 5)).sum()), len(squares))
+              for level in LEVELS))
+
+
+def share_with_bounds(hits: int, tries: int, confidence: float = 0.95
+                      ) -> tuple[float, float, float]:
+    """Share of hits, and the bounds that hold the true probability, all NaN without a try."""
+    if not tries:
+        return (float('nan'),) * 3
+    tail = (1 - confidence) / 2
+    return (hits / tries,
+            float(beta.ppf(tail, hits, tries - hits + 1)) if hits else 0.0,
+            float(beta.ppf(1 - tail, hits + 1, tries - hits)) if hits < tries else 1.0)
+
+
+def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
+    """
+    Plot the share of poses that lie inside against the probability that was claimed, by scene.
+
+    On the right the share beyond, on logarithmic axes: that is where backends break.
+    """
+    from djet_ros.lab.style import figure
+    from matplotlib import colormaps
+    scenes = list(dict.fromkeys(record.scene for record in records))
+    with figure(path, 9.0, 4.0) as empty:
+        left, right = empty.subplots(1, 2)
+        for number, scene in enumerate(scenes):
+            squares = np.sort([r.square for r in records if r.scene == scene and r.told])
+            if not len(squares):
+                continue
+            claimed, found = chi2.cdf(squares, 5), np.arange(1, len(squares) + 1) / len(squares)
+            look = {'label': f'{scene} ({len(squares)})', 'color': colormaps['tab20'](number % 20)}
+            left.step(claimed, found, where='post', **look)
+            right.step(np.maximum(chi2.sf(squares, 5), 1e-6), 1 - found + 1 / len(squares), **look)
+        left.plot([0, 1], [0, 1], 'k:', lw=1)
+        right.plot([1e-6, 1], [1e-6, 1], 'k:', lw=1)
+        left.set(xlabel='claimed probability', ylabel='share of poses inside', xlim=(0, 1),
+                 ylim=(0, 1))
+        right.set(xlabel='claimed probability of an error so large', xscale='log', yscale='log',
+                  ylabel='share of poses', xlim=(1e-6, 1), ylim=(1e-4, 1))
+        right.legend(fontsize=7, ncols=2, loc='upper left')

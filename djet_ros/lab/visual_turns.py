@@ -1,0 +1,43 @@
+"""What a recording shows of turns by its images alone, and what its gyro felt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from djet_ros.config.sections import Config
+from djet_ros.core.types import Array
+from djet_ros.lab.imu_offset import VisualTurns
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.odometry.visual_odometry import TRACKED
+from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.recording import Recording
+import numpy as np
+from numpy.typing import NDArray
+
+
+def listen(recording: Recording, config: Config, advance: Callable[[], None]
+           ) -> tuple[VisualTurns, NDArray[np.int64], Array]:
+    """Give the turns of the images, and stamps (M,) and rates (M, 3) of the gyro."""
+    tracker = Tracker(config, message_type, image_topic=recording.image_topic)
+    ends: list[tuple[int, int]] = []
+    rotations, stamps, rates = [], [], []
+    for topic, _, message in recording.messages():
+        if topic == recording.info_topic:
+            tracker.camera_info(message)
+        elif topic == recording.beside['imu']:
+            rate = message.angular_velocity
+            stamps.append(stamp_ns(message.header))
+            rates.append((rate.x, rate.y, rate.z))
+        elif topic == recording.image_topic:
+            processed = tracker.counts.processed
+            tracker.image(message)
+            advance()
+            last = tracker.last
+            if tracker.counts.processed > processed and last is not None \
+                    and last.status in TRACKED and last.since_ns is not None:
+                ends.append((last.since_ns, last.stamp_ns))
+                rotations.append(last.motion[:3, :3].T)
+    start, end = np.array(ends, np.int64).reshape(-1, 2).T
+    return (VisualTurns(start, end, np.array(rotations).reshape(-1, 3, 3)),
+            np.array(stamps, np.int64), np.array(rates, np.float64).reshape(-1, 3))
