@@ -529,10 +529,10 @@ def motion(stamp: int) -> Any:
 TUM_OF_RESULTS = b''.join(b'%d.000000000 0 0 %d 0 0 0 1\n' % (i, i) for i in range(1, 4))
 FRAMES_OF_RESULTS = (
     b'image,stamp_ns,status,reason,previous_stamp_ns,matches,inliers,culled,iterations,'
-    b'median_residual_px,mean_hamming,scale,scale_known,ms\n'
+    b'median_residual_px,mean_hamming,scale,scale_kind,ms\n'
     b'0,1000000000,FIRST_FRAME,,,,,,,,,,,1.00\n'
     b'1,2000000000,TIME_JUMP,,,,,,,,,,,1.00\n'
-    b'2,3000000000,OK,,2000000000,9,9,0,2,0.1,9.0,1.0,1,1.00\n')
+    b'2,3000000000,OK,,2000000000,9,9,0,2,0.1,9.0,1.0,metric,1.00\n')
 
 
 def sequence_target(build: Callable[[Path], None], file: str,

@@ -243,9 +243,9 @@ def test_a_conversion_that_fails_leaves_nothing_or_the_old_bag(small_kitti, tmp_
         write_kitti_bag(KittiSequence(folder), out, progress=interrupt, overwrite=True)
     damaged = folder / 'image_0' / '000004.png'
     damaged.write_bytes(damaged.read_bytes()[:500])
-    with pytest.raises(DjetError, match='000004.png is a damaged PNG'):
+    with pytest.raises(DjetError, match='000004.png is a damaged image'):
         write_kitti_bag(KittiSequence(folder), out, overwrite=True)
-    with pytest.raises(DjetError, match='damaged PNG'):
+    with pytest.raises(DjetError, match='damaged image'):
         write_kitti_bag(KittiSequence(folder), out.parent / 'other')
     assert [path.name for path in out.parent.iterdir()] == ['out']
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before

@@ -9,6 +9,7 @@ from djet_ros.config.sections import Config, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
+from djet_ros.live.parameters import live_choices, with_live_values
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -197,3 +198,18 @@ def test_what_strangers_wrote_cannot_control_the_terminal():
     error = DjetError('no parameter \x1b[2J\n\u202e ' + 'x' * 5000)
     assert str(error).startswith('no parameter ?[2J ? xxx')
     assert len(str(error)) < 1100
+
+
+def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
+    scale = flat(Config())['odometry.scale']
+    offered = [one for one in scale.description.choices if one != 'ground_truth']
+    assert list(live_choices(scale)) == offered
+    for value, reason in (('wheels', "is 'wheels'"),
+                          ('ground_truth', "is 'ground_truth', which only a recording has")):
+        with pytest.raises(DjetError) as error:
+            with_live_values(Config(), {'odometry.scale': value})
+        assert str(error.value) == f'odometry.scale {reason}; choose from {", ".join(offered)}'
+    assert with_live_values(Config(), {'odometry.scale': 'speed'}).odometry.scale == 'speed'
+    # every other choice is as good live as offline
+    assert all(live_choices(item) == item.description.choices
+               for item in flat(Config()).values() if item.name != 'odometry.scale')

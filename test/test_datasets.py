@@ -195,7 +195,7 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
     ('cam0/data.csv', f',{STAMPS[0]}.png', '', 'line 2 has 1 words'),
     ('cam0/data.csv', str(STAMPS[0]), '1.5', 'is no stamp in nanoseconds'),
     ('cam0/data.csv', str(STAMPS[0]), str(STAMPS[3]), 'is not after the one before'),
-    ('cam0/sensor.yaml', 'radial-tangential', 'equidistant', "distortion model 'equidistant'"),
+    ('cam0/sensor.yaml', 'radial-tangential', 'fov', "distortion model 'fov'"),
     ('cam0/sensor.yaml', '[110.0,', '[-110.0,', 'is no camera'),
     ('cam0/sensor.yaml', 'intrinsics', 'outsides', 'is no ASL camera description'),
     ('cam0/sensor.yaml', 'data: [', 'data: [1, ', 'is no ASL camera description'),

@@ -129,6 +129,23 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
         assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
 
 
+def test_a_bag_with_an_imu_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+        live, start, peer, bag, tmp_path):
+    """Its mounting comes over /tf_static."""
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--imu', 'true']) == 0
+    poses = [topic for topic in TYPES if topic != '/diagnostics']
+    with Bag(tmp_path / 'out' / 'bag') as replayed:
+        expected = {topic: [serialised(m.message) for m in replayed.messages({topic})]
+                    for topic in poses}
+    live(*EVERY, '-p', 'odometry.imu:=true', '-r', 'imu:=/imu/data_raw', topic=RECTIFIED)
+    player = start('play', bag, '--rate', '2')
+    peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
+    player.finish()
+    for topic in poses:
+        assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
+    assert int((peer.said() or {})['gyro samples']) > 0
+
+
 @pytest.mark.parametrize('reliability', ['best_effort', 'reliable'])
 def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
         live, start, peer, bag, reliability):
@@ -268,6 +285,39 @@ def test_a_request_of_another_middleware_is_said_and_changes_nothing(live, peer)
     peer.wait('the log', lambda: 'a request for /vo_node/pause came in the form of another '
               'middleware' in one.log)
     assert not peer.said(message='paused')
+
+
+def test_clients_of_fast_dds_take_its_services_for_absent_and_the_log_says_why(live, peer):
+    one = live(*FAST)
+    writers, readers = ends(peer, f'{NODE}/reset')
+    # rmw_fastrtps waits until there are as many of either
+    assert len(writers) != len(readers)
+    assert [user_data for user_data in readers if user_data in writers]
+    reply = 'std_srvs::srv::dds_::Trigger_Response_'
+    peer.graph.listen_raw(f'rr{NODE}/resetReply', reply, lambda *_: None, Profile(), 'clientid=1;')
+    peer.graph.listen_raw(f'rr{NODE}/pauseReply', reply, lambda *_: None, Profile(), '')
+    peer.wait('the log', lambda: 'a client on another middleware waits for /vo_node/pause, which '
+              'only those on Cyclone DDS can have; call it with '
+              'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp' in one.log)
+    assert 'waits for /vo_node/reset' not in one.log
+
+
+def ends(peer: Peer, service: str) -> tuple[list[str], list[str]]:
+    """Give what the writers of answers and the readers of requests say of themselves."""
+    from cyclonedds.builtin import (
+        BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.qos import Policy
+    found = []
+    participant = DomainParticipant(int(ENVIRONMENT['ROS_DOMAIN_ID']))
+    for kind, topic in ((BuiltinTopicDcpsPublication, f'rr{service}Reply'),
+                        (BuiltinTopicDcpsSubscription, f'rq{service}Request')):
+        reader = BuiltinDataReader(participant, kind)
+        some = peer.wait(topic, lambda reader=reader, topic=topic: [
+            bytes(one.qos[Policy.Userdata].data).decode() if Policy.Userdata in one.qos else ''
+            for one in reader.read(1000) if one.topic_name == topic])
+        found.append(some)
+    return found[0], found[1]
 
 
 def test_diagnostics_follow_simulated_time(live, start, peer, bag):

@@ -8,6 +8,7 @@ from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 import pickle
+from time import perf_counter
 
 from cards import Cards, K as CARDS_K, pose
 import cv2
@@ -53,8 +54,9 @@ MOTIONS = {'sideways': SIDEWAYS, 'forward': FORWARD, 'backward': BACKWARD}
 NOISE = 0.5  # pixels, in each coordinate of y
 TRIALS = 200
 
-# The factor by which the covariance is meant to exceed what independent matches would give.
-CAUTION = 1.6
+# The factor by which the covariance exceeds what independent matches would give: twenty large
+# cells tell its size to a sixth, and it is never taken to be smaller than small ones tell.
+CAUTION = 1.2
 
 
 def errors_of(result, R, t):
@@ -135,7 +137,7 @@ def test_the_covariance_tells_how_the_pose_scatters(motion, loss):
         # 300 matches leave the covariance itself uncertain by a tenth
         assert low < CAUTION * mean_square < 1.1 * high
     directions = CAUTION * np.linalg.eigvalsh(scatter)
-    assert directions[0] > 0.5 and directions[-1] < 1.8
+    assert directions[0] > 0.45 and directions[-1] < 1.8
 
 
 def test_matches_in_a_handful_of_places_do_not_pretend_to_know_how_sure_the_pose_is():
@@ -152,7 +154,7 @@ def test_matches_in_a_handful_of_places_do_not_pretend_to_know_how_sure_the_pose
         assert here.sum() > 20 and result.status == status
 
 
-@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 @pytest.mark.parametrize('method', ['rpe', 'five_point'])
 @pytest.mark.parametrize('motion', MOTIONS)
 def test_without_noise_the_pose_is_exact(motion, method, preset_name):
@@ -246,15 +248,16 @@ class Wall:
     def __init__(self, step: str) -> None:
         image = textured(np.random.default_rng(52), (240, 160))
         camera = np.array([[200.0, 0, 120], [0, 200, 80], [0, 0, 1]])
-        views = [TwoViewEstimator().view(gray, camera)
+        whole = preset('best', patch_scale=1.0)
+        views = [TwoViewEstimator(whole).view(gray, camera)
                  for gray in (image, np.roll(image, -2, axis=1))]
-        grid = np.stack(np.meshgrid(np.arange(16, 220, 8), np.arange(20, 140, 8)), -1)
+        grid = np.stack(np.meshgrid(np.arange(15, 220, 8), np.arange(20, 140, 8)), -1)
         x = grid.reshape(-1, 2).astype(float)
         sideways = Pose(np.eye(3), np.array([-1.0, 0, 0]))
         self.tracks, self.keypoints = [], []
         for rounds in range(1, 6):
-            config = preset('best', step=step, step_share=0.2, max_iterations=rounds,
-                            epsilon=1e-12, cull_outside=False)
+            config = replace(whole, step=step, step_share=0.2, max_iterations=rounds,
+                             epsilon=1e-12, cull_outside=False)
             surface = WatchedSurface(*views, x, config)
             self.tracks.append(track_jointly(surface, camera, x, [sideways], config))
             self.keypoints.append(surface.asked[-1])
@@ -279,7 +282,7 @@ def test_culled_matches_keep_the_loss_they_had_last():
     wall = Wall('pixel')
     lost = wall.tracks[0].voting & ~wall.tracks[-1].voting
     assert 3 <= lost.sum() < len(lost) / 4
-    assert (wall.keypoints[0][lost, 0] == 16).all()
+    assert (wall.keypoints[0][lost, 0] == 15).all()
     for before, after in pairwise(wall.tracks):
         assert not (after.voting & ~before.voting).any()  # a culled match stays out
         out = ~after.voting
@@ -355,7 +358,7 @@ def pair():
     return estimator.view(frames[3], K), estimator.view(frames[4], K), motions[3]
 
 
-@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 @pytest.mark.parametrize('method', METHODS)
 def test_the_same_frames_give_the_same_bytes(pair, method, preset_name, request):
     previous, current, _ = pair
@@ -377,7 +380,22 @@ def test_the_final_step_ends_on_the_epipolar_line(pair, method):
     lines = epipolar_lines(fundamental(current.K, result.R, result.t), result.x)
     assert np.abs(line_distances(lines, result.y_opt)).max() < 1e-9
     assert np.allclose(np.abs(result.residuals), np.abs(line_distances(lines, result.y)))
-    assert set(result.timings) == {'matching', 'starts', 'jet', 'result'}
+
+
+@pytest.mark.parametrize('threads', [1, 2])
+def test_stage_times_add_up_to_the_time_it_took(pair, threads):
+    previous, current, _ = pair
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        began = perf_counter()
+        stages = TwoViewEstimator().estimate(previous, current).timings
+        took = perf_counter() - began
+    finally:
+        cv2.setNumThreads(before)
+    assert set(stages) == {'matching', 'starts', 'jet', 'result'}
+    assert all(seconds >= 0 for seconds in stages.values())
+    assert 0.8 * took < sum(stages.values()) < took
 
 
 def test_the_result_tells_the_hamming_distances_at_the_final_places(pair):
@@ -430,7 +448,7 @@ def test_a_black_frame_is_a_status_and_no_crash(pair, method):
 
 # Real frames.
 
-@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_name):
     sequence = KittiSequence(kitti / 'sequences/06', start=20, end=29)
     frames = [sequence.image(i) for i in range(len(sequence))]
@@ -477,7 +495,7 @@ def small_views():
 
 @pytest.mark.filterwarnings('error')
 @given(kind=st.sampled_from(SORTS), count=st.integers(1, 60), seed=st.integers(0, 2**32 - 1),
-       method=st.sampled_from(METHODS), preset_name=st.sampled_from(['best', 'paper']),
+       method=st.sampled_from(METHODS), preset_name=st.sampled_from(['best', 'fast', 'paper']),
        images=st.tuples(*2 * [st.integers(0, 2)]),
        indefinite=st.sampled_from(['project', 'drop', 'keep']))
 @settings(max_examples=200, deadline=None)
@@ -488,14 +506,15 @@ def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, pr
     config = preset(preset_name, method=method, min_matches=8, indefinite=indefinite)
     result = TwoViewEstimator(config).estimate_matched(*views, x, y)
     assert np.allclose(result.R @ result.R.T, np.eye(3), atol=1e-9)
-    assert np.linalg.norm(result.t) == pytest.approx(float(result.status == Status.OK))
+    assert np.linalg.norm(result.t) == pytest.approx(float(result.status in (
+        Status.OK, Status.AMBIGUOUS, Status.TWO_MOTIONS, Status.TOO_FEW_INLIERS)))
     assert np.isfinite(result.y_opt).all()
     if result.status == Status.OK:
         variances = np.linalg.eigvalsh(result.covariance_5)
         assert variances[0] > -1e-8 * variances[-1] and variances[-1] > 0
 
 
-@pytest.mark.parametrize('preset_name', ['best', 'paper'])
+@pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 @pytest.mark.parametrize('method', ['djet', 'rpe'])
 def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
     """Some hundred matches of noise always fit some essential matrix."""

@@ -412,7 +412,7 @@ def test_a_damaged_store_is_named(road, tmp_path):
     (['.'], 'is neither a bag nor a folder of KITTI'),
     (['road', '--methods', 'djet,orb'], "there is no method 'orb'; choose from djet, rpe, "),
     (['road', '--methods', 'djet,djet'], "method 'djet' is given twice"),
-    (['road', '--presets', 'worst'], "there is no preset 'worst'; choose from best, paper"),
+    (['road', '--presets', 'worst'], "there is no preset 'worst'; choose from best, fast, paper"),
     (['road', '--workers', '0'], 'workers is 0; at least one is needed'),
     (['road', '--start', '7'], '8 frames, of which 1 are chosen'),
     (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, intensities, smooth
-from djet_ros.core.orb_pattern import REACH, TESTS
+from djet_ros.core.orb_pattern import pattern, REACH, TESTS
 from djet_ros.core.surfaces import DescriptorSurface, with_minimum
 import numpy as np
 import pytest
@@ -20,12 +20,13 @@ def smoothed(seed):
 
 
 @pytest.mark.parametrize('grading', [2.0, 24.0, 120.0])
-@pytest.mark.parametrize('count', [16, 100, 256])
-def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count):
+@pytest.mark.parametrize(('count', 'scale'), [(16, 1.0), (100, 0.6), (256, 1.0)])
+def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count, scale):
+    tests = pattern(count, scale)
     image_a, image_b = smoothed(70), smoothed(71)
     x, y = np.array([[60, 50], [90, 61]]), np.array([[62, 49], [88, 60]])
-    reference = grades(*intensities(image_a, x, count), grading)
-    surfaces = graded_surfaces(reference, image_b, y, 2, grading)
+    reference = grades(*intensities(image_a, x, tests), grading)
+    surfaces = graded_surfaces(reference, image_b, y, 2, grading, tests)
 
     def graded(image, place, test):
         levels = [image[place[1] + test[i + 1], place[0] + test[i]] / 4 for i in (0, 2)]
@@ -36,7 +37,7 @@ def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count):
             for v_x in range(-2, 3):
                 expected = sum(abs(graded(image_a, x[k], test)
                                    - graded(image_b, y[k] + (v_x, v_y), test))
-                               for test in TESTS[:count]) / (2 * grading)
+                               for test in tests) / (2 * grading)
                 assert surfaces[v_y + 2, v_x + 2, k] == pytest.approx(expected, rel=1e-6)
 
 
@@ -58,20 +59,22 @@ def test_many_points_at_once_are_as_one_at_a_time():
     rng = np.random.default_rng(73)
     image_a, image_b = smoothed(74), smoothed(75)
     points = rng.integers(REACH + 2, np.subtract(SIZE, REACH + 2), (5000, 2))
-    reference = grades(*intensities(image_a, points, 128), 24.0)
-    together = graded_surfaces(reference, image_b, points, 2, 24.0)
+    reference = grades(*intensities(image_a, points, TESTS[:128]), 24.0)
+    together = graded_surfaces(reference, image_b, points, 2, 24.0, TESTS[:128])
     for k in (0, 2047, 2048, 4999):
-        alone = graded_surfaces(reference[:, k:k + 1], image_b, points[k:k + 1], 2, 24.0)
+        alone = graded_surfaces(reference[:, k:k + 1], image_b, points[k:k + 1], 2, 24.0,
+                                TESTS[:128])
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
-    assert graded_surfaces(reference[:, :0], image_b, points[:0], 2, 24.0).shape == (5, 5, 0)
+    assert graded_surfaces(reference[:, :0], image_b, points[:0], 2, 24.0,
+                           TESTS[:128]).shape == (5, 5, 0)
 
 
 def test_without_grading_all_of_orbs_bits_are_compared():
     image_a, image_b = (textured(np.random.default_rng(seed), SIZE) for seed in (76, 77))
-    estimator = TwoViewEstimator()
+    config = preset('paper', window=3)
+    estimator = TwoViewEstimator(config)
     views = [estimator.view(image, K) for image in (image_a, image_b)]
     x = np.array([[60.0, 50.0], [90.0, 61.0]])
-    config = EstimatorConfig(grading=0.0, binary_tests=256, window=3, window_sigma=0.0)
     fitted = DescriptorSurface(*views, x, config).around(x)
     pixels = x.astype(int)
     samples = hamming_surfaces(descriptor_bits(views[0].smoothed, pixels), views[1].smoothed,
@@ -85,18 +88,39 @@ def test_without_grading_all_of_orbs_bits_are_compared():
 def test_graded_tests_find_a_place_in_noise_nearer_to_the_truth_than_bits(noise):
     rng = np.random.default_rng(78)
     clean = textured(rng, (320, 240))
-    estimator = TwoViewEstimator()
-    views = [estimator.view(np.clip(clean + rng.normal(0, noise, clean.shape), 0, 255).astype(
-        np.uint8), K) for _ in range(2)]
+    images = [np.clip(clean + rng.normal(0, noise, clean.shape), 0, 255).astype(np.uint8)
+              for _ in range(2)]
     grid = np.stack(np.meshgrid(np.arange(40, 280, 7), np.arange(40, 200, 7)), -1)
     x = grid.reshape(-1, 2).astype(float)
     errors = {}
     for grading, count in ((24.0, 128), (0.0, 256)):
-        surface = DescriptorSurface(*views, x, EstimatorConfig(grading=grading,
-                                                               binary_tests=count))
+        config = EstimatorConfig(grading=grading, binary_tests=count)
+        views = [TwoViewEstimator(config).view(image, K) for image in images]
+        surface = DescriptorSurface(*views, x, config)
         fitted, _ = with_minimum(surface.around(x), 'project')
         errors[grading] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
     assert errors[24.0] < 0.8 * errors[0.0]
+
+
+@pytest.mark.parametrize('exposure', [0.4, 1.6])
+def test_a_change_of_exposure_changes_neither_places_nor_what_the_fit_leaves(exposure):
+    rng = np.random.default_rng(79)
+    dim = 70 + 0.3 * (textured(rng, (320, 240)).astype(float) - 128)
+    estimator = TwoViewEstimator()
+    before, same, after = (estimator.view(np.clip(
+        gain * dim + rng.normal(0, 0.5, dim.shape), 0, 255).astype(np.uint8), K)
+        for gain in (1.0, 1.0, exposure))
+    grid = np.stack(np.meshgrid(np.arange(40, 280, 7), np.arange(40, 200, 7)), -1)
+    x = grid.reshape(-1, 2).astype(float)
+    left, errors = {}, {}
+    for name, view in (('same', same), ('after', after)):
+        fitted, _ = with_minimum(
+            DescriptorSurface(before, view, x, EstimatorConfig()).around(x), 'project')
+        left[name] = np.median(fitted.c / np.maximum(np.trace(fitted.A, axis1=1, axis2=2), 1e-9))
+        errors[name] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
+    # Less light is told in fewer gray levels, so that noise weighs more.
+    assert errors['after'] < 2.5 * errors['same']
+    assert left['after'] < 2.5 * left['same']
 
 
 def test_a_gray_level_is_seen_in_quarters_as_orb_sees_it_in_whole_ones():

@@ -95,8 +95,8 @@ def transforms(heard: Heard, parent: str) -> dict[int, Any]:
 
 
 def worst(poses: dict[int, Any]) -> float:
-    """Give the largest distance from the way, of poses by stamp."""
-    return max(float(np.linalg.norm(here[:3, 3] - [WAYS[(stamp - START) // PERIOD], 0, 0]))
+    """Give the largest distance from the way to the right, of poses by stamp."""
+    return max(float(np.linalg.norm(here[:3, 3] - [0, -WAYS[(stamp - START) // PERIOD], 0]))
                for stamp, here in poses.items())
 
 
@@ -123,7 +123,8 @@ def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: No
     path = listener.heard[PATH][-1]
     assert path.header.frame_id == 'map'
     told = dict(pose_of(one) for one in listener.heard[ODOMETRY])
-    assert worst(dict(pose_of(one) for one in path.poses)) < worst(told)
+    # Loops can't mend what is exact to 3 cm already.
+    assert worst(dict(pose_of(one) for one in path.poses)) < max(worst(told), 0.03)
     # REP 105: odom -> camera is the odometry's alone, and map -> odom carries the correction
     map_to_odom, odom_to_camera = (transforms(listener.heard, frame) for frame in ('map', 'odom'))
     assert map_to_odom.keys() == odom_to_camera.keys() == told.keys()

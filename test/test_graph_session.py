@@ -8,7 +8,7 @@ from djet_ros.odometry.messages import stamp_ns
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
-from test_live_slam import Odometry, START
+from test_live_slam import MOUNTING, Odometry, START
 from test_session import Graph
 
 TOPICS = {'odometry': '/vo_node/odometry', 'relative_pose_cov': '/vo_node/relative_pose_cov',
@@ -20,19 +20,20 @@ WAYS = [0.25 * i for i in (*range(7), *range(5, -1, -1))]
 class Live:
     """A session at work on a way to the right and back."""
 
-    def __init__(self, **parameters):
+    def __init__(self, base_frame='', **parameters):
         pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
         from djet_ros.live.graph_session import GraphSession
         from djet_ros.posegraph.live_slam import LiveSlam
         self.graph = Graph()
         self.slam = LiveSlam(
             from_flat({'estimator.max_features': 500, 'slam.keyframe_distance': 0.4,
-                       'slam.loop_gap': 0.5,
+                       'slam.loop_gap': 0.5, 'odometry.base_frame': base_frame,
                        **{f'slam.{name}': value for name, value in parameters.items()}}),
             message_type, 'image_rect')
         self.session = GraphSession(self.slam, self.graph, TOPICS)
         self.session.start()
-        self._cards, self._odometry, self._was = Cards(), Odometry(), None
+        self._cards, self._odometry, self._was = Cards(), Odometry(
+            'body', base_frame, MOUNTING if base_frame else None), None
 
     def drive(self, ways):
         self.session.camera_info(camera_info(K, SIZE))
@@ -79,6 +80,18 @@ def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
     assert stamps == [START + i * 100_000_000 for i in range(len(WAYS))]
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
     assert one.slam.map.imageless == 0
+
+
+def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):
+    one = live(base_frame='base_link')
+    one.drive(WAYS[:3])
+    until(lambda: any("tf does not know where 'camera' is on 'base_link'; until then the "
+                      'odometry is not used' in line for line in one.graph.lines))
+    assert not one.graph.heard('/tf')
+    one.graph.frames['base_link', 'camera'] = MOUNTING
+    one.drive(WAYS[3:6])
+    until(lambda: [stamp_ns(message.transforms[0].header) for message in one.graph.heard('/tf')][
+        -3:] == [START + i * 100_000_000 for i in (3, 4, 5)])
 
 
 def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):

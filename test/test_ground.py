@@ -66,7 +66,7 @@ def moved(before, after, sigma=1e-3):
 
 
 def view(gray):
-    return View(gray, K, None, None)
+    return View(gray, K, None, None, None)
 
 
 @pytest.fixture(scope='module')

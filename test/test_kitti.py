@@ -96,7 +96,8 @@ DAMAGES = {
     'calib.txt does not exist': lambda f: (f / 'calib.txt').unlink(),
     'times.txt does not exist': lambda f: (f / 'times.txt').unlink(),
     'times.txt is not a text file': lambda f: (f / 'times.txt').write_bytes(b'\xff\xfe\x00'),
-    '000003.png is not a PNG image': lambda f: (f / 'image_0/000003.png').write_text('hello'),
+    '000003.png is neither a PNG nor a JPEG image':
+        lambda f: (f / 'image_0/000003.png').write_text('hello'),
     '000002.png is 8x4, the images before it are 64x48':
         lambda f: cv2.imwrite(str(f / 'image_0/000002.png'), np.zeros((4, 8), np.uint8)),
     'has no images image_0': lambda f: [path.unlink() for path in (f / 'image_0').iterdir()],
@@ -139,7 +140,7 @@ def test_a_png_cut_short_is_found_when_it_is_read(small_kitti):
     path = folder / 'image_0' / '000001.png'
     path.write_bytes(path.read_bytes()[:1000])
     sequence = KittiSequence(folder)
-    with pytest.raises(DjetError, match='000001.png is a damaged PNG image'):
+    with pytest.raises(DjetError, match='000001.png is a damaged image'):
         sequence.image(1)
 
 

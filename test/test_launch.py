@@ -16,7 +16,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from djet_ros.config.flat import from_flat
-from djet_ros.config.sections import NodeConfig
+from djet_ros.config.sections import NodeConfig, OdometryConfig
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.live.topics import graph_outputs, odometry_outputs
 import pytest
@@ -27,11 +27,11 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
 
 ARGUMENTS = {
-    'vo.launch.py': {'image', 'camera_info', 'params_file', 'namespace', 'name', 'log_level',
-                     'respawn', 'use_sim_time', 'rviz'},
-    'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'namespace',
-                       'log_level', 'respawn', 'use_sim_time'},
-    'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'rviz'},
+    'vo.launch.py': {'image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
+                     'log_level', 'respawn', 'use_sim_time', 'rviz'},
+    'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'base_frame',
+                       'namespace', 'log_level', 'respawn', 'use_sim_time'},
+    'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'base_frame', 'rviz'},
 }
 
 
@@ -53,7 +53,19 @@ def test_the_parameters_of_a_replay_are_the_defaults_without_loss_and_with_a_pat
 
 def test_rviz_shows_what_the_node_publishes() -> None:
     shown = topics(yaml.safe_load((ROOT / 'config' / 'vo.rviz').read_text()))
-    assert shown == ['/vo_node/odometry', '/vo_node/path', '/vo_node/debug_image']
+    assert shown == ['/vo_node/odometry', '/vo_node/path', '/vo_node/landmarks',
+                     '/vo_node/debug_image']
+
+
+def test_the_recipe_for_robot_localization_fuses_the_twist_of_our_odometry_alone() -> None:
+    page = (ROOT / 'doc' / 'slam-backend.md').read_text()
+    block, = re.findall(r'```yaml\n(ekf_filter_node:.*?)```', page, re.DOTALL)
+    recipe = yaml.safe_load(block)['ekf_filter_node']['ros__parameters']
+    node, topic = recipe['odom0'].strip('/').split('/')
+    assert (node, odometry_outputs(NodeConfig())[topic]) == ('vo_node', 'nav_msgs/msg/Odometry')
+    assert recipe['odom_frame'] == recipe['world_frame'] == OdometryConfig().odom_frame
+    # its order: x y z, roll pitch yaw, their velocities, three accelerations
+    assert recipe['odom0_config'] == [False] * 6 + [True] * 6 + [False] * 3
 
 
 def texts(value: Any) -> Iterator[str]:
@@ -169,6 +181,7 @@ def test_vo_launch_names_the_node_and_starts_it_again_after_an_error(
 def test_two_cameras_have_their_own_nodes_and_topics(
         environment: dict[str, str], tmp_path: Path) -> None:
     said = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
+                    'base_frame:=base_link',
                     until='queue policy', times=2)
     for side in ('left', 'right'):
         assert f'[{side}.vo_node]: images from /{side}/camera/image_raw, camera_info from ' \

@@ -27,14 +27,17 @@ from ros_messages import camera_info, image, message_type
 
 PERIOD = 100_000_000
 START = 50 * 10**9
+# 0.3 m ahead of the base and 1 m above it, looking ahead.
+MOUNTING = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
 SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
 
 
 class Odometry:
     """An odometry that is told its motions, and words them as vo_node does."""
 
-    def __init__(self, convention='optical'):
-        self._make = Messages(message_type, OdometryConfig(frame_convention=convention))
+    def __init__(self, convention='optical', base_frame='', mounting=None):
+        self._make = Messages(message_type, OdometryConfig(
+            frame_convention=convention, base_frame=base_frame), mounting=mounting)
         self.stamp = START
         self.reset()
 
@@ -104,6 +107,26 @@ def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
     assert np.allclose(second.motion, motion)
     assert np.allclose(second.covariance, covariance, atol=2e-9)
     assert np.allclose(second.pose, motion)
+
+
+@pytest.mark.parametrize('convention', ['optical', 'body'])
+def test_of_a_vehicle_too_a_step_is_the_motion_of_the_camera(convention):
+    motion, covariance = pose(z=1.0, yaw=0.1), np.diag(np.arange(1.0, 7)**2) * 1e-6
+    odometry = Odometry(convention, 'base_link', MOUNTING)
+    steps = StepMessages(convention, 'base_link', MOUNTING)
+    told(steps, *odometry.start())
+    step, = told(steps, *odometry.move(motion, covariance))
+    assert np.allclose(step.motion, motion)
+    assert np.allclose(step.pose, motion)
+    assert np.allclose(step.covariance, covariance, atol=2e-9)
+
+
+def test_an_odometry_of_something_else_is_refused_with_what_helps():
+    odometry, steps = Odometry('body', 'base_link', MOUNTING), StepMessages('body')
+    told(steps, *odometry.start())
+    with pytest.raises(DjetError, match="is of 'base_link', and not of 'camera_body'; give both "
+                       'nodes the same odometry.base_frame'):
+        told(steps, *odometry.move(pose(z=1.0)))
 
 
 def test_it_does_not_matter_in_which_order_the_messages_of_a_frame_come():
@@ -203,7 +226,8 @@ def live():
 
 
 QUICK = SlamConfig(keyframe_distance=0.5, loop_gap=0.5, optimise_period=0.0, path_period=0.0)
-FEW_FEATURES = from_flat({'estimator.max_features': 800})
+FEW_FEATURES = from_flat({'estimator.max_features': 800,
+                          'odometry.frame_convention': 'optical'})
 
 
 class Drive:
@@ -212,7 +236,9 @@ class Drive:
     def __init__(self, live, config=FEW_FEATURES, slam=QUICK, drift=0.01):
         self.slam = live(replace(config, slam=slam), message_type, 'image_rect')
         self.slam.camera_info(camera_info(K, SIZE))
-        self.odometry = Odometry(config.odometry.frame_convention)
+        base_frame = config.odometry.base_frame
+        self.odometry = Odometry(config.odometry.frame_convention, base_frame,
+                                 MOUNTING if base_frame else None)
         self._cards, self._drift, self._frame = Cards(), pose(x=drift), 0
         self._true = np.eye(4)
         self.true, self.told, self.corrections, self.path = {}, {}, {}, None
@@ -322,6 +348,25 @@ def test_with_body_axes_the_map_is_the_same_along_other_axes(live, driven):
     axes[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     for ours, theirs in zip(drive.path.poses, driven.path.poses, strict=True):
         assert np.allclose(pose_of(ours)[1], axes @ pose_of(theirs)[1] @ axes.T, atol=1e-6)
+    stamp, newest = pose_of(drive.path.poses[-1])
+    drive.go(pose(x=0.01))
+    assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
+
+
+def test_with_a_base_frame_the_map_is_that_of_the_vehicle_once_tf_knows_the_mounting(live, driven):
+    drive = Drive(live, from_flat({'estimator.max_features': 800,
+                                   'odometry.base_frame': 'base_link'}))
+    frames = {('base_link', 'camera'): MOUNTING}
+    assert drive.slam.mount(lambda *_: None).startswith('no image has come')
+    drive.slam.image(image(np.zeros((9, 9), np.uint8), stamp_ns=START - PERIOD))
+    assert drive.slam.mount(lambda *_: None) == (
+        "tf does not know where 'camera' is on 'base_link'")
+    assert drive.slam.state == ('WARN', 'waiting for the mounting of the camera on tf')
+    assert drive.slam.mount(lambda *names: frames.get(names)) == ''
+    drive.to_and_fro()
+    for one, other in zip(drive.path.poses, driven.path.poses, strict=True):
+        turned = MOUNTING @ pose_of(other)[1] @ np.linalg.inv(MOUNTING)
+        assert np.allclose(pose_of(one)[1], turned, atol=1e-4)
     stamp, newest = pose_of(drive.path.poses[-1])
     drive.go(pose(x=0.01))
     assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)

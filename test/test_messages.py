@@ -5,7 +5,14 @@ from importlib import import_module
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.odometry.messages import camera_frame, in_convention, Messages, stamp_ns, twist
+from djet_ros.odometry.messages import (
+    camera_frame,
+    in_convention,
+    Messages,
+    mounted_frame,
+    stamp_ns,
+    twist,
+)
 from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -13,6 +20,7 @@ import pytest
 import ros_messages
 from scipy.spatial.transform import Rotation
 
+OPTICAL = OdometryConfig(frame_convention='optical')
 STAMP = 1_700_000_000_123_456_789
 
 
@@ -84,7 +92,7 @@ def test_stamps_are_the_images_own_to_the_nanosecond(family):
 def test_a_relative_pose_is_the_current_camera_in_the_previous_one(family):
     result = a_result()
     R, t = result.relative.R, result.relative.t
-    message = Messages(family[0], OdometryConfig()).relative_pose(result)
+    message = Messages(family[0], OPTICAL).relative_pose(result)
     assert message.header.frame_id == 'cam_optical_frame'
     expected = np.eye(4)
     expected[:3, :3], expected[:3, 3] = R.T, -0.7 * R.T @ t
@@ -110,6 +118,29 @@ def test_body_axes_are_forward_left_up_at_both_ends_of_a_pose(family):
     assert np.allclose(np.diag(np.reshape(message.pose.covariance, (6, 6))), [3, 1, 2, 6, 4, 5])
 
 
+def test_as_it_stands_whoever_drives_ahead_goes_along_x_and_stays_level(family):
+    ahead = np.eye(4)
+    # a camera that looks ahead, 2 m on and turned to the left
+    ahead[:3, :3], ahead[:3, 3] = rotation_exp(np.array([0, -0.1, 0])), (0.0, 0.0, 2.0)
+    message = Messages(family[0], OdometryConfig()).odometry(a_result(motion=ahead, pose=ahead))
+    pose = matrix(message.pose.pose)
+    assert np.allclose(pose[:3, 3], [2.0, 0, 0])
+    assert np.allclose(Rotation.from_matrix(pose[:3, :3]).as_rotvec(), [0, 0, 0.1])
+    assert message.twist.twist.linear.x > 7.9
+    assert message.twist.twist.angular.z == pytest.approx(0.4)
+    assert (message.header.frame_id, message.child_frame_id) == ('odom', 'cam_frame')
+
+
+@pytest.mark.parametrize(('config', 'frame', 'ahead'), [
+    ({}, 'cam_optical_frame', [0, 0, 1]),
+    ({'camera_frame': 'mine'}, 'mine', [1, 0, 0]),
+    ({'camera_frame': 'mine', 'frame_convention': 'optical'}, 'mine', [0, 0, 1])])
+def test_the_mounting_is_asked_of_a_frame_along_the_axes_that_it_has(config, frame, ahead):
+    name, axes = mounted_frame(OdometryConfig(**config), 'cam_optical_frame')
+    assert name == frame
+    assert np.allclose(axes[:3, :3] @ [0, 0, 1], ahead)
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10**6))
 def test_the_convention_does_not_change_what_poses_say(seed):
@@ -127,7 +158,7 @@ def test_the_convention_does_not_change_what_poses_say(seed):
 @pytest.mark.parametrize('configured, convention, image_frame, expected', [
     ('', 'optical', 'cam', 'cam'), ('mine', 'optical', 'cam', 'mine'),
     ('mine', 'body', 'cam_optical_frame', 'mine'), ('', 'body', 'cam_optical_frame', 'cam_frame'),
-    ('', 'body', 'left_optical', 'left'), ('', 'body', 'cam', 'cam_body')])
+    ('', 'body', 'left_optical', 'left'), ('', 'body', 'cam', 'cam_body'), ('', 'body', '', '')])
 def test_the_frame_is_named_after_what_it_is(configured, convention, image_frame, expected):
     config = OdometryConfig(camera_frame=configured, frame_convention=convention)
     assert camera_frame(config, image_frame) == expected
@@ -135,7 +166,8 @@ def test_the_frame_is_named_after_what_it_is(configured, convention, image_frame
 
 def test_odometry_has_the_pose_in_the_odom_frame_and_the_twist_in_the_camera(family):
     result = a_result()
-    message = Messages(family[0], OdometryConfig(odom_frame='world')).odometry(result)
+    config = OdometryConfig(odom_frame='world', frame_convention='optical')
+    message = Messages(family[0], config).odometry(result)
     assert (message.header.frame_id, message.child_frame_id) == ('world', 'cam_optical_frame')
     assert np.allclose(matrix(message.pose.pose), result.pose)
     assert np.allclose(np.reshape(message.pose.covariance, (6, 6)), result.pose_covariance)

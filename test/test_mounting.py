@@ -2,6 +2,8 @@
 
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
+from djet_ros.odometry.static_frames import StaticFrames
+from djet_ros.recordings.decoding import MAKE
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -56,3 +58,33 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
         off_of_twist.append(twist_of_base(velocity + error, covariance, T)[0] - moving)
     for samples, said in ((off, told), (off_of_twist, told_of_twist)):
         assert np.allclose(np.cov(np.transpose(samples)), said, atol=0.05 * np.diag(said).max())
+
+
+def told(*frames):
+    """Make the frames of (parent, child, pose)."""
+    known = StaticFrames()
+    for parent, child, pose in frames:
+        known.add(MAKE.frame(0, parent, child, pose))
+    return known
+
+
+def test_a_frame_is_found_along_the_tree_upwards_and_downwards():
+    rng = np.random.default_rng(5)
+    mast, head, wheel = (random_pose(rng) for _ in range(3))
+    frames = told(('base', 'mast', mast), ('/mast', '/head', head), ('base', 'wheel', wheel))
+    assert np.allclose(frames.transform('base', 'head'), mast @ head)
+    assert np.allclose(frames.transform('wheel', 'head'), np.linalg.inv(wheel) @ mast @ head)
+    assert np.allclose(frames.transform('/head', 'base'), np.linalg.inv(mast @ head))
+    assert frames.transform('base', 'antenna') is None
+    # one step is what was told, to the last bit of its message
+    assert np.array_equal(told(('base', 'cam', AHEAD)).transform('base', 'cam'), AHEAD)
+
+
+def test_who_is_told_last_counts_and_nonsense_does_no_harm():
+    nonsense = MAKE.frame(0, 'base', 'cam', np.eye(4))
+    nonsense.transforms[0].transform.rotation.w = 0.0
+    frames = told(('base', 'cam', np.eye(4)), ('base', 'cam', AHEAD), ('a', 'b', np.eye(4)),
+                  ('b', 'a', np.eye(4)))
+    frames.add(nonsense)
+    assert np.array_equal(frames.transform('base', 'cam'), AHEAD)
+    assert frames.transform('a', 'cam') is None

@@ -15,7 +15,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.odometry.messages import stamp_ns
-from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.recording import BagRecording
@@ -50,6 +50,9 @@ TYPES = {
 }
 FAST = {'estimator.max_features': 600}
 EVERY = {**FAST, 'ros.queue_policy': 'every'}
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
+# The camera on its vehicle: 0.3 m ahead of the base and 1 m above it, looking ahead.
+AHEAD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
 PERIOD = 100_000_000
 START = 50 * 10**9
 
@@ -140,7 +143,7 @@ def wait_for_log(node: NodeProcess, text: str, seconds: float = 2 * PATIENCE) ->
 class Drive:
     """The images as a sequence that can be written as a bag."""
 
-    name, K, size, poses = 'cards', K, SIZE, None
+    name, K, size, poses, imu, model = 'cards', K, SIZE, None, None, 'plumb_bob'
     distortion = np.zeros(5)
 
     def __init__(self, images: list[Any]) -> None:
@@ -154,11 +157,20 @@ class Drive:
         return self._images[index]
 
 
+@pytest.mark.parametrize('base_frame', ['', 'base_link'])
 def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
-        node, publisher, subscriber, drive, tmp_path):
-    write_kitti_bag(Drive(drive), tmp_path / 'bag')
+        node, publisher, subscriber, drive, tmp_path, base_frame):
+    if base_frame:
+        pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    mounting = MAKE.frame(0, 'base_link', 'camera', AHEAD)
+    write_kitti_bag(Drive(drive), tmp_path / 'plain')
+    with Bag(tmp_path / 'plain') as plain, ResultBag(tmp_path / 'bag') as whole:
+        whole.write('/tf_static', mounting, 0)
+        for one in plain.messages():
+            whole.write(one.topic, one.message, one.stamp_ns)
     parameters = tmp_path / 'fast.yaml'
-    parameters.write_text('/**: {ros__parameters: {estimator: {max_features: 600}}}')
+    parameters.write_text('/**: {ros__parameters: {estimator: {max_features: 600}, '
+                          f'odometry: {{base_frame: "{base_frame}"}}}}}}')
     replay = subprocess.run(
         [sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())',
          'replay', tmp_path / 'bag', '--output', tmp_path / 'out', '--config', parameters],
@@ -172,6 +184,9 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
     node('-r', 'image:=/camera/image_rect', '--params-file', str(parameters),
          **{'ros.queue_policy': 'every'})
     with BagRecording(tmp_path / 'bag') as source:
+        if base_frame:
+            publisher.advertise('/tf_static', TF_TYPE, durability='transient_local', depth=1)
+            publisher.send('/tf_static', mounting)
         publisher.advertise(source.info_topic, INFO_TYPE)
         publisher.advertise(source.image_topic, IMAGE_TYPE)
         # Until the node knows both publishers, as they know the node.
@@ -488,7 +503,8 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
     assert 'Max: 20000' in reasons[3]
     assert reasons[4].startswith("estimator.loss is 'hubber'; choose from none, huber, cauchy")
     assert 'read-only' in reasons[5]
-    assert 'only a recording has' in reasons[6]
+    assert 'which only a recording has; choose from none, constant, speed' in reasons[6]
+    assert reasons[6].count('ground_truth') == 1
     play(publisher, drive[3:5], first=3)
     subscriber.wait('all odometry', lambda heard: len(heard[f'{NODE}/odometry']) == 5)
     frames = [m.header.frame_id for m in subscriber.heard[f'{NODE}/odometry']]
@@ -554,7 +570,7 @@ def test_path_transform_and_debug_image_come_on_demand(
     assert (picture.width, picture.height, picture.encoding) == (*SIZE, 'bgr8')
     assert [len(m.poses) for m in viewer.heard[f'{NODE}/path']] == [1, 2, 3, 4]
     transform = viewer.heard['/tf'][-1].transforms[0]
-    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera')
+    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera_body')
     viewer.ask('unsubscribe', topic=f'{NODE}/debug_image')
     sleep(0.5)
     play(publisher, drive[4:6], first=4)
@@ -575,10 +591,8 @@ def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_pa
     subscriber.wait('pairs', paired(2))
     wait_for_log(one, "tf does not know where 'camera' is on 'base_link'")
     assert not subscriber.heard[f'{NODE}/odometry']
-    mounting = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
-    publisher.advertise('/tf_static', 'tf2_msgs/msg/TFMessage', durability='transient_local',
-                        depth=1)
-    publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', mounting))
+    publisher.advertise('/tf_static', TF_TYPE, durability='transient_local', depth=1)
+    publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', AHEAD))
     for i in range(3, 12):
         # Nothing says when the node has taken the mounting in.
         play(publisher, drive[i:i + 1], first=i, pause=0.3)

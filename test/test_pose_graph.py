@@ -45,9 +45,10 @@ class Drive:
     """A source of images of cards; black ones and gaps in time as wanted."""
 
     image_topic, info_topic = '/image_rect', '/camera_info'
-    ground_truth_topic = speed_topic = None
+    ground_truth_topic = None
 
     def __init__(self, black=(), gaps=()):
+        self.beside = {}
         self._black, self._gaps = black, gaps
 
     def __len__(self):
@@ -81,7 +82,8 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def unscaled(tmp_path_factory):
-    return replayed(tmp_path_factory.mktemp('unknown') / 'results')
+    return replayed(tmp_path_factory.mktemp('unknown') / 'results',
+                    **{'odometry.scale': 'none'})
 
 
 def random_graph(seed, vertices=8):

@@ -124,7 +124,7 @@ def test_every_stamp_that_a_sender_may_send_can_be_sent_on(sec, nanosec):
 
 @given(poses(), poses())
 def test_poses_survive_their_messages(motion, pose):
-    made = Messages(message_type, OdometryConfig())
+    made = Messages(message_type, OdometryConfig(frame_convention='optical'))
     one = result(motion, pose)
     for message, expected in ((made.relative_pose(one), motion), (made.odometry(one), pose),
                               (made.pose_stamped(one), pose),

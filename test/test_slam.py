@@ -487,8 +487,8 @@ def closed(drive, tmp_path_factory):
 
 def test_the_command_closes_loops_of_a_recording(closed):
     said = json.loads((closed / 'slam.json').read_text())
-    assert (said['scale'], said['scale_known'], said['scale_uncertainty']) == (
-        'ground_truth', True, 0.05)
+    assert (said['scale'], said['scale_kind'], said['scale_uncertainty']) == (
+        'ground_truth', 'metric', 0.05)
     assert said['frames'] == 17
     assert said['keyframes'] == said['edges']['odometry'] + 1 >= 7
     assert said['edges']['loop'] >= 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids
@@ -22,8 +22,8 @@ from two_view import K, textured
 SIZE = (160, 120)
 
 
-def view(gray):
-    return TwoViewEstimator().view(gray, K)
+def view(gray, config=None):
+    return TwoViewEstimator(config).view(gray, K)
 
 
 def hills(shift=(0.0, 0.0), size=SIZE):
@@ -46,11 +46,10 @@ def pair():
 @pytest.mark.parametrize(('side', 'sigma'), [(3, 0.0), (5, 1.0), (7, 0.0), (7, 2.0)])
 def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_nearest_pixel(
         pair, side, sigma):
-    previous, current = pair
+    config = preset('paper', window=side, window_sigma=sigma)
+    previous, current = (view(one.gray, config) for one in pair)
     x, y = np.array([[60.4, 50.0], [90.0, 70.6]]), np.array([[64.2, 48.7], [88.0, 66.4]])
-    surface = DescriptorSurface(previous, current, x,
-                                EstimatorConfig(window=side, window_sigma=sigma,
-                                                grading=0.0, binary_tests=256))
+    surface = DescriptorSurface(previous, current, x, config)
     fitted = surface.around(y)
     assert fitted.usable.all()
     assert np.array_equal(fitted.centres, [[64, 49], [88, 66]])
@@ -71,11 +70,33 @@ def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_ne
         assert fitted.c[k] == pytest.approx(c, abs=1e-8)
 
 
-@pytest.mark.parametrize('snap', [True, False])
-def test_the_reference_point_is_where_its_descriptor_was_taken_or_as_printed(pair, snap):
+def test_the_reference_point_stays_between_pixels_though_its_descriptor_is_of_the_next_one(pair):
     x = np.array([[60.4, 50.0], [90.0, 70.6]])
-    surface = DescriptorSurface(*pair, x, EstimatorConfig(snap_reference=snap))
-    assert np.array_equal(surface.x, [[60, 50], [90, 71]] if snap else x)
+    image = textured(np.random.default_rng(33), SIZE)
+    for config, ahead in ((EstimatorConfig(), x - np.rint(x)), (preset('paper'), 0.0)):
+        surface = DescriptorSurface(view(image, config), view(image, config), x, config)
+        assert np.array_equal(surface.x, x)
+        # As printed, the part of a pixel is forgotten.
+        assert np.allclose(surface.around(x).centres, np.rint(x) + ahead)
+
+
+def test_references_between_pixels_have_their_minimum_nearer_to_where_the_image_went():
+    """By parts of a pixel, which a fit around whole pixels is drawn away from."""
+    # Without what lies between pixels: that does not move with an image.
+    still = cv2.GaussianBlur(textured(np.random.default_rng(39), (320, 240)), (0, 0), 1.0)
+    shift = np.array([3.375, -1.75])
+    moved = cv2.warpAffine(still, np.column_stack([np.eye(2), shift]), (320, 240),
+                           flags=cv2.INTER_LANCZOS4)
+    before, after = view(still), view(moved)
+    x = before.features.points
+    x = x[(np.abs(x - (160, 120)) < (110, 70)).all(1)]
+    surface = DescriptorSurface(before, after, x, EstimatorConfig())
+    errors, y, as_it_was = [], x + np.rint(shift), np.repeat(np.eye(2)[None], len(x), axis=0)
+    for warp in (None, as_it_was, as_it_was):
+        fitted, _ = with_minimum(surface.around(y, warp), 'project')
+        y = np.clip(fitted.minima(), y - 1, y + 1)
+        errors.append(np.median(np.linalg.norm(y - x - shift, axis=1)))
+    assert errors[2] < 0.7 * errors[0]
 
 
 def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
@@ -92,17 +113,22 @@ def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
     assert np.median(np.linalg.norm(y - x - shift, axis=1)) < 0.25
 
 
-def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(pair):
+@pytest.mark.parametrize('warped', [False, True])
+def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(pair, warped):
     rng = np.random.default_rng(34)
     x = rng.uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
+    warp = np.repeat(np.diag([1.1, 0.95])[None], 30, axis=0) if warped else None
     surface = DescriptorSurface(*pair, x, EstimatorConfig())
     y = x.copy()
+    surface.around(y)
     for _ in range(4):
         y = y + rng.normal(0, 1.0, y.shape) * (rng.uniform(size=(30, 1)) < 0.5)
-        asked = surface.around(y)
-        fresh = DescriptorSurface(*pair, x, EstimatorConfig()).around(y)
+        asked = surface.around(y, warp)
+        new = DescriptorSurface(*pair, x, EstimatorConfig())
+        new.around(x)  # the contrast is measured where matches are first seen
+        fresh = new.around(y, warp)
         for name in ('centres', 'A', 'b', 'c', 'usable'):
-            assert np.array_equal(getattr(asked, name), getattr(fresh, name)), name
+            assert np.allclose(getattr(asked, name), getattr(fresh, name), 1e-9), name
 
 
 WARPS = {'smaller': 0.85 * np.eye(2), 'larger': 1.2 * np.eye(2),
@@ -141,22 +167,25 @@ def test_patches_look_more_alike_where_the_reference_is_warped(kind, name):
     assert seen < plain
 
 
-def test_no_warp_changes_nothing(pair):
-    x = np.array([[60.4, 50.0], [90.0, 70.6]])
-    plain, same = (DescriptorSurface(*pair, x, EstimatorConfig()).around(x + 2.0, warp)
+def test_no_warp_changes_nothing_on_whole_pixels(pair):
+    x = np.array([[60.0, 50.0], [90.0, 71.0]])
+    config = EstimatorConfig(window=3, grading=0.0)
+    pair = [view(one.gray, config) for one in pair]
+    plain, same = (DescriptorSurface(*pair, x, config).around(x + 2.0, warp)
                    for warp in (None, np.repeat(np.eye(2)[None], 2, axis=0)))
     assert np.array_equal(plain.A, same.A) and np.array_equal(plain.c, same.c)
 
 
 @pytest.mark.parametrize('side', [3, 7])
 def test_points_without_descriptors_at_the_border_have_no_surface(pair, side):
-    margin, (width, height) = REACH + side // 2, SIZE
+    margin, (width, height) = REACH + side // 2, SIZE  # of the whole pattern
     x, y = np.full((8, 2), 60.0), np.full((8, 2), 60.0)
     y[1], y[2] = (margin, margin), (margin - 1, 60)
     y[3], y[4] = (width - 1 - margin, height - 1 - margin), (60, height - margin)
     y[5] = (-1e4, 1e4)
     x[6], x[7] = (REACH, height - 1 - REACH), (REACH - 1, 60)
-    surface = DescriptorSurface(*pair, x, EstimatorConfig(window=side))
+    config = EstimatorConfig(window=side, patch_scale=1.0)
+    surface = DescriptorSurface(*(view(one.gray, config) for one in pair), x, config)
     fitted = surface.around(y)
     assert fitted.usable.tolist() == [True, True, False, True, False, False, True, False]
     assert np.array_equal(fitted.centres, y)

@@ -8,7 +8,15 @@ from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Status
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
-from djet_ros.odometry.messages import frame_status, FrameStatus, pose_of, stamp_ns
+from djet_ros.odometry.messages import (
+    frame_status,
+    FrameStatus,
+    in_convention,
+    OPTICAL_TO_BODY,
+    pose_of,
+    stamp_ns,
+)
+from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.tracker import Tracker
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -72,7 +80,8 @@ def test_a_drive_gives_relative_poses_and_odometry_with_the_images_stamps(drive)
             assert stamp_ns(messages[topic].header) == ns(i * 0.1)
     position = out[3]['odometry'].pose.pose.position
     ahead = np.array([position.x, position.y, position.z]) / 3
-    direction = STEP[:3, 3] / np.linalg.norm(STEP[:3, 3])
+    # x forward, y left, z up
+    direction = OPTICAL_TO_BODY @ STEP[:3, 3] / np.linalg.norm(STEP[:3, 3])
     assert np.degrees(np.arccos(ahead @ direction / np.linalg.norm(ahead))) < 8
 
 
@@ -171,8 +180,9 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
     said = [frame_status(out['relative_pose_status']) for out in play(one, images)]
     stamps = [ns(0.1 * i) for i in range(len(images))]
     bad = Status.TOO_FEW_MATCHES
+    scales = {True: Scale.METRIC, False: Scale.UNKNOWN}
     assert said == [FrameStatus(stamps[i], status, None if start is None else stamps[start],
-                                known, stationary) for i, status, start, known, stationary in [
+                                scales[known], still) for i, status, start, known, still in [
         (0, Status.FIRST_FRAME, None, False, False),
         (1, Status.OK, 0, True, False),
         (2, Status.NO_PARALLAX, 1, True, True),
@@ -408,7 +418,8 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
         (1, 'bad pair: TOO_FEW_MATCHES'), (2, 'lost: TOO_FEW_MATCHES')]
     # the pose is held, and nobody is to believe in it or in a velocity
     for message in (o['odometry'] for o in out):
-        assert np.allclose(pose_of(message)[1], one.last.pose, rtol=0, atol=1e-12)
+        held = in_convention(one.last, 'body').pose
+        assert np.allclose(pose_of(message)[1], held, rtol=0, atol=1e-12)
         for covariance in (message.pose.covariance, message.twist.covariance):
             assert np.diag(np.reshape(covariance, (6, 6)))[:3].min() >= 9999
         assert message.twist.twist.linear.x == message.twist.twist.angular.y == 0
@@ -442,7 +453,7 @@ def test_a_transform_comes_on_demand(drive):
     assert all('/tf' not in out for out in play(tracker(), drive[:2]))
     out = play(tracker(**{'ros.publish_tf': True}), drive[:2])[1]
     transform = out['/tf'].transforms[0]
-    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera')
+    assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera_body')
     assert transform.transform.rotation == out['odometry'].pose.pose.orientation
 
 
@@ -462,6 +473,27 @@ def test_a_debug_image_shows_the_last_pair(drive):
     assert one.debug_image() is not None
 
 
+def test_landmarks_are_a_cloud_in_front_of_the_camera(drive):
+    one = tracker()
+    play(one, drive[:1])
+    assert one.landmarks() is None
+    play(one, drive[1:4], start=0.1)
+    topic, cloud = one.landmarks()
+    assert (topic, cloud.header.frame_id) == ('landmarks', one.last.frame_id)
+    assert stamp_ns(cloud.header) == one.last.stamp_ns
+    assert [field.name for field in cloud.fields] == ['x', 'y', 'z']
+    places = np.frombuffer(np.asarray(cloud.data).tobytes(), '<f4').reshape(cloud.width, 3)
+    assert cloud.row_step == 12 * cloud.width == len(cloud.data)
+    assert len(places) > 20
+    assert (places[:, 2] > 0).mean() > 0.9
+    serialised(cloud)
+    play(one, [np.zeros_like(drive[0])], start=0.5)
+    assert one.landmarks() is None
+    none = tracker(**{'odometry.scale': 'none'})
+    play(none, drive[:3])
+    assert none.landmarks() is None
+
+
 def test_speeds_give_the_length(drive):
     one = tracker(**{'odometry.scale': 'speed'})
     vector = message_type('geometry_msgs/msg/Vector3')
@@ -472,11 +504,11 @@ def test_speeds_give_the_length(drive):
             header=header(ns(i * 0.1)), twist=twist)
         one.speed(stamped)
         one.image(image(gray, stamp_ns=ns(i * 0.1)))
-    assert np.linalg.norm(one.last.motion[:3, 3]) == pytest.approx(0.5)
-    assert one.last.scale_known
+    assert np.linalg.norm(one.last.motion[:3, 3]) == pytest.approx(0.5, rel=0.02)
+    assert one.last.scale_kind is Scale.METRIC
     one.reset()
     play(one, drive[:2])
-    assert not one.last.scale_known
+    assert one.last.scale_kind is Scale.RELATIVE
 
 
 def test_faces_add_their_counts_and_values(drive):
@@ -565,7 +597,7 @@ def test_diagnostics_say_what_was_counted(drive):
     assert told.values['frames rejected: short_data'] == '1'
     assert told.values['status: OK'] == '4'
     assert told.values['rate (Hz)'] == '9.99'
-    assert told.values['scale'] == 'unknown'
+    assert told.values['scale'] == 'relative'
     assert int(told.values['inliers']) <= int(told.values['matches'])
     assert float(told.values['median residual (px)']) < 2
     assert 'time of matching (ms)' in told.values

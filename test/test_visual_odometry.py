@@ -15,6 +15,7 @@ from djet_ros.odometry.scale import (
     scale_source,
     SpeedScale,
     UnitScale,
+    Unmeasured,
 )
 from djet_ros.odometry.uncertainty import compose, motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
@@ -63,7 +64,7 @@ def test_poses_are_the_current_camera_in_the_first_and_in_the_previous_one(cards
 
 
 def test_without_a_scale_a_translation_has_length_one_and_says_that_it_is_no_metre(cards):
-    result = drive(odometry(), cards, [np.eye(4), STEP])[-1]
+    result = drive(odometry(UnitScale()), cards, [np.eye(4), STEP])[-1]
     assert np.linalg.norm(result.motion[:3, 3]) == pytest.approx(1)
     assert not result.scale_known
     along = unit(result.motion[:3, 3])
@@ -342,7 +343,8 @@ def test_ground_truth_is_interpolated_and_not_believed_across_holes():
 
 
 def test_the_configuration_names_the_scale():
-    assert isinstance(scale_source(OdometryConfig()), UnitScale)
+    assert isinstance(scale_source(OdometryConfig()), Unmeasured)
+    assert isinstance(scale_source(OdometryConfig(scale='none')), UnitScale)
     assert scale_source(OdometryConfig(scale='constant', scale_value=2)).between(0, 1).value == 2
     assert isinstance(scale_source(OdometryConfig(scale='speed')), SpeedScale)
     with pytest.raises(DjetError, match='no ground truth'):

@@ -1,0 +1,422 @@
+"""What comes beside the images: gyro, another odometry, masks; by messages, live and offline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import re
+from time import monotonic
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+import cv2
+from djet_ros.config.flat import from_flat
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import rotation_angle
+from djet_ros.core.masks import blocked
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError
+from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
+from djet_ros.live.session import Session
+from djet_ros.odometry.messages import MessageFactory
+from djet_ros.odometry.static_frames import StaticFrames
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.mask_files import still_mask
+import numpy as np
+import pytest
+from ros_messages import camera_info, header, image, message_type, serialised
+
+START, PERIOD = 50 * 10**9, 100_000_000
+MAKE = MessageFactory(message_type)
+IMU = {'odometry.imu': True, 'odometry.imu_rotation': '0.5 -0.5 0.5 0.5'}
+POSES = ('relative_pose', 'relative_pose_cov', 'relative_pose_status', 'odometry')
+
+
+def tracker(**values: Any) -> Tracker:
+    mask = values.pop('still', None)
+    one = Tracker(from_flat({'estimator.max_features': 500, **values}), message_type,
+                  image_topic='/camera/image_rect', still_mask=mask)
+    one.camera_info(camera_info(K, SIZE))
+    return one
+
+
+class Drive:
+    """A drive to and fro past cards, and what a gyro with the axes of a robot felt on it."""
+
+    def __init__(self, frames: int = 12, standing: int = 0) -> None:
+        cards, here, self.poses = Cards(), np.eye(4), []
+        self.images: list[Any] = []
+        for i in range(-standing, frames):
+            self.poses.append(here)
+            self.images.append(cards.gray(here, noise=i + 100))
+            if i >= 0:
+                way = 1 if i // 11 % 2 == 0 else -1
+                here = here @ pose(x=0.25 * way, z=0.15 * way, yaw=0.01 * np.sin(i))
+        self.felt: FeltMotion = feel(np.array(self.poses), 0.1, Mems(), 0)
+
+    def imu(self) -> list[Any]:
+        return [MAKE.imu(START + int(stamp), 'imu', rate, force) for stamp, rate, force in zip(
+            self.felt.stamps_ns, self.felt.rates, self.felt.accelerations, strict=True)]
+
+    def image(self, index: int, gray: Any = None) -> Any:
+        return image(self.images[index] if gray is None else gray,
+                     stamp_ns=START + index * PERIOD)
+
+    def turned(self, start: int, end: int) -> Array:
+        return np.asarray((np.linalg.inv(self.poses[start]) @ self.poses[end])[:3, :3])
+
+
+@pytest.fixture(scope='module')
+def drive() -> Drive:
+    return Drive()
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def played(one: Tracker, drive: Drive, imu: list[Any], black: tuple[int, ...] = ()) -> list[Any]:
+    """Play images with the samples up to them, and give what comes of them."""
+    waiting, outgoing = list(imu), []
+    for i in range(len(drive.images)):
+        while waiting and one.lacks(drive.image(i)):
+            one.imu(waiting.pop(0))
+        gray = np.zeros_like(drive.images[i]) if i in black else None
+        outgoing += one.image(drive.image(i, gray))
+    return outgoing
+
+
+def said(one: Tracker) -> dict[str, str]:
+    return {complaint.name: complaint.text for complaint in one.complaints}
+
+
+# Gyro
+
+def test_without_a_gyro_its_messages_change_nothing(drive: Drive) -> None:
+    with_them, without = tracker(), tracker()
+    heard = []
+    for one, messages in ((with_them, drive.imu()), (without, [])):
+        for message in messages:
+            one.imu(message)
+        heard.append([serialised(message.message) for message in played(one, drive, [])
+                      if message.topic in POSES])
+    assert heard[0] == heard[1]
+
+
+def test_orientation_goes_on_through_darkness() -> None:
+    """A camera that has stood for three seconds, drives off, and sees nothing for another two."""
+    drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
+    one = tracker(**IMU)
+    angles = {}
+    for i in range(len(drive.images)):
+        for message in drive.imu():
+            if START + (i - 1) * PERIOD < stamp_of(message) <= START + i * PERIOD:
+                one.imu(message)
+        one.image(drive.image(i, np.zeros_like(drive.images[i]) if i in dark else None))
+        assert one.last is not None
+        angles[i] = rotation_angle(drive.turned(0, i), one.last.pose[:3, :3])
+        if i in dark:
+            assert one.last.status.value.startswith('TOO_FEW')
+            off = angles[i]**2 / np.trace(one.last.pose_covariance[3:, 3:])
+            assert off < 9
+    assert max(angles.values()) < np.radians(0.5)
+    assert one.last is not None and one.last.status.value == 'OK'
+
+
+def test_without_a_gyro_orientation_is_not_known_after_darkness() -> None:
+    drive, one = Drive(), tracker()
+    for i in range(8):
+        one.image(drive.image(i, np.zeros_like(drive.images[i]) if i > 3 else None))
+    assert one.last is not None
+    assert np.sqrt(one.last.pose_covariance[3:, 3:].trace()) > 3
+
+
+def test_an_image_lacks_the_gyro_until_there_is_a_sample_at_its_stamp(drive: Drive) -> None:
+    one = tracker(**IMU)
+    samples = drive.imu()
+    assert one.lacks(drive.image(1)) == 'imu'
+    for message in samples[:20]:  # up to 95 ms
+        one.imu(message)
+    assert one.lacks(drive.image(1)) == 'imu'
+    one.imu(samples[20])
+    assert one.lacks(drive.image(1)) == ''
+
+
+@pytest.mark.parametrize(('what', 'name', 'text'), [
+    ('none', 'no imu in time', "asks for 'imu', and no sample has come; publish it"),
+    ('late', 'no imu in time', 'images were worked on without it'),
+    ('nan', 'gyro samples of no use', '241 of 241 samples|of .* samples: not a rate'),
+    ('unmounted', 'no mounting of imu', "where 'imu' is on 'camera'"),
+])
+def test_what_is_wrong_with_a_gyro_is_said_and_stalls_nothing(
+        drive: Drive, what: str, name: str, text: str) -> None:
+    one = tracker(**{**IMU, **({'odometry.imu_rotation': ''} if what == 'unmounted' else {})})
+    samples = drive.imu()
+    for i in range(len(drive.images)):
+        for message in samples:
+            late = 10 * PERIOD if what == 'late' else 0
+            if what != 'none' and START + (i - 1) * PERIOD < stamp_of(message) + late \
+                    <= START + i * PERIOD:
+                if what == 'nan':
+                    message.angular_velocity.y = float('nan')
+                one.imu(message)
+        one.image(drive.image(i))
+    assert one.counts.status['OK'] == len(drive.images) - 1
+    assert name in said(one)
+    assert re.search(text, said(one)[name])
+    assert one.diagnosis().level == 'WARN'
+
+
+def test_a_gyro_that_is_mounted_otherwise_is_said_and_not_gone_by() -> None:
+    long = Drive(frames=45)
+    one = tracker(**{**IMU, 'odometry.imu_rotation': '0 0 0 1'})
+    for message in long.imu():
+        # Something to be seen of which axis is which.
+        message.angular_velocity.x += 1.0
+        one.imu(message)
+    for i in range(len(long.images)):
+        one.image(long.image(i))
+    assert 'gyro does not fit' in said(one)
+    assert one.last is not None and one.last.status.value == 'OK'
+
+
+@pytest.mark.parametrize('text', ['1 0 0', '1 1 1 1', 'a b c d', 'nan 0 0 1'])
+def test_a_rotation_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(DjetError, match="imu_rotation is '.*'; give a quaternion"):
+        from_flat({'odometry.imu_rotation': text})
+
+
+# Live
+
+class Graph:
+    """Writes down what a session publishes; knows one frame."""
+
+    def __init__(self) -> None:
+        self.published: list[Any] = []
+        self.frames = StaticFrames()
+
+    def publish(self, outgoing: Any) -> None:
+        self.published += outgoing
+
+    def log(self, level: str, text: str) -> None:
+        pass
+
+    def why_silent(self, topic: str) -> str:
+        return ''
+
+    def wants(self, topic: str) -> bool:
+        return False
+
+    def transform(self, base: str, camera: str) -> Array | None:
+        return self.frames.transform(base, camera)
+
+
+@pytest.fixture
+def live() -> Iterator[Callable[..., tuple[Session, Tracker, Graph]]]:
+    sessions = []
+
+    def start(**values: Any) -> tuple[Session, Tracker, Graph]:
+        graph, one = Graph(), Tracker(
+            from_flat({'estimator.max_features': 500, 'ros.queue_policy': 'every',
+                       'ros.queue_size': 100, **values}), message_type,
+            image_topic='/camera/image_rect')
+        session = Session(one, graph, {'image': '/i', 'camera_info': '/c'})
+        session.camera_info(camera_info(K, SIZE))
+        session.start()
+        sessions.append(session)
+        return session, one, graph
+
+    yield start
+    for session in sessions:
+        session.stop(10)
+
+
+def wait_for(one: Tracker, images: int) -> None:
+    end = monotonic() + 30
+    while one.counts.received < images:
+        assert monotonic() < end
+
+
+def mounting(drive: Drive) -> Any:
+    where = np.eye(4)
+    where[:3, :3] = drive.felt.to_camera
+    return MAKE.frame(0, 'camera', 'imu', where)
+
+
+@pytest.mark.parametrize('order', ['before', 'after'])
+def test_live_gives_the_poses_of_the_tracker_to_the_last_bit(
+        live: Any, drive: Drive, order: str) -> None:
+    """Whether the samples come before their images, or a little after them."""
+    expected = played(tracker(**IMU), drive, drive.imu())
+    session, one, graph = live(**{'odometry.imu': True})
+    graph.frames.add(mounting(drive))
+    samples = drive.imu()
+    for i in range(len(drive.images)):
+        part = [message for message in samples
+                if START + (i - 1) * PERIOD < stamp_of(message) <= START + i * PERIOD]
+        if order == 'after':
+            session.image(drive.image(i))
+        for message in part:
+            session.imu(message)
+        if order == 'before':
+            session.image(drive.image(i))
+    wait_for(one, len(drive.images))
+    session.configure(one.config)  # let in when the last image is published
+    assert [serialised(message.message) for message in graph.published
+            if message.topic in POSES] == [serialised(message.message) for message in expected
+                                           if message.topic in POSES]
+
+
+def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Drive) -> None:
+    session, one, _ = live(**IMU)
+    start = monotonic()
+    session.image(drive.image(0))
+    session.image(drive.image(1))
+    end = monotonic() + 30
+    while one.counts.processed < 2:
+        assert monotonic() < end
+    assert monotonic() - start < 3
+
+
+# Masks
+
+def test_masked_pixels_give_no_feature_and_no_surface(drive: Drive) -> None:
+    left_out = np.zeros(SIZE[::-1], bool)
+    left_out[:, :150] = True
+    estimator = TwoViewEstimator()
+    views = [estimator.view(gray, K, left_out=left_out) for gray in drive.images[:2]]
+    assert min(view.features.points[:, 0].min() for view in views) > 150 + 12
+    found = estimator.estimate(*views)
+    assert found.inliers.sum() > 50
+    assert found.y_opt[found.inliers, 0].min() > 150 + 10
+    orb = TwoViewEstimator(from_flat({'estimator.detector': 'orb'}).estimator)
+    assert orb.view(drive.images[0], K, left_out=left_out).features.points[:, 0].min() > 150
+
+
+def test_a_single_pixel_blocks_the_patches_around_it() -> None:
+    left_out = np.zeros((60, 80), bool)
+    left_out[30, 40] = True
+    rows, columns = np.nonzero(blocked(left_out))
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (17, 43, 27, 53)
+
+
+@pytest.mark.parametrize('kind', ['file', 'topic'])
+def test_what_is_masked_does_not_matter(drive: Drive, kind: str) -> None:
+    """The left half sticks to the camera, as its own bonnet would, or is as it was."""
+    stuck = np.random.default_rng(0).integers(0, 256, (SIZE[1], 160), np.uint8)
+    stuck = cv2.GaussianBlur(stuck, (0, 0), 1.5)
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, :160] = 0
+    values: dict[str, Any] = {'still': mask < 128} if kind == 'file' else {'odometry.mask': True}
+    masked, clean = tracker(**values), tracker(**values)
+    for i, gray in enumerate(drive.images):
+        shown = gray.copy()
+        shown[:, :160] = stuck
+        for one, pixels in ((masked, shown), (clean, gray)):
+            if kind == 'topic':
+                assert one.lacks(drive.image(i)) == 'mask'
+                one.mask(drive.image(i, mask))
+            assert one.lacks(drive.image(i)) == ''
+            one.image(drive.image(i, pixels))
+        assert masked.last is not None and clean.last is not None
+        if masked.last.relative is not None and clean.last.relative is not None:
+            seen, shared = (set(map(tuple, one.last.relative.x.round(1)))
+                            for one in (masked, clean))
+            assert len(seen & shared) > 0.9 * len(shared)
+            assert min(x for x, _ in seen) > 160 + 12
+    assert not masked.last.stationary
+
+
+def test_a_mask_of_another_size_is_an_error_and_not_forgotten(drive: Drive) -> None:
+    one = tracker(still=np.zeros((10, 10), bool))
+    one.image(drive.image(0))
+    assert one.counts.rejected == {'mask_size': 1}
+    assert 'odometry.mask_file has 10x10 pixels, the image 320x240' in str(one.problem)
+
+
+def test_a_mask_file_is_read_and_one_that_is_none_is_named(tmp_path: Path) -> None:
+    assert still_mask('') is None
+    gray = np.full((40, 60), 255, np.uint8)
+    gray[20:] = 0
+    cv2.imwrite(str(tmp_path / 'mask.png'), gray)
+    mask = still_mask(str(tmp_path / 'mask.png'))
+    assert mask is not None and mask[20:].all() and not mask[:20].any()
+    with pytest.raises(DjetError, match='could not be read'):
+        still_mask(str(tmp_path / 'nowhere.png'))
+
+
+def test_masks_are_undistorted_with_their_images() -> None:
+    one = Tracker(from_flat({}), message_type, image_topic='/camera/image_raw')
+    one.camera_info(camera_info(K, SIZE, d=np.array([-0.3, 0.1, 0.0, 0.0, 0.0])))
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, :60] = 0
+    one.mask(image(mask, stamp_ns=START))
+    assert one._camera is not None
+    left_out = one._beside.left_out(START, mask.shape, one._camera)
+    assert left_out is not None
+    # The edge of a barrel image is pulled in at its middle less than at its corners.
+    ends = [int(np.flatnonzero(row)[-1]) for row in left_out[[0, 119]]]
+    assert ends[0] != ends[1]
+
+
+# Another odometry
+
+def odometry(drive: Drive, index: int, T: Array, frame: str = 'base_link') -> Any:
+    """Word the true pose of a base that carries the camera at T (4, 4)."""
+    base = T @ drive.poses[index] @ np.linalg.inv(T)
+    stamped = MAKE.pose_in(START + index * PERIOD, 'wheels', base)
+    with_covariance = message_type('geometry_msgs/msg/PoseWithCovariance')
+    nothing = message_type('geometry_msgs/msg/Vector3')(x=0.0, y=0.0, z=0.0)
+    return message_type('nav_msgs/msg/Odometry')(
+        header=header(START + index * PERIOD, 'wheels'), child_frame_id=frame,
+        pose=with_covariance(pose=stamped.pose, covariance=np.zeros(36)),
+        twist=message_type('geometry_msgs/msg/TwistWithCovariance')(
+            twist=message_type('geometry_msgs/msg/Twist')(linear=nothing, angular=nothing),
+            covariance=np.zeros(36)))
+
+
+def test_another_odometry_gives_the_length_through_its_mounting(drive: Drive) -> None:
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T[:3, 3] = 1.2, 0.1, 0.8
+    one = tracker(**{'odometry.scale': 'guess'})
+    one.guess(odometry(drive, 0, T))
+    assert one.wanted_mountings('camera') == {'guess': ('base_link', 'camera')}
+    one.mount_beside('guess', T)
+    for i in range(len(drive.images)):
+        one.guess(odometry(drive, i, T))
+        assert one.lacks(drive.image(i)) == ''
+        one.image(drive.image(i))
+        if i:
+            assert one.last is not None and one.last.scale_known
+            true = np.linalg.norm(drive.poses[i][:3, 3] - drive.poses[i - 1][:3, 3])
+            # Weighed with what landmarks tell of the lengths.
+            assert one.last.scale == pytest.approx(true, rel=0.01)
+
+
+def test_a_guess_finds_what_is_too_far_to_be_sought() -> None:
+    """Frames 0.35 rad apart: half of the image is gone, and the rest is elsewhere."""
+    cards = Cards()
+    far = Drive(frames=3)
+    far.poses = [np.eye(4), pose(x=0.4, z=0.1, yaw=0.35), pose(x=0.8, z=0.2, yaw=0.0)]
+    far.images = [cards.gray(one) for one in far.poses]
+    one = tracker(**{'odometry.guess': True, 'estimator.search_radius': 0.05})
+    one.guess(odometry(far, 0, np.eye(4), 'camera'))
+    one.mount_beside('guess', np.eye(4))
+    for i in range(3):
+        one.guess(odometry(far, i, np.eye(4), 'camera'))
+        one.image(far.image(i))
+        if i:
+            assert one.last is not None and one.last.status.value == 'OK'
+            assert rotation_angle(one.last.motion[:3, :3], far.turned(i - 1, i)) < np.radians(0.2)
+
+
+def test_static_frames_are_chained_in_both_directions() -> None:
+    frames = StaticFrames()
+    a, b = pose(x=1.0, yaw=0.3), pose(z=2.0, yaw=-0.2)
+    frames.add(MAKE.frame(0, 'base_link', 'mast', a))
+    frames.add(MAKE.frame(0, '/mast', 'imu', b))
+    assert np.allclose(frames.transform('base_link', 'imu'), a @ b)
+    assert np.allclose(frames.transform('imu', 'base_link'), np.linalg.inv(a @ b))
+    assert frames.transform('base_link', 'camera') is None
+    assert np.array_equal(frames.transform('imu', 'imu'), np.eye(4))

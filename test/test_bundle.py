@@ -1,0 +1,111 @@
+"""Least squares over frames and landmarks: exact data is reproduced, and eliminated exactly."""
+
+from dataclasses import replace
+
+from djet_ros.core.bundle import eliminate, in_frame, Landmarks, linearise, Poses, projected
+from djet_ros.core.geometry import rotation_exp
+import numpy as np
+import pytest
+
+K = np.array([[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
+
+
+def scene(rng, frames=4, landmarks=40):
+    """Poses of a camera that drives and turns, and landmarks that it sees exactly."""
+    poses = Poses(
+        np.array([rotation_exp(np.array([0.01, 0.03, -0.02]) * f) for f in range(frames)]),
+        np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None])
+    found = Landmarks.at(rng.integers((100, 80), (540, 400), (landmarks, 2)),
+                         1 / rng.uniform(4, 20, landmarks), 0, frames)
+    found.anchors[landmarks // 2:] = 1
+    for frame in range(frames):
+        found.minima[:, frame] = projected(K, in_frame(K, poses, found, frame))
+        later = found.anchors < frame
+        found.seen[later, frame] = True
+        A = rng.normal(size=(landmarks, 2, 2))
+        found.roots[:, frame] = A + 2 * np.eye(2)
+    return poses, found
+
+
+def test_a_landmark_is_seen_where_its_point_in_space_is_projected():
+    poses, landmarks = scene(np.random.default_rng(0))
+    for n in (0, 39):
+        anchor = landmarks.anchors[n]
+        ray = np.linalg.inv(K) @ [*landmarks.points[n], 1]
+        world = poses.R[anchor].T @ (ray / landmarks.rho[n] - poses.t[anchor])
+        here = poses.R[3] @ world + poses.t[3]
+        assert projected(K, in_frame(K, poses, landmarks, 3))[n] == pytest.approx(
+            (K @ here)[:2] / here[2])
+
+
+def test_exact_observations_leave_no_residual():
+    poses, landmarks = scene(np.random.default_rng(1))
+    assert np.abs(linearise(K, poses, landmarks).residuals).max() < 1e-9
+
+
+def test_jacobians_are_those_of_small_steps():
+    poses, landmarks = scene(np.random.default_rng(2))
+    landmarks.minima += 3.0
+    linear = linearise(K, poses, landmarks)
+    step = np.random.default_rng(3).normal(size=(4, 6)) * 1e-6
+    depths = np.random.default_rng(4).normal(size=40) * 1e-7
+    expected = (np.einsum('nij,nj->ni', linear.by_frame, step[linear.frame])
+                + np.einsum('nij,nj->ni', linear.by_anchor, step[linear.anchor])
+                + linear.by_rho * depths[linear.landmark, None])
+    ahead, back = (linearise(K, poses.moved(sign * step.ravel()), replace(
+        landmarks, rho=landmarks.rho + sign * depths)).residuals for sign in (1, -1))
+    assert (ahead - back) / 2 == pytest.approx(expected, rel=1e-5, abs=1e-9)
+
+
+def test_steps_undo_one_another():
+    poses, _ = scene(np.random.default_rng(5))
+    step = np.random.default_rng(6).normal(size=24) * 0.05
+    assert poses.moved(step).step_from(poses) == pytest.approx(step, abs=1e-12)
+
+
+def test_elimination_solves_the_same_equations_as_all_at_once():
+    poses, landmarks = scene(np.random.default_rng(7))
+    landmarks.minima += np.random.default_rng(8).normal(size=landmarks.minima.shape)
+    linear = linearise(K, poses, landmarks)
+    weights = np.random.default_rng(9).uniform(0.5, 2, len(linear.residuals))
+    J = np.zeros((len(weights), 2, 24 + 40))
+    for n, (landmark, frame, anchor) in enumerate(
+            zip(linear.landmark, linear.frame, linear.anchor)):
+        J[n, :, 6 * frame:6 * frame + 6] += linear.by_frame[n]
+        J[n, :, 6 * anchor:6 * anchor + 6] += linear.by_anchor[n]
+        J[n, :, 24 + landmark] = linear.by_rho[n]
+    W = np.repeat(weights, 2)[:, None]
+    J = J.reshape(-1, 64)
+    # The seven freedoms of the whole are held by a little information about each pose.
+    held = np.diag([*[1.0] * 24, *[0.0] * 40])
+    whole = -np.linalg.solve((J * W).T @ J + held, (J * W).T @ linear.residuals.ravel())
+    reduced = eliminate(linear, weights, 4, 40)
+    step = -np.linalg.solve(reduced.H + np.eye(24), reduced.g)
+    assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
+    assert reduced.depth_change(step) == pytest.approx(whole[24:], rel=1e-4, abs=1e-7)
+
+
+def test_noise_free_landmarks_bring_poses_and_depths_back():
+    poses, landmarks = scene(np.random.default_rng(10))
+    rng = np.random.default_rng(11)
+    wrong = poses.moved(rng.normal(size=24) * [*[0.0] * 12, *[0.01] * 12])
+    guessed = replace(landmarks, rho=landmarks.rho * rng.uniform(0.8, 1.2, 40))
+    # The first two poses hold where all is, and how large.
+    held = np.diag([*[1e12] * 12, *[0.0] * 12])
+    for _ in range(8):
+        linear = linearise(K, wrong, guessed)
+        reduced = eliminate(linear, np.ones(len(linear.residuals)), 4, 40)
+        step = -np.linalg.solve(reduced.H + held, reduced.g)
+        wrong = wrong.moved(step)
+        guessed = replace(guessed, rho=guessed.rho + reduced.depth_change(step))
+    assert np.abs(wrong.step_from(poses)).max() < 1e-6
+    assert guessed.rho == pytest.approx(landmarks.rho, rel=1e-5)
+
+
+def test_a_frame_takes_the_landmarks_that_are_anchored_in_it_along():
+    _, landmarks = scene(np.random.default_rng(12))
+    left = landmarks.without_frame(0)
+    assert len(left) == 20
+    assert not left.anchors.any()
+    assert np.array_equal(left.minima, landmarks.minima[20:, 1:])
+    assert landmarks.with_frame().seen.shape == (40, 5)

@@ -1,0 +1,107 @@
+"""Covariances against errors: what shares mean, and the command that shows them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.lab.coverage import (
+    Coverage,
+    coverage_rows,
+    LEVELS,
+    normalised_square,
+    share_with_bounds,
+)
+from djet_ros.odometry.visual_odometry import camera_motion
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+
+def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
+    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
+    return subprocess.run([sys.executable, '-c', code, 'lab', 'coverage', *map(str, arguments)],
+                          capture_output=True, text=True, timeout=300, check=False)
+
+
+def record(square: float = 1.0, failed: bool = False, claims: tuple[float, float] = (0.1, 1.0),
+           status: Status = Status.OK, scene: str = 'road') -> Coverage:
+    return Coverage(scene, f'{scene}-1', 'alone', 4, 5, status.value, failed, 2.0, 20.0, *claims,
+                    square, 100, 90)
+
+
+def test_errors_drawn_from_the_covariance_lie_inside_as_often_as_claimed() -> None:
+    rng = np.random.default_rng(0)
+    R, t = rotation_exp(rng.normal(size=3)), unit(rng.normal(size=3))
+    true_motion = camera_motion(RelativePose(Status.OK, R, t), 3.0)
+    A = rng.normal(size=(5, 5)) * 1e-3
+    squares = []
+    for error in rng.multivariate_normal(np.zeros(5), A @ A.T, 2000):
+        pose = RelativePose(Status.OK, rotation_exp(error[:3]) @ R,
+                            unit(t + sphere_tangents(t) @ error[3:]), covariance_5=A @ A.T)
+        squares.append(normalised_square(pose, true_motion))
+    row, = coverage_rows([record(square) for square in squares])
+    for level, (_, least, most) in zip(LEVELS, row.inside):
+        # 95 % bounds, five times: wider by half is enough for all of them
+        assert least - (most - least) / 4 < level < most + (most - least) / 4
+    assert row.median == pytest.approx(1, abs=0.1)
+
+
+def test_the_bounds_of_a_share_hold_it_with_the_confidence_that_they_claim() -> None:
+    tries = 60
+    for true in (0.02, 0.5, 0.95):
+        hits = np.arange(tries + 1)
+        bounds = [share_with_bounds(int(one), tries) for one in hits]
+        held = [least <= true <= most for _, least, most in bounds]
+        assert binom.pmf(hits, tries, true)[held].sum() >= 0.95
+
+
+def test_only_what_is_wrong_and_claims_to_be_exact_is_both() -> None:
+    assert record(failed=True).wrong_and_sure
+    for humble in (record(failed=False), record(failed=True, claims=(0.5, 1.0)),
+                   record(failed=True, claims=(0.1, 5.0)),
+                   record(failed=True, status=Status.DEGENERATE),
+                   record(failed=True, status=Status.NO_PARALLAX)):
+        assert not humble.wrong_and_sure
+
+
+def test_pairs_are_summed_up_by_scene() -> None:
+    rows = coverage_rows([record(), record(scene='indoor', square=30.0, failed=True),
+                          record(scene='indoor', status=Status.DEGENERATE),
+                          record(scene='indoor', status=Status.NO_PARALLAX)])
+    assert [(row.scene, row.pairs, row.told, row.given_up, row.needlessly, row.wrong_and_sure)
+            for row in rows] == [('road', 1, 1, 0, 0, 0), ('indoor', 3, 1, 1, 1, 1)]
+    assert rows[1].inside[-1][0] == 0
+
+
+def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path) -> None:
+    command = ('--scenes', 'road', '--seeds', '1', '--frames', 4, '--output', tmp_path,
+               '--workers', 1)
+    answer = djet(*command)
+    assert answer.returncode == 0, answer.stderr
+    alone, in_a_row = json.loads((tmp_path / 'coverage.json').read_text())['rows']
+    assert (alone['start'], in_a_row['start']) == ('alone', 'in a row')
+    assert alone['pairs'] == in_a_row['pairs'] == 3
+    assert alone['told'] == 3 and alone['wrong_and_sure'] == 0
+    assert (tmp_path / 'reliability.png').read_bytes().startswith(b'\x89PNG')
+    records = (tmp_path / 'records.jsonl').read_bytes()
+    image = next(tmp_path.glob('scenes/*/sequences/*/image_0/000001.png'))
+    before = image.stat().st_mtime_ns
+    assert djet(*command).stdout == answer.stdout
+    assert (tmp_path / 'records.jsonl').read_bytes() == records
+    assert image.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    ((), 'nothing to measure'), (('--scenes', 'moon'), "'moon'"),
+    (('--scenes', 'road', '--seeds', 'x'), "'x'"),
+    (('--scenes', 'road', '--frames', 1), '--frames 1'), (('nowhere',), 'nowhere')])
+def test_what_can_be_mended_is_one_line_and_exit_code_2(
+        tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+    answer = djet(*arguments, '--output', tmp_path)
+    assert answer.returncode == 2
+    assert said in answer.stderr and answer.stderr.count('\n') == 1

@@ -1,0 +1,312 @@
+"""Layouts as they are downloaded: OpenCV's YAML, JPEG, TUM-VI, 7-Scenes, KITTI raw, and IMUs."""
+
+from pathlib import Path
+import shutil
+
+import cv2
+from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.datasets import euroc, open_sequence, seven_scenes, tum_rgbd
+from djet_ros.recordings.kitti_raw import clock_nanoseconds
+from djet_ros.recordings.recording import open_recording
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+STAMPS = [1403636579763555584 + i * 50_000_000 for i in range(4)]
+SIZE = (160, 120)
+NOISE = cv2.GaussianBlur(
+    np.random.default_rng(4).integers(0, 256, SIZE[::-1], dtype=np.uint8), (0, 0), 2)
+# The camera sees along the body's x axis; the IMU's axes are the body's, turned about z.
+CAMERA_IN_BODY = np.array([[0, 0, 1, 0.1], [-1, 0, 0, 0.2], [0, -1, 0, 0.3], [0, 0, 0, 1.0]])
+IMU_IN_BODY = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+OPENCV = f"""\
+%YAML:1.0
+---
+sensor_type: camera
+T_BS: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: d
+   data: {CAMERA_IN_BODY.ravel().tolist()}
+intrinsics: [110.0, 109.0, 80.0, 60.0]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 0.00002]
+"""
+
+KALIBR = f"""\
+cam0:
+  T_cam_imu: {np.linalg.inv(CAMERA_IN_BODY).tolist()}
+  camera_model: pinhole
+  distortion_coeffs: [0.0034, 0.0007, -0.0020, 0.0002]
+  distortion_model: equidistant
+  intrinsics: [60.0, 60.5, 79.0, 59.0]
+  resolution: [160, 120]
+"""
+
+
+@pytest.fixture
+def asl(tmp_path: Path) -> Path:
+    """Give an EuRoC folder with an IMU at 100 Hz that turns by 0.1, 0.2 and 0.3 rad/s."""
+    folder = tmp_path / 'MH_02'
+    camera, imu = folder / 'mav0' / 'cam0', folder / 'mav0' / 'imu0'
+    (camera / 'data').mkdir(parents=True)
+    imu.mkdir()
+    (camera / 'sensor.yaml').write_text(OPENCV)
+    (camera / 'data.csv').write_text('#timestamp [ns],filename\n' + ''.join(
+        f'{stamp},{stamp}.png\n' for stamp in STAMPS))
+    for stamp in STAMPS:
+        cv2.imwrite(str(camera / 'data' / f'{stamp}.png'), NOISE)
+    (imu / 'sensor.yaml').write_text(
+        f'%YAML:1.0\nsensor_type: imu\nT_BS: {{data: {IMU_IN_BODY.ravel().tolist()}}}\n')
+    (imu / 'data.csv').write_text('#timestamp [ns],w_RS_S_x [rad s^-1],...\n' + ''.join(
+        f'{STAMPS[0] + (i - 3) * 10_000_000 + 1},0.1,0.2,0.3,9.8,0,0\n' for i in range(25)))
+    return folder
+
+
+# EuRoC and TUM-VI
+
+def test_opencvs_yaml_is_read_as_what_it_says(asl: Path) -> None:
+    sequence = euroc(asl)
+    assert sequence.K.tolist() == [[110.0, 0, 80], [0, 109, 60], [0, 0, 1]]
+    assert sequence.distortion.tolist() == [-0.28, 0.07, 0.0002, 0.00002, 0]
+
+
+@pytest.mark.parametrize('header', ['%YAML:1.0', '%YAML:1.0\n', '%YAML:1.0\n---\n', '%YAML',
+                                    '%YAML:1.0\n---\nT_BS: !!opencv-matrix', '%YAML 9.9\n---\n',
+                                    '%YAML:1.0\n---\nT_BS: !!opencv-matrix [1, 2]\n'])
+def test_a_cut_or_odd_header_is_one_line(asl: Path, header: str) -> None:
+    path = asl / 'mav0' / 'cam0' / 'sensor.yaml'
+    path.write_text(header)
+    with pytest.raises(DjetError, match='sensor.yaml') as caught:
+        euroc(asl)
+    assert '\n' not in str(caught.value)
+
+
+def test_what_the_imu_felt_is_turned_to_the_camera(asl: Path) -> None:
+    imu = euroc(asl).imu
+    assert imu is not None
+    assert len(imu.stamps_ns) == 25
+    assert imu.stamps_ns[0] == STAMPS[0] - 29_999_999
+    # To the body by a quarter turn about z, and to the camera: x right is -y, y down is -z.
+    assert np.allclose(imu.to_camera @ imu.rates[0], [-0.1, -0.3, -0.2])
+
+
+def test_samples_come_before_the_image_up_to_the_first_one_after_it(asl: Path) -> None:
+    with open_recording(asl, beside={'imu': None}) as recording:
+        said = list(recording.messages())
+    images = [i for i, one in enumerate(said) if one.topic == recording.image_topic]
+    for number, place in enumerate(images):
+        felt = [stamp_ns(one.message.header) for one in said[:place]
+                if one.topic == recording.beside['imu']]
+        assert felt[-2] < STAMPS[number] <= felt[-1]
+    assert said[0].topic == recording.beside['frames']
+
+
+def test_nothing_of_the_imu_comes_unless_it_is_wanted(asl: Path) -> None:
+    with open_recording(asl) as recording:
+        assert recording.beside == {}
+        assert {one.message.__msgtype__ for one in recording.messages()} == {
+            'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'}
+
+
+def test_a_folder_without_an_imu_says_so(asl: Path) -> None:
+    shutil.rmtree(asl / 'mav0' / 'imu0')
+    with pytest.raises(DjetError, match='holds nothing of an IMU'):
+        open_recording(asl, beside={'imu': None})
+
+
+def test_a_bag_of_a_folder_holds_its_imu_and_how_it_is_mounted(asl: Path) -> None:
+    write_kitti_bag(euroc(asl), asl / 'bag')
+    with open_recording(asl / 'bag', beside={'imu': None}) as recording:
+        assert recording.beside == {'imu': '/imu/data_raw', 'frames': '/tf_static'}
+    with open_recording(asl, beside={'imu': None}) as folder, Bag(asl / 'bag') as bag:
+        rates = [[one.message.angular_velocity.x, stamp_ns(one.message.header)]
+                 for one in folder.messages() if one.topic == '/imu/data_raw']
+        assert rates == [[one.message.angular_velocity.x, stamp_ns(one.message.header)]
+                         for one in bag.messages({'/imu/data_raw'})]
+        assert len(list(bag.messages({'/tf_static'}))) == 2
+
+
+@pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
+    ('imu0/data.csv', ',0.1,', ',nan,', 'not a finite number'),
+    ('imu0/data.csv', ',0.1,0.2', ',0.1', 'has 6 numbers'),
+    ('imu0/sensor.yaml', 'T_BS', 'S_BT', 'no ASL sensor description'),
+    ('imu0/sensor.yaml', '[0.0, -1.0', '[5.0, -1.0', 'no rigid motion'),
+])
+def test_a_wrong_imu_is_named(asl: Path, file: str, old: str, new: str, said: str) -> None:
+    path = asl / 'mav0' / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(DjetError, match=said):
+        euroc(asl)
+
+
+def test_tum_vi_has_its_camera_from_kalibr_and_its_truth_from_mocap(asl: Path) -> None:
+    (asl / 'dso').mkdir()
+    (asl / 'dso' / 'camchain.yaml').write_text(KALIBR)
+    (asl / 'mav0' / 'cam0' / 'sensor.yaml').unlink()
+    (asl / 'mav0' / 'mocap0').mkdir()
+    (asl / 'mav0' / 'mocap0' / 'data.csv').write_text('#timestamp [ns], p_RS_R_x [m], ...\n' + (
+        ''.join(f'{STAMPS[0] + i * 8_000_000},{i * 0.008},7,8,1,0,0,0\n' for i in range(30))))
+    sequence = euroc(asl)
+    assert (sequence.model, len(sequence.distortion)) == ('equidistant', 4)
+    assert sequence.poses is not None
+    assert np.allclose(sequence.poses[3][:3, 3], [0, 0, 0.15], atol=1e-9)
+    # The image is that of a pinhole: a ray of 30 degrees is seen at f tan 30.
+    theta = np.radians(30)
+    seen = 60.0 * theta * (1 + 0.0034 * theta**2 + 0.0007 * theta**4 - 0.0020 * theta**6
+                           + 0.0002 * theta**8)
+    spot = np.zeros(SIZE[::-1], np.uint8)
+    cv2.circle(spot, (round(79 + seen), 59), 3, 255, -1)
+    cv2.imwrite(str(asl / 'mav0' / 'cam0' / 'data' / f'{STAMPS[0]}.png'), spot)
+    columns = sequence.image(0).astype(float).sum(0)
+    assert np.average(np.arange(SIZE[0]), weights=columns) == pytest.approx(
+        79 + 60 * np.tan(theta), abs=0.7)
+    (asl / 'dso' / 'camchain.yaml').write_text(KALIBR.replace('T_cam_imu', 'T_imu_cam'))
+    with pytest.raises(DjetError, match=r'no camera chain of Kalibr \(cam0'):
+        euroc(asl)
+
+
+# TUM-like folders and 7-Scenes
+
+def test_jpeg_images_are_read_where_png_are(tmp_path: Path) -> None:
+    folder = tmp_path / 'phone'
+    (folder / 'rgb').mkdir(parents=True)
+    for i in range(3):
+        cv2.imwrite(str(folder / 'rgb' / f'{i}.jpg'), NOISE, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    (folder / 'rgb.txt').write_text(''.join(f'{1 + i}.5 rgb/{i}.jpg\n' for i in range(3)))
+    (folder / 'calibration.txt').write_text('100 101 80 60')
+    sequence = tum_rgbd(folder)
+    assert sequence.size == SIZE
+    assert np.abs(sequence.image(1).astype(int) - NOISE).max() <= 2
+    whole = (folder / 'rgb' / '1.jpg').read_bytes()
+    (folder / 'rgb' / '1.jpg').write_bytes(whole[:len(whole) // 2])
+    with pytest.raises(DjetError, match=r'1.jpg is a damaged image \(JPEG image of \d+ bytes is'):
+        tum_rgbd(folder).image(1)
+    (folder / 'rgb' / '1.jpg').write_bytes(whole[:30])
+    with pytest.raises(DjetError, match='1.jpg: JPEG image has no header'):
+        tum_rgbd(folder)
+
+
+def seven_scenes_folder(folder: Path, suffix: str) -> Path:
+    folder.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(folder / f'frame-{i:06d}.color.{suffix}'), NOISE)
+        pose = np.eye(4)
+        pose[:3, 3] = 2 + 0.1 * i, 1, 0
+        np.savetxt(folder / f'frame-{i:06d}.pose.txt', pose)
+    return folder
+
+
+@pytest.mark.parametrize('suffix', ['png', 'jpg'])
+def test_7_scenes_is_read_as_it_is(tmp_path: Path, suffix: str) -> None:
+    sequence = open_sequence(seven_scenes_folder(tmp_path / 'seq-01', suffix))
+    assert sequence.K.tolist() == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
+    assert sequence.poses is not None
+    assert np.allclose(sequence.poses[:, :3, 3], [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+    assert np.diff(sequence.stamps_ns).tolist() == [33_333_333] * 2
+
+
+def test_a_pose_of_7_scenes_that_is_none_is_named(tmp_path: Path) -> None:
+    folder = seven_scenes_folder(tmp_path / 'seq-01', 'png')
+    (folder / 'frame-000001.pose.txt').write_text('1 0 0 0\n')
+    with pytest.raises(DjetError, match='has 1 rows, a pose has 4'):
+        seven_scenes(folder)
+
+
+# KITTI raw
+
+P_RECT = [50.0, 0, 80, 0, 0, 50, 60, 0, 0, 0, 1, 0]
+CALIBRATION = {
+    'calib_cam_to_cam.txt': (
+        'calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.95e-02\nS_00: 200 150\n'
+        'K_00: 70 0 100 0 70 75 0 0 1\nD_00: -0.3 0.1 0 0 0\nS_rect_00: 160 120\n'
+        f'R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_00: {" ".join(map(str, P_RECT))}\n'),
+    # x of the scanner and of the unit is ahead, which is the camera's z.
+    'calib_velo_to_cam.txt': 'R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.3\ndelta_f: 0 0\n',
+    'calib_imu_to_velo.txt': 'R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n',
+}
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Give a drive that goes east at 10 m/s, level, and turns left by 0.1 rad/s."""
+    drive = tmp_path / '2011_09_26' / '2011_09_26_drive_0001_sync'
+    (drive / 'image_00' / 'data').mkdir(parents=True)
+    (drive / 'oxts' / 'data').mkdir(parents=True)
+    for name, text in CALIBRATION.items():
+        (drive.parent / name).write_text(text)
+    clock = [f'2011-09-26 13:02:25.{9 - 5 + i}64389445\n' for i in range(4)]
+    for i in range(4):
+        cv2.imwrite(str(drive / 'image_00' / 'data' / f'{i:010d}.png'), NOISE)
+        longitude = 8.4 + np.degrees(i / 6378137.0 / np.cos(np.radians(49.0)))
+        row = [49.0, longitude, 115, 0, 0, 0.01 * i, *[0] * 5, 0.1, 0.2, 9.8, 0, 0, 0,
+               0.01, 0.02, 0.1, *[0] * 10]
+        (drive / 'oxts' / 'data' / f'{i:010d}.txt').write_text(' '.join(map(str, row)))
+    for folder in ('image_00', 'oxts'):
+        (drive / folder / 'timestamps.txt').write_text(''.join(clock))
+    return drive
+
+
+def test_a_raw_drive_of_kitti_is_read_as_it_is(raw: Path) -> None:
+    sequence = open_sequence(raw)
+    assert sequence.K.tolist() == [[50, 0, 80], [0, 50, 60], [0, 0, 1]]
+    assert sequence.stamps_ns[0] == 1317042145_464389445
+    assert np.diff(sequence.stamps_ns).tolist() == [100_000_000] * 3
+    assert sequence.poses is not None
+    turn = Rotation.from_matrix(sequence.poses[3, :3, :3]).as_rotvec()
+    assert np.allclose(turn, [0, -0.03, 0], atol=1e-9)  # left is about -y of the camera
+    assert sequence.poses[3, 2, 3] == pytest.approx(3, abs=0.02)
+    assert sequence.imu is not None
+    assert np.allclose(sequence.imu.to_camera @ sequence.imu.rates[0], [-0.02, -0.1, 0.01])
+
+
+def test_a_raw_drive_needs_no_gps(raw: Path) -> None:
+    shutil.rmtree(raw / 'oxts')
+    sequence = open_sequence(raw)
+    assert (sequence.poses, sequence.imu) == (None, None)
+
+
+def test_unrectified_images_of_a_raw_drive_have_their_distortion(raw: Path) -> None:
+    for path in (raw / 'image_00' / 'data').iterdir():
+        cv2.imwrite(str(path), np.zeros((150, 200), np.uint8))
+    sequence = open_sequence(raw)
+    assert sequence.K[0].tolist() == [70, 0, 100]
+    assert sequence.distortion.tolist() == [-0.3, 0.1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
+    ('../calib_cam_to_cam.txt', 'S_rect_00: 160', 'S_rect_00: 161', 'these are 160x120'),
+    ('../calib_cam_to_cam.txt', 'P_rect_00', 'P_rect_99', "has no line 'P_rect_00:'"),
+    ('../calib_cam_to_cam.txt', 'P_rect_00: 50.0', 'P_rect_00: -50.0', 'is no camera'),
+    ('../calib_velo_to_cam.txt', 'T: 0', 'T:', 'T has 2 numbers, 3 belong there'),
+    ('image_00/timestamps.txt', '2011-09-26', '2011-13-26', 'line 1.*is no stamp'),
+    ('image_00/timestamps.txt', '2011-09-26', '1911-09-26', 'is no stamp between'),
+    ('oxts/data/0000000001.txt', '49.0', '', 'has 29 numbers'),
+    ('oxts/data/0000000001.txt', '49.0', '95.0', 'farther than'),
+])
+def test_a_wrong_raw_drive_is_named(raw: Path, file: str, old: str, new: str, said: str) -> None:
+    path = raw / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(DjetError, match=said) as caught:
+        open_sequence(raw)
+    assert '\n' not in str(caught.value)
+
+
+def test_a_raw_drive_asks_for_its_calibration(raw: Path) -> None:
+    (raw.parent / 'calib_cam_to_cam.txt').unlink()
+    with pytest.raises(DjetError, match='calib_cam_to_cam.txt is missing; copy it there'):
+        open_sequence(raw)
+
+
+@pytest.mark.parametrize(('text', 'nanoseconds'), [
+    ('1971-01-02 00:00:01', (366 * 86400 + 1) * 10**9),
+    ('2011-09-26 13:02:25.5', 1317042145_500000000),
+    ('2011-09-26 13:02:25.964389445', 1317042145_964389445)])
+def test_clocks_are_read_to_the_nanosecond(text: str, nanoseconds: int) -> None:
+    assert clock_nanoseconds(text) == nanoseconds

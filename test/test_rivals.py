@@ -1,0 +1,176 @@
+"""Pairs that leave a choice: two basins, two bodies, matches by chance; and pairs that do not."""
+
+from __future__ import annotations
+
+from djet_ros.core.covariance import difference, spanning, squared_distance
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
+from djet_ros.core.jet import jet_problem, Loss
+from djet_ros.core.rivals import false_alarms, goes_on, preferences
+from djet_ros.core.starts import all_round
+from djet_ros.core.surfaces import ReprojectionSurface
+from djet_ros.core.types import Pose, RelativePose, Status
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from two_view import FORWARD, K, project, SIZE, two_views, TwoViews, uniform_view
+
+NOISE = 0.2
+# How a body may move, as the camera sees it: across, or against it along the camera's own way.
+BODIES = {'across': (0.3, 0.05, 0.4), 'against': (0.0, -0.016, 0.8)}
+
+
+def scene_with_body(still: int, moving: int, motion: str, box: tuple[float, float],
+                    ) -> tuple[TwoViews, np.ndarray, np.ndarray, Pose]:
+    """Give matches of the world and of a body between two columns, and how that moves."""
+    rng = np.random.default_rng(3)
+    seen = two_views(rng, count=still, t=FORWARD, turn=(0.0, 0.004, 0.0))
+    pixels = rng.uniform((box[0], 60), (box[1], SIZE[1]), (moving, 2))
+    points = (np.column_stack([pixels, np.ones(moving)]) @ np.linalg.inv(K).T
+              * rng.uniform(5, 8, (moving, 1)))
+    R, t = rotation_exp(np.array([0.0, -0.01, 0.003])), np.array(BODIES[motion])
+    x = np.concatenate([seen.x, pixels])
+    y = np.concatenate([seen.y, project(K, points @ R.T + t)[0]])
+    return seen, x, y + rng.normal(0, NOISE, y.shape), Pose(R, unit(t))
+
+
+def estimate(x: np.ndarray, y: np.ndarray, before: Pose | None = None) -> RelativePose:
+    prior = None if before is None else RelativePose(Status.OK, before.R, before.t)
+    return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
+        uniform_view(), uniform_view(), x, y, prior)
+
+
+@pytest.mark.parametrize('motion', BODIES)
+def test_of_two_bodies_none_is_taken_for_the_world_for_sure(motion: str) -> None:
+    _, x, y, _ = scene_with_body(200, 300, motion, (300, 1000))
+    assert estimate(x, y).status is Status.TWO_MOTIONS
+
+
+@pytest.mark.parametrize('motion', BODIES)
+def test_the_world_is_what_goes_on_as_before_though_most_matches_follow_another_body(
+        motion: str) -> None:
+    seen, x, y, body = scene_with_body(200, 300, motion, (300, 1000))
+    result = estimate(x, y, Pose(rotation_exp(np.array([0, 0.002, 0])) @ seen.R, seen.t))
+    assert result.status is Status.OK
+    assert rotation_angle(result.R, seen.R) < 2e-3
+    assert direction_angle(result.t, seen.t) < 0.02
+    assert result.inliers[:200].mean() > 0.8 and result.inliers[200:].mean() < 0.3
+    # … and with the body's motion before it, it would be the body.
+    assert direction_angle(estimate(x, y, body).t, body.t) < 0.1
+
+
+def test_a_small_body_leaves_no_doubt_about_the_world() -> None:
+    seen, x, y, _ = scene_with_body(400, 60, 'across', (600, 760))
+    result = estimate(x, y)
+    assert result.status is Status.OK
+    assert direction_angle(result.t, seen.t) < 0.01
+    assert not result.inliers[400:].any()
+
+
+def plane_of_two_motions() -> tuple[np.ndarray, np.ndarray]:
+    """Give noisy matches on one plane, which move alike under two motions."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform((50, 50), (1190, 330), (200, 2))
+    R = Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix()
+    H = K @ (R + np.outer((0.2, 0.1, -0.3), [0.1, 0.2, 0.15])) @ np.linalg.inv(K)
+    y = np.column_stack([x, np.ones(200)]) @ H.T
+    return x, y[:, :2] / y[:, 2:] + rng.normal(0, NOISE, (200, 2))
+
+
+def test_where_another_motion_explains_the_matches_as_well_the_pose_says_so() -> None:
+    result = estimate(*plane_of_two_motions())
+    assert result.status is Status.AMBIGUOUS
+    # Its guess is one of them, and its covariance spans a large part of the way to the other.
+    assert result.t.any()
+    assert np.sqrt(np.trace(result.covariance_5[3:, 3:])) > 0.1
+
+
+def test_the_motion_before_decides_between_them() -> None:
+    x, y = plane_of_two_motions()
+    guess = estimate(x, y)
+    assert estimate(x, y, Pose(guess.R, guess.t)).status is Status.OK
+
+
+def test_points_in_space_leave_no_choice() -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        seen = two_views(rng, count=100)
+        result = estimate(seen.x, seen.y + rng.normal(0, NOISE, seen.y.shape))
+        assert result.status is Status.OK
+
+
+def test_false_matches_agree_with_no_motion_that_is_believed() -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        x = rng.uniform((0, 0), SIZE, (250, 2))
+        angle, length = rng.uniform(0, 2 * np.pi, 250), 186 * np.sqrt(rng.uniform(0, 1, 250))
+        y = x + np.column_stack([np.cos(angle), np.sin(angle)]) * length[:, None]
+        assert estimate(x, y).status not in (Status.OK, Status.NO_PARALLAX)
+
+
+def test_a_motion_that_a_few_of_many_agree_with_is_expected_by_chance() -> None:
+    assert false_alarms(20, 332, 0.02) > 0
+    assert false_alarms(5, 332, 0.02) == np.inf
+    assert false_alarms(100, 332, 0.02) < 0
+    assert false_alarms(20, 24, 0.02) < 0
+
+
+def preference_between(x: np.ndarray, y: np.ndarray, one: Pose, other: Pose) -> float:
+    surface = ReprojectionSurface(x, y)
+    problem = jet_problem(K, x, surface.around(y))
+    return float(preferences(problem, x, [one, other], 0, Loss('geman_mcclure', 1.0))[1])
+
+
+def test_of_two_motions_equally_wrong_neither_is_preferred_more_often_than_chance_has_it() -> None:
+    found = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        seen = two_views(rng, count=100)
+        y = seen.y + rng.normal(0, NOISE, seen.y.shape)
+        off = rng.normal(0, 1e-3, 3)
+        one, other = (Pose(rotation_exp(sign * off) @ seen.R, seen.t) for sign in (1, -1))
+        found.append(preference_between(seen.x, y, one, other))
+    assert abs(np.mean(found)) < 4 / np.sqrt(200)
+    assert 0.7 < np.std(found) < 1.2
+
+
+def test_repeating_every_match_next_to_itself_makes_no_preference_stronger() -> None:
+    rng = np.random.default_rng(0)
+    seen = two_views(rng, count=100)
+    y = seen.y + rng.normal(0, NOISE, seen.y.shape)
+    one, other = Pose(seen.R, seen.t), Pose(rotation_exp(np.array([0, 2e-3, 0])) @ seen.R, seen.t)
+    once = preference_between(seen.x, y, one, other)
+    assert once > 3
+    assert preference_between(np.tile(seen.x, (2, 1)), np.tile(y, (2, 1)), one, other) == \
+        pytest.approx(once)
+
+
+def test_a_covariance_that_spans_a_pose_has_it_as_many_standard_deviations_off_as_said() -> None:
+    rng = np.random.default_rng(5)
+    A, t = rng.normal(size=(5, 5)) * 0.01, unit(rng.normal(size=3))
+    R = rotation_exp(rng.normal(size=3))
+    off = difference(R, t, Pose(rotation_exp(rng.normal(size=3) * 0.3) @ R,
+                                -unit(t + rng.normal(size=3) * 0.3)))
+    five, six = spanning(A @ A.T, t, off, 3.0)
+    assert squared_distance(five, off) == pytest.approx(9)
+    assert np.linalg.eigvalsh(five - A @ A.T).min() > -1e-12
+    assert np.linalg.norm(six[3:, 3:] @ t) < 1e-12  # t keeps its length
+    near = 1e-6 * off
+    assert np.array_equal(spanning(A @ A.T, t, near, 3.0)[0], A @ A.T)
+
+
+def test_only_what_is_like_the_motion_before_goes_on() -> None:
+    before, turned = Pose(np.eye(3), unit(np.array([0.0, 0, -1]))), rotation_exp(
+        np.array([0, 0.02, 0]))
+    alike, unlike = Pose(turned, before.t), Pose(np.eye(3), unit(np.array([1.0, 0, -1])))
+    assert goes_on(before, alike, unlike)
+    assert not goes_on(before, unlike, alike)
+    assert not goes_on(before, alike, Pose(turned.T, before.t))  # as like as the other
+
+
+def test_directions_all_round_leave_no_large_gap() -> None:
+    starts = np.array([pose.t for pose in all_round(np.eye(3), 10)])
+    assert np.allclose(np.linalg.norm(starts, axis=1), 1)
+    sphere = unit(np.random.default_rng(6).normal(size=(500, 3)))
+    assert np.degrees(np.arccos(np.abs(sphere @ starts.T).max(1)).max()) < 45

@@ -1,0 +1,165 @@
+"""One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
+
+from cards import Cards, pose
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
+from djet_ros.odometry.visual_odometry import TRACKED, VisualOdometry
+import numpy as np
+import pytest
+
+ESTIMATOR = EstimatorConfig(max_features=800)
+
+# A camera that speeds up, slows down and turns: metres and radians a tenth of a second.
+WAYS = [0.2, 0.2, 0.25, 0.3, 0.36, 0.36, 0.3, 0.22, 0.16, 0.16, 0.2, 0.26]
+
+
+@pytest.fixture(scope='module')
+def cards():
+    return Cards()
+
+
+def steps(ways=WAYS):
+    return [pose(x=0.8 * way, z=0.6 * way, yaw=0.01 * (-1)**i) for i, way in enumerate(ways)]
+
+
+class Drive:
+    """An odometry, a camera among the cards, and a clock."""
+
+    def __init__(self, cards, source=None, **config):
+        self.cards, self.here, self.ns = cards, np.eye(4), 0
+        self.odometry = VisualOdometry(ESTIMATOR, OdometryConfig(**config), source)
+        self.look()
+
+    def look(self, gap_ns=10**8):
+        frame = self.cards.frame(0.0, self.here, noise=self.ns // 10**8)
+        self.ns += gap_ns
+        return self.odometry.process(Frame(frame.gray, frame.K, self.ns, 'camera'))
+
+    def go(self, moves):
+        results = []
+        for move in moves:
+            self.here = self.here @ move
+            results.append(self.look())
+        return results
+
+
+def lengths(results):
+    return np.array([np.linalg.norm(result.motion[:3, 3]) for result in results])
+
+
+def test_the_first_step_is_the_unit_of_all_that_follow(cards):
+    results = Drive(cards).go(steps())
+    assert lengths(results)[0] == pytest.approx(1)
+    assert lengths(results) * WAYS[0] == pytest.approx(np.array(WAYS), rel=0.03)
+    assert all(result.scale_kind is Scale.RELATIVE for result in results)
+
+
+def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards):
+    results = Drive(cards).go(steps())[1:]
+    for result, way in zip(results, WAYS[1:]):
+        along = result.motion[:3, 3] / np.linalg.norm(result.motion[:3, 3])
+        sigma = np.sqrt(along @ result.motion_covariance[:3, :3] @ along)
+        assert 1e-4 < sigma / result.scale < 0.1
+        assert abs(result.scale * WAYS[0] - way) < 5 * sigma * WAYS[0]
+
+
+def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
+    drive = Drive(cards)
+    before = lengths(drive.go(steps()[:5]))
+    rest = drive.go([np.eye(4)] * 3)
+    assert all(result.stationary for result in rest)
+    turns = drive.go([pose(yaw=0.03)] * 2 + [pose(yaw=-0.03)] * 2)
+    assert all(result.status in TRACKED for result in turns)
+    after = lengths(drive.go([pose(x=0.16, z=0.12)] * 3))
+    assert before[0] == pytest.approx(1)
+    assert after == pytest.approx(1, rel=0.05)
+
+
+def test_a_bad_frame_does_not_change_the_scale(cards):
+    drive = Drive(cards)
+    drive.go(steps()[:4])
+    drive.here = drive.here @ pose(x=0.16, z=0.12)
+    black = np.zeros((240, 320), np.uint8)
+    drive.ns += 10**8
+    bad = drive.odometry.process(Frame(black, drive.cards.frame(0).K, drive.ns, 'camera'))
+    assert bad.status not in TRACKED
+    bridged = drive.go([pose(x=0.16, z=0.12)])[0]
+    assert np.linalg.norm(bridged.motion[:3, 3]) == pytest.approx(2, rel=0.05)
+
+
+def test_after_a_gap_the_old_speed_is_the_guess(cards):
+    drive = Drive(cards, max_gap=0.5)
+    drive.go([pose(x=0.16, z=0.12)] * 4)
+    drive.look(gap_ns=10**9)
+    after = drive.go([pose(x=0.16, z=0.12), pose(x=0.08, z=0.06)])
+    assert lengths(after)[0] == pytest.approx(1, rel=0.05)
+    assert lengths(after)[1] == pytest.approx(0.5, rel=0.05)
+
+
+def test_without_any_parallax_there_is_no_unit_yet(cards):
+    drive = Drive(cards)
+    turns = drive.go([pose(yaw=0.03)] * 2)
+    assert all(result.scale_kind is Scale.UNKNOWN for result in turns)
+    assert drive.go(steps()[:2])[0].scale == pytest.approx(1)
+
+
+def test_a_speed_makes_metres_and_landmarks_carry_them_on_where_it_falls_silent(cards):
+    speeds = SpeedScale()
+    drive = Drive(cards, speeds)
+    measured = []
+    for move, way in zip(steps()[:6], WAYS):
+        for stamp in (drive.ns + 1, drive.ns + 10**8):
+            speeds.add_speed(stamp, way / 0.1)
+        measured += drive.go([move])
+    assert lengths(measured)[2:] == pytest.approx(np.array(WAYS[2:6]), rel=0.04)
+    silent = []
+    for move in [*steps()[6:], *[pose(x=0.12, z=0.09)] * 2]:
+        drive.here = drive.here @ move
+        silent.append(drive.look(gap_ns=3 * 10**8))
+    assert lengths(silent)[-1] == pytest.approx(0.15, rel=0.06)
+    assert all(result.scale_kind is Scale.METRIC for result in silent)
+    shares = [sigma(result) / result.scale for result in silent]
+    assert shares[-1] > sigma(measured[-1]) / measured[-1].scale
+
+
+def sigma(result):
+    along = result.motion[:3, 3] / np.linalg.norm(result.motion[:3, 3])
+    return float(np.sqrt(along @ result.motion_covariance[:3, :3] @ along))
+
+
+def test_one_wild_speed_does_not_change_the_scale(cards):
+    speeds = SpeedScale()
+    drive = Drive(cards, speeds)
+    speeds.add_speed(0, 2.0)
+    results = []
+    for number in range(8):
+        speeds.add_speed(drive.ns + 5 * 10**7, 40.0 if number == 5 else 2.0)
+        speeds.add_speed(drive.ns + 10**8, 2.0)
+        results += drive.go([pose(x=0.16, z=0.12)])
+    assert lengths(results) == pytest.approx(0.2, rel=0.06)
+
+
+def test_the_same_frames_give_the_same_scale_to_the_last_bit(cards):
+    first, second = (Drive(cards, Unmeasured()).go(steps()[:6]) for _ in range(2))
+    for one, other in zip(first, second):
+        assert np.array_equal(one.pose, other.pose)
+        assert np.array_equal(one.pose_covariance, other.pose_covariance)
+
+
+def test_the_window_keeps_few_images(cards):
+    drive = Drive(cards)
+    drive.go([pose(x=0.16, z=0.12, yaw=0.004)] * 14)
+    window = drive.odometry._one_scale._window
+    assert len(window._images) <= 7
+    assert len(window._landmarks) < 2000
+    assert window.landmarks().shape[1] == 3
+    assert (window.landmarks()[:, 2] > 0).mean() > 0.9
+
+
+def test_another_estimator_goes_on_at_the_last_speed(cards):
+    drive = Drive(cards)
+    drive.go([pose(x=0.16, z=0.12)] * 3)
+    drive.odometry.configure(EstimatorConfig(max_features=600), OdometryConfig(), Unmeasured())
+    assert lengths(drive.go([pose(x=0.16, z=0.12)] * 2)) == pytest.approx(1, rel=0.05)

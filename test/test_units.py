@@ -1,0 +1,111 @@
+"""Drift of the unit of lengths, as loops see it: circles that come out too large, and mended."""
+
+from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.posegraph.loops import unit_change
+from djet_ros.posegraph.pose_graph import Edge, PoseGraph
+from djet_ros.posegraph.units import log_units, with_one_unit
+import numpy as np
+import pytest
+
+N = 60
+SIGMAS = np.array([0.01, 0.01, 0.01, 0.001, 0.001, 0.001])
+
+
+def circles():
+    """Poses (N, 4, 4) twice round a circle of thirty steps."""
+    poses = np.tile(np.eye(4), (N, 1, 1))
+    for i in range(N):
+        angle = 2 * np.pi * i / (N / 2)
+        poses[i, :3, :3] = rotation_exp(np.array([0.0, angle, 0.0]))
+        poses[i, :3, 3] = 10 * np.array(
+            [1 - np.cos(angle), 0.0, np.sin(angle)])
+    return poses
+
+
+def drifting(poses, drift=0.003, wrong=()):
+    """Edges of an odometry whose unit grows with each step, and loops from lap to lap."""
+    units = drift * np.arange(N)
+    edges = []
+    for i in range(N - 1):
+        motion = np.linalg.inv(poses[i]) @ poses[i + 1]
+        motion[:3, 3] *= np.exp(-units[i])
+        edges.append(Edge(i, i + 1, motion, np.diag(SIGMAS**2)))
+    for i in range(30, N, 5):
+        motion = np.linalg.inv(poses[i]) @ poses[i - 30]
+        motion[:3, 3] *= np.exp(-units[i])
+        stretch = units[i - 30] - units[i] + (1.0 if i in wrong else 0.0)
+        edges.append(Edge(i, i - 30, motion, np.diag(SIGMAS**2), 'loop', True, (stretch, 0.005)))
+    return edges, units
+
+
+def integrated(edges):
+    poses = [np.eye(4)]
+    for edge in edges[:N - 1]:
+        poses.append(poses[-1] @ edge.motion)
+    return np.array(poses)
+
+
+def test_units_differ_between_laps_as_loops_tell():
+    edges, units = drifting(circles())
+    found = log_units(N, edges)
+    assert found[0] == 0
+    assert found[30::5] - found[:30:5] == pytest.approx(0.09, abs=0.01)
+    # How it came about within the lap is not seen by loops that all span one.
+    assert found == pytest.approx(units, abs=0.04)
+
+
+def test_a_loop_that_contradicts_the_others_has_no_say():
+    edges, units = drifting(circles(), wrong=(40,))
+    assert log_units(N, edges) == pytest.approx(units, abs=0.04)
+
+
+def test_without_a_loop_that_tells_nothing_changes():
+    edges, _ = drifting(circles())
+    graph = PoseGraph(np.arange(N), circles(), tuple(edges[:N - 1]))
+    same, factors = with_one_unit(graph)
+    assert np.array_equal(factors, np.ones(N))
+    assert all(one is other for one, other in zip(same.edges, graph.edges))
+
+
+def test_loops_mend_the_scale_which_poses_alone_cannot():
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.posegraph.backend import optimise
+    truth = circles()
+    edges, _ = drifting(truth)
+    graph = PoseGraph(np.arange(N), integrated(edges), tuple(edges))
+    rigid = PoseGraph(np.arange(N), graph.poses, tuple(
+        Edge(e.source, e.target, e.motion, e.covariance, e.kind) for e in edges))
+    before, mended, bent = (np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max()
+                            for poses in (graph.poses, optimise(graph).graph.poses,
+                                          optimise(rigid).graph.poses))
+    assert before > 1
+    assert mended < before / 3
+    assert mended < bent / 2
+
+
+def pair(points, R, t, K):
+    """Exact answer of an estimator for points (N, 3) of the first view."""
+    there = points @ R.T + t
+    x, y = ((p @ K.T)[:, :2] / p[:, 2:] for p in (points, there))
+    return RelativePose(Status.OK, R=R, t=unit(t), x=x, y=y, y_opt=y,
+                        inliers=np.ones(len(x), bool)), there
+
+
+def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():
+    rng = np.random.default_rng(0)
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    points = rng.uniform((-6, -3, 8), (6, 3, 30), (200, 3))
+    step, _ = pair(points, rotation_exp(np.array([0.0, 0.02, 0])), np.array([0.1, 0, 1.0]), K)
+    loop, there = pair(points, rotation_exp(np.array([0.0, -0.05, 0.01])),
+                       np.array([0.4, 0.1, -0.3]), K)
+    other, _ = pair(there, rotation_exp(np.array([0.01, 0, 0])), np.array([-0.1, 0, 1.2]), K)
+    near, far = 0.5, 0.6  # metres in a unit
+    lengths = [np.linalg.norm(way) for way in ([0.1, 0, 1.0], [0.4, 0.1, -0.3], [-0.1, 0, 1.2])]
+    ratio, sigma = unit_change(step, lengths[0] / near, loop, lengths[1] / near, other,
+                               lengths[2] / far, K)
+    assert ratio == pytest.approx(np.log(far / near), abs=1e-6)
+    assert sigma == pytest.approx(1e-3)
+    few = RelativePose(Status.OK, x=other.x[:9], y=other.y[:9], y_opt=other.y_opt[:9],
+                       inliers=np.ones(9, bool), R=other.R, t=other.t)
+    assert unit_change(step, 1.0, loop, 1.0, few, 1.0, K) is None
