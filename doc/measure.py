@@ -28,12 +28,12 @@ from typing import Any
 
 import djet_ros
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.geometry import sphere_tangents, unit
-from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.bench import bench
 from djet_ros.lab.closure import closures, summary
+from djet_ros.lab.coverage import normalised_square
 from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.methods import default_methods, make_methods, Method
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
@@ -46,7 +46,6 @@ from djet_ros.recordings.outputs import write_whole
 from djet_ros.replay.drift import drift
 from djet_ros.replay.pair_errors import motion_errors
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -227,6 +226,7 @@ def measured(job: Job) -> dict[str, Any]:
     with TemporaryDirectory() as name:
         datasets = opened_for(job, Path(name))
         methods = [*make_methods(default_methods(), ['best'], {}),
+                   *make_methods(['djet'], ['fast'], {}),
                    *make_methods(PAPER_METHODS, ['paper'], {})]
         sequence, frames = opened(datasets[0]), min(job.frames or CLOSURE_FRAMES, CLOSURE_FRAMES)
         found = {'seeds': list(job.seeds), 'methods': by_method(datasets, methods),
@@ -306,17 +306,8 @@ def tracked(dataset: Dataset) -> Iterator[Outcome]:
                                             true_motion)
         yield Outcome(dataset.name, result.status.value, rotation, direction,
                       has_failed(rotation, direction, true_motion),
-                      surprise(result.relative, true_motion) if np.isfinite(direction)
+                      normalised_square(result.relative, true_motion) if np.isfinite(direction)
                       else float('nan'))
-
-
-def surprise(pose: RelativePose, true_motion: Array) -> float:
-    """Squared error of a pose over its covariance (5, 5); 5 on average if that is true."""
-    R = true_motion[:3, :3].T
-    t = unit(-R @ true_motion[:3, 3])
-    error = np.concatenate([Rotation.from_matrix(R @ pose.R.T).as_rotvec(),
-                            sphere_tangents(pose.t).T @ (t - pose.t)])
-    return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
 def ablation(data: Path | None, most: int | None) -> dict[str, Any]:

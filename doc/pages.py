@@ -288,7 +288,9 @@ def speed(results: Any) -> str:
         return 'Not measured yet.\n'
     both = (part, part['all_cores'])
     rows = [("time over OpenCV's chain", *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
+            ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in both)),
             ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in both)),
+            ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in both)),
             *((f'{stage}, ms', *(f'{one["stages_ms"][stage]:.1f}' for one in both))
               for stage in part['stages_ms'])]
     growth = [(f'{name} {key}', f'{value:.1f}')
