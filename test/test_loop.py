@@ -30,9 +30,9 @@ def test_closing_the_loop_leaves_less_than_a_third_of_the_trajectory_error(block
     assert said['frames'] == 427
     assert said['edges']['loop'] > 100
     assert said['rejected']['loop'] < 0.2 * said['edges']['loop']
-    assert before['ape_m'] > 0.1  # there is something to be closed
+    assert before['ape_m'] > 0.03  # 1 in 10,000 of the way: there is something to be closed
     assert after['ape_m'] < before['ape_m'] / 3
     if 'evo_ape_m' in before:
         assert after['evo_ape_m'] < before['evo_ape_m'] / 3
-        # Loops mend the way as a whole; from frame to frame it stays what it was.
-        assert after['evo_rpe_m'] == pytest.approx(before['evo_rpe_m'], rel=0.2)
+        # Loops mend the way as a whole; from frame to frame it stays what it was, to a millimetre.
+        assert after['evo_rpe_m'] == pytest.approx(before['evo_rpe_m'], abs=0.001)
