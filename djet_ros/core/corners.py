@@ -70,7 +70,8 @@ def corner_slopes(image: Image) -> NDArray[np.float32]:
     xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))
                   for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     trace = xx + yy
-    spread = cv2.magnitude(xx - yy, 2 * xy)
+    # Not by cv2.magnitude: its last bit depends on where in memory the arrays lie.
+    spread = np.sqrt((xx - yy)**2 + 4 * xy**2)
     least, most = trace - spread, trace + spread
     least *= least >= np.float32(_LEAST_RATIO) * most
     least *= np.float32(0.5 / _SOBEL**2)
