@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from djet_ros.core.fusion import agrees, difference, fused, Turn
+from djet_ros.core.fusion import agrees, fused, Turn
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
@@ -66,7 +66,7 @@ def test_the_jerks_of_a_hand_are_integrated_to_a_hundredth_of_a_degree(seed: int
     for i in range(len(poses) - 1):
         turn = gyro.turn(i * PERIOD, (i + 1) * PERIOD)
         assert turn is not None
-        assert np.linalg.norm(difference(turn, relative(poses, i, i + 1))) < np.radians(0.01)
+        assert np.linalg.norm(turn.off(relative(poses, i, i + 1))) < np.radians(0.01)
 
 
 def test_rates_along_the_axes_of_a_robot_are_those_of_its_camera() -> None:
@@ -96,7 +96,7 @@ def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
             gyro.add(i * 5_000_000, bias + 0.01 * np.sqrt(200) * rng.standard_normal(3))
         turn = gyro.turn(2_000_000, 198_000_000)
         assert turn is not None
-        off.append(difference(turn, np.eye(3)))
+        off.append(turn.off(np.eye(3)))
     scatter = np.mean(np.square(off))
     assert scatter / np.diag(turn.covariance).mean() == pytest.approx(1, abs=0.25)
 
@@ -242,7 +242,7 @@ def test_errors_after_fusion_are_as_large_as_the_covariance_says_and_smaller_tha
         visual = pair(rotation_exp(error[:3]) @ R, seen / np.linalg.norm(seen), covariance)
         turn = Turn(rotation_exp(rng.normal(0, 5e-4, 3)) @ R, told)
         found = fused(visual, turn)
-        off = np.concatenate([difference(Turn(found.R, told), R),
+        off = np.concatenate([Turn(found.R, told).off(R),
                               sphere_tangents(found.t).T @ (found.t - t)])
         before.append(error @ np.linalg.solve(covariance, error))
         after.append(off @ np.linalg.solve(found.covariance_5, off))

@@ -8,6 +8,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import jet_problem, Loss
 from djet_ros.core.rivals import false_alarms, goes_on, preferences
+from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import all_round
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
@@ -119,7 +120,8 @@ def test_a_motion_that_a_few_of_many_agree_with_is_expected_by_chance() -> None:
 def preference_between(x: np.ndarray, y: np.ndarray, one: Pose, other: Pose) -> float:
     surface = ReprojectionSurface(x, y)
     problem = jet_problem(K, x, surface.around(y))
-    return float(preferences(problem, x, [one, other], 0, Loss('geman_mcclure', 1.0))[1])
+    losses = losses_at(problem, [one, other], Loss('geman_mcclure', 1.0))
+    return float(preferences(losses, x, 0)[1])
 
 
 def test_of_two_motions_equally_wrong_neither_is_preferred_more_often_than_chance_has_it() -> None:

@@ -16,14 +16,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
-from djet_ros.core.geometry import rays, rotation_exp
+from djet_ros.core.geometry import rays, rotation_exp, rotation_log, skew
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
 # A landmark that was projected from this near or from behind, in its anchor's depths.
 _NEAREST = 1e-3
+
+# Information that holds a pose where it is.
+_HELD = 1e10
+
+# Information where there is none, so that what hangs on it can be eliminated.
+_HARDLY = 1e-6
 
 # What is added to the information about an inverse depth, so that there always is some.
 _TRACE = 1e-9
@@ -41,6 +46,14 @@ class Poses:
         R = np.einsum('fij,akj->faik', self.R, self.R)
         return R, self.t[:, None] - np.einsum('faij,aj->fai', R, self.t)
 
+    def joined(self, R: Array, t: Array) -> Poses:
+        """Give the poses and one more, R (3, 3) and t (3,)."""
+        return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]))
+
+    def without_frame(self, frame: int) -> Poses:
+        """Give all poses but one."""
+        return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0))
+
     def moved(self, step: Array) -> Poses:
         """Give the poses moved by a step (6 F,)."""
         step = step.reshape(-1, 6)
@@ -50,9 +63,51 @@ class Poses:
     def step_from(self, other: Poses) -> Array:
         """Give the step (6 F,) that moves other poses to these, to first order."""
         turns = self.R @ other.R.transpose(0, 2, 1)
-        omega = np.array([cv2.Rodrigues(turn)[0].ravel() for turn in turns])
-        return np.concatenate(
-            [omega, self.t - np.einsum('fij,fj->fi', turns, other.t)], axis=1).ravel()
+        shifts = self.t - np.einsum('fij,fj->fi', turns, other.t)
+        return np.concatenate([rotation_log(turns), shifts], axis=1).ravel()
+
+
+@dataclass
+class PosePrior:
+    """
+    What is known of F poses beside their landmarks.
+
+    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from where they were, `since`.
+    """
+
+    H: Array
+    g: Array
+    since: Poses
+
+    @classmethod
+    def holding(cls, pose: Poses) -> PosePrior:
+        """Hold a first pose where it is."""
+        return cls(np.eye(6) * _HELD, np.zeros(6), pose)
+
+    def gradient(self, poses: Poses) -> Array:
+        """Slope (6 F,) of that at some poses."""
+        return np.asarray(self.g + self.H @ poses.step_from(self.since))
+
+    def add(self, H: Array, g: Array, poses: Poses) -> None:
+        """Add what is known around poses."""
+        self.H += H
+        self.g += g - H @ poses.step_from(self.since)
+
+    def with_frame(self, R: Array, t: Array) -> PosePrior:
+        """Give the same with one more pose, of which nothing is known."""
+        return PosePrior(np.pad(self.H, (0, 6)), np.pad(self.g, (0, 6)), self.since.joined(R, t))
+
+    def without_frame(self, frame: int) -> PosePrior:
+        """Give what is known of the others, a frame eliminated."""
+        gone = np.zeros(len(self.H), bool)
+        gone[6 * frame:6 * frame + 6] = True
+        own, others = self.H[np.ix_(gone, gone)], self.H[np.ix_(~gone, gone)]
+        # Of a frame that a mere turn led to, nothing may be known but its rotation.
+        own = own + np.diag(1e-9 * np.diag(own) + _HARDLY)
+        gain = np.linalg.solve(own, others.T).T
+        H = self.H[np.ix_(~gone, ~gone)] - gain @ others.T
+        return PosePrior((H + H.T) / 2, self.g[~gone] - gain @ self.g[gone],
+                         self.since.without_frame(frame))
 
 
 @dataclass
@@ -159,8 +214,8 @@ def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
     weight = rho[:, None, None]
     return Linearised(
         landmark, frame, anchor, np.einsum('nij,nj->ni', root, off),
-        np.concatenate([-by_place @ _skews(place), by_place * weight], axis=2),
-        np.concatenate([by_turned @ _skews(ray), -by_turned * weight], axis=2),
+        np.concatenate([-by_place @ skew(place), by_place * weight], axis=2),
+        np.concatenate([by_turned @ skew(ray), -by_turned * weight], axis=2),
         np.einsum('nij,nj->ni', by_place, t))
 
 
@@ -204,10 +259,3 @@ def eliminate(linear: Linearised, weights: Array, frames: int, landmarks: int) -
         coupling[seen] = np.add.reduceat((J * J_rho[:, None]).sum(2), first, axis=0)
     return Reduced(H - (coupling.T * variances) @ coupling,
                    g - coupling.T @ (variances * slopes), coupling, variances, slopes)
-
-
-def _skews(vectors: Array) -> Array:
-    """Cross-product matrices (N, 3, 3) of vectors (N, 3)."""
-    x, y, z = vectors.T
-    nought = np.zeros(len(vectors))
-    return np.stack([nought, -z, y, z, nought, -x, -y, x, nought], axis=1).reshape(-1, 3, 3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
+from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import at, Mask
 from djet_ros.core.orb_pattern import REACH
@@ -92,11 +93,7 @@ def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int,
 
     first: (N,) bool mask of points that come before all others.
     """
-    cells = (points // _CELL) @ np.array([1, 2**20]) * 2 + ~first
-    order = np.lexsort((-strengths, cells))
-    _, begin, count = np.unique(cells[order], return_index=True, return_counts=True)
-    rank = np.empty(len(points), np.int64)
-    rank[order] = np.arange(len(points)) - np.repeat(begin, count)
+    rank = rank_in_cells(cells_of(points, _CELL) * 2 + ~first, -strengths)
     return np.asarray(np.sort(np.lexsort((-strengths, rank, ~first))[:most]))
 
 

@@ -71,9 +71,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     covariance = correlated / (gain * flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
-    turned = _blocks(-residuals.tangents if flipped else residuals.tangents)
+    turned = lift(-residuals.tangents if flipped else residuals.tangents)
     covariance_6 = turned @ covariance @ turned.T
-    basis = _blocks(sphere_tangents(t))
+    basis = lift(sphere_tangents(t))
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
@@ -100,8 +100,15 @@ def spanning(covariance: Array, t: Array, apart: Array, sigmas: float) -> tuple[
     distance = squared_distance(covariance, apart)
     if distance > sigmas**2:
         covariance = covariance + np.outer(apart, apart) * (1 / sigmas**2 - 1 / distance)
-    basis = _blocks(sphere_tangents(t))
+    basis = lift(sphere_tangents(t))
     return covariance, basis @ covariance @ basis.T
+
+
+def lift(tangents: Array) -> Array:
+    """Lift (6, 5) of steps (rotation, two tangents) to (rotation, direction)."""
+    lifted = np.zeros((6, 5))
+    lifted[:3, :3], lifted[3:, 3:] = np.eye(3), tangents
+    return lifted
 
 
 def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
@@ -126,13 +133,6 @@ def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
     by_noise = (without - np.linalg.inv(H)).sum(0)
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
     return np.asarray((1 - 1 / cells) * (seen + by_noise) / 2)
-
-
-def _blocks(tangents: Array) -> Array:
-    """Lift (6, 5) of steps (rotation, two tangents) to (rotation, direction)."""
-    lift = np.zeros((6, 5))
-    lift[:3, :3], lift[3:, 3:] = np.eye(3), tangents
-    return lift
 
 
 def summed_by_cell(places: Array, *values: Array, side: float = CELL) -> list[Array]:

@@ -13,9 +13,9 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.geometry import (
     epipolar_lines,
+    facing,
     fit_rotation,
     fundamental,
-    in_front,
     line_distances,
     rays,
 )
@@ -189,13 +189,11 @@ class TwoViewEstimator:
         inliers = track.inliers()
         # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
         rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
-        ahead, behind = (int(in_front(R, t, rays_x, rays_y).sum())
-                         for t in (track.pose.t, -track.pose.t))
-        flipped = behind > ahead
-        t = -track.pose.t if flipped else track.pose.t
+        sign = facing(R, track.pose.t, rays_x, rays_y)
+        t = sign * track.pose.t
 
         covariances = pose_covariance(
-            track.residuals, track.loss, x[track.voting], t, flipped, surface.gain)
+            track.residuals, track.loss, x[track.voting], t, sign < 0, surface.gain)
         hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
         status = Status.OK
         if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
+from djet_ros.core.covariance import lift
+from djet_ros.core.geometry import rotation_exp, rotation_log, sphere_tangents, unit
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 # Radians by which two rotations may differ beyond what they say of themselves.
 _SLACK = np.radians(0.02)
@@ -28,15 +28,14 @@ class Turn:
     R: Array
     covariance: Array
 
-
-def difference(turn: Turn, R: Array) -> Array:
-    """Rotation vector (3,) from the left that takes a rotation R (3, 3) to the turn's."""
-    return np.asarray(Rotation.from_matrix(turn.R @ R.T).as_rotvec())
+    def off(self, R: Array) -> Array:
+        """Rotation vectors (…, 3) from the left that take R, (3, 3) or (N, 3, 3), to this."""
+        return rotation_log(self.R @ R.swapaxes(-1, -2))
 
 
 def agrees(turn: Turn, relative: RelativePose) -> bool:
     """Tell whether the rotation of a pair is the turn's, as far as both claim to know it."""
-    z = difference(turn, relative.R)
+    z = turn.off(relative.R)
     S = relative.covariance_6[:3, :3] + turn.covariance + _SLACK**2 * np.eye(3)
     return bool(np.isfinite(S).all() and z @ np.linalg.solve(S, z) < _SURPRISE)
 
@@ -52,7 +51,7 @@ def fused(relative: RelativePose, turn: Turn) -> RelativePose:
     if not np.isfinite(covariance).all():
         return relative
     gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + turn.covariance)
-    step = gain @ difference(turn, relative.R)
+    step = gain @ turn.off(relative.R)
     keep = np.eye(5) - gain @ np.eye(3, 5)
     updated = keep @ covariance @ keep.T + gain @ turn.covariance @ gain.T
     R = rotation_exp(step[:3]) @ relative.R
@@ -64,10 +63,9 @@ def fused(relative: RelativePose, turn: Turn) -> RelativePose:
     change = np.eye(5)
     change[3:, 3:] = sphere_tangents(turned).T @ sphere_tangents(t)
     updated = change @ updated @ change.T
-    lift = np.zeros((6, 5))
-    lift[:3, :3], lift[3:, 3:] = np.eye(3), sphere_tangents(turned)
+    basis = lift(sphere_tangents(turned))
     return replace(relative, R=R, t=turned, covariance_5=updated,
-                   covariance_6=lift @ updated @ lift.T)
+                   covariance_6=basis @ updated @ basis.T)
 
 
 def _with_rotation(covariance: Array, rotation: Array) -> Array:

@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 
+# The generators of rotations, (3, 3, 3): [e_i]_x.
+GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+
+
 def skew(v: Array) -> Array:
-    """Cross-product matrix [v]_x of a (3,) vector, so that [v]_x w is the product v x w."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    """Cross-product matrices [v]_x (…, 3, 3) of vectors (…, 3): [v]_x w is the product v x w."""
+    return np.asarray(v @ GENERATORS.reshape(3, 9)).reshape(*v.shape, 3)
 
 
 def rotation_exp(omega: Array) -> Array:
@@ -26,7 +30,7 @@ def rotation_exp(omega: Array) -> Array:
 
 
 def rotation_log(R: Array) -> Array:
-    """Rotation vector (3,) in radians of a rotation matrix (3, 3)."""
+    """Rotation vectors (…, 3) in radians of rotation matrices, (3, 3) or (N, 3, 3)."""
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
@@ -112,6 +116,12 @@ def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.boo
     """
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     return np.asarray((depth_x > 0) & (depth_y > 0))
+
+
+def facing(R: Array, t: Array, rays_x: Array, rays_y: Array) -> float:
+    """Sign, 1 or -1, with which t brings more of the points to the front of both cameras."""
+    ahead, behind = (in_front(R, sign * t, rays_x, rays_y).sum() for sign in (1, -1))
+    return 1.0 if ahead >= behind else -1.0
 
 
 def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:

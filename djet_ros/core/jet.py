@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
 from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,6 +75,11 @@ class Solution:
     t: Array
     cost: float
     residuals: Residuals
+
+    @property
+    def pose(self) -> Pose:
+        """Give (R, t) by itself."""
+        return Pose(self.R, self.t)
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from djet_ros.core.covariance import summed_by_cell
-from djet_ros.core.geometry import in_front
+from djet_ros.core.geometry import facing
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
-from djet_ros.core.sketch import losses_in_front, refine_all
+from djet_ros.core.sketch import losses_at, losses_in_front, refine_all
 from djet_ros.core.starts import FORWARD, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -82,22 +82,20 @@ def goes_on(before: Pose, one: Pose, other: Pose) -> bool:
     return near < _LIKE_BEFORE and 2 * near < change(before, other)
 
 
-def preferences(problem: JetProblem, places: Array, poses: Sequence[Pose], chosen: int,
-                loss: Loss) -> Array:
+def preferences(losses: Array, places: Array, chosen: int) -> Array:
     """
     Tell by how many standard deviations matches prefer one of some poses to each (S,).
 
-    places: (N, 2) pixels of the matches. Vuong's test (Econometrica 1989): of two models that are
-    both fitted and neither a special case of the other, the summed difference of losses is about
-    normal, with the variance of its parts, and its sign tells which is nearer to the truth. The
-    matches of one cell err together, so these parts are cells: with D_c the difference in cell c,
+    losses: (S, N) of the matches at the poses; places: (N, 2) their pixels. Vuong's test
+    (Econometrica 1989): of two models that are both fitted and neither a special case of the
+    other, the summed difference of losses is about normal, with the variance of its parts, and
+    its sign tells which is nearer to the truth. The matches of one cell err together, so these
+    parts are cells: with D_c the difference in cell c,
 
         z = sum_c D_c / sqrt(sum_c D_c^2).
 
-    The probability that a pose preferred by z is the wrong one is Phi(-z) at most. Points behind
-    the camera cost as ``sketch.losses_in_front`` says.
+    The probability that a pose preferred by z is the wrong one is Phi(-z) at most.
     """
-    losses = losses_in_front(problem, refine_all(problem, poses, loss, 0), loss)
     by_cell, = summed_by_cell(places, losses - losses[chosen])
     return np.asarray(by_cell.sum(0) / np.sqrt(np.maximum((by_cell**2).sum(0), 1e-300)))
 
@@ -171,17 +169,14 @@ def _log_choose(n: int, k: int) -> float:
 
 def _distances(problem: JetProblem, pose: Pose) -> Array:
     """Distances (N,) of matches from their epipolar half-lines, in those of the residuals."""
-    plain = Loss()
-    seen = refine_all(problem, [pose], plain, 0)
     # Indefinite surfaces that are kept as printed have losses below 0.
-    return np.asarray(np.sqrt(np.abs(losses_in_front(problem, seen, plain, signs=(1.0,))[0])))
+    return np.asarray(np.sqrt(np.abs(losses_at(problem, [pose], Loss(), signs=(1.0,))[0])))
 
 
 def _in_front(problem: JetProblem, pose: Pose, agreeing: NDArray[np.bool_]) -> Pose:
     """Give t the sign that brings more of the points to the front of both cameras."""
     rays_x, rays_y = problem.rays_x[:, agreeing].T, problem.rays_y[:, agreeing].T
-    ahead, behind = (in_front(pose.R, sign * pose.t, rays_x, rays_y).sum() for sign in (1, -1))
-    return pose if ahead >= behind else Pose(pose.R, -pose.t)
+    return Pose(pose.R, facing(pose.R, pose.t, rays_x, rays_y) * pose.t)
 
 
 def _area(places: Array) -> float:

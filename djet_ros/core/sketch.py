@@ -12,15 +12,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
+from djet_ros.core.geometry import (
+    GENERATORS,
+    rotation_exp,
+    rotation_log,
+    skew,
+    sphere_tangents,
+    unit,
+)
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-
-# The generators of rotations, (3, 3, 3): [e_i]_x.
-_GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
 
 _DAMPING_AT_FIRST = 1e-4
 
@@ -121,6 +124,12 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     return np.asarray(losses[losses.sum(2).argmin(0), np.arange(len(sketch))])
 
 
+def losses_at(problem: JetProblem, poses: Sequence[Pose], loss: Loss,
+              signs: Sequence[float] = (1.0, -1.0)) -> Array:
+    """Losses (S, N) as those in front, of poses as they are."""
+    return losses_in_front(problem, refine_all(problem, poses, loss, 0), loss, signs)
+
+
 def _products(problem: JetProblem) -> Array:
     """Entries (9, N) of x y*^T in the order of an essential matrix's rows."""
     return np.asarray((problem.rays_y[:, None] * problem.rays_x[None]).reshape(9, -1))
@@ -129,10 +138,10 @@ def _products(problem: JetProblem) -> Array:
 def _expand(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss) -> _Expansion:
     """Expand the losses at all poses, with the variances of their residuals held."""
     tangents = np.array([sphere_tangents(one) for one in t])
-    across = _skew(t)
+    across = skew(t)
     E = across @ R
-    by_rotation = across[:, None] @ (_GENERATORS @ R[:, None])
-    by_direction = _skew(tangents.transpose(0, 2, 1)) @ R[:, None]
+    by_rotation = across[:, None] @ (GENERATORS @ R[:, None])
+    by_direction = skew(tangents.transpose(0, 2, 1)) @ R[:, None]
     stack = np.concatenate([E[:, None], by_rotation, by_direction], axis=1)
     values = (stack.reshape(-1, 9) @ products).reshape(len(R), 6, -1)
     e, J = values[:, 0], values[:, 1:]
@@ -154,7 +163,7 @@ def _held(expansion: _Expansion, R: Array, held: Held | None) -> _Expansion:
     """Add what the rotations (S, 3, 3) cost for not being the one that is held."""
     if held is None:
         return expansion
-    off = Rotation.from_matrix(R @ held.R.T).as_rotvec()
+    off = rotation_log(R @ held.R.T)
     pull = off @ held.weight
     H, gradient = expansion.H.copy(), expansion.gradient.copy()
     H[:, :3, :3] += held.weight
@@ -186,8 +195,3 @@ def _chosen(better: NDArray[np.bool_], there: _Expansion, here: _Expansion) -> _
 def _where(better: NDArray[np.bool_], there: Array, here: Array) -> Array:
     """Take from one array (S, …) or the other."""
     return np.where(better.reshape(-1, *(1,) * (there.ndim - 1)), there, here)
-
-
-def _skew(v: Array) -> Array:
-    """Cross-product matrices [v]_x (…, 3, 3) of vectors (…, 3)."""
-    return np.asarray(v @ _GENERATORS.reshape(3, 9)).reshape(*v.shape, 3)

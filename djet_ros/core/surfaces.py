@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import stretches
 from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import (
     describable,
@@ -38,6 +39,9 @@ from scipy.ndimage import map_coordinates
 
 # The outermost of ORB's tests is 13 pixels off, and moves by a quarter of a pixel.
 _WARP_STEP = 0.02
+
+# chosen: a patch that would be stretched or shrunk by more is a false match, or no reference.
+_MOST_STRETCH = 2.0
 
 # Pixels between which a reference may stay as it was sampled.
 _NEAR_ENOUGH = 0.05
@@ -96,7 +100,7 @@ class DescriptorSurface:
         self._mask = current.mask
         self.gain = _GAIN if config.warp_reference else 1.0
         self._latest = _no_paraboloids(len(x))
-        # The reference of each match: how it was seen, and how far from its pixel y is expected.
+        # How the reference of each match was seen last, and how far x is from its pixel.
         self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
         self._contrast = 1.0
@@ -107,42 +111,38 @@ class DescriptorSurface:
             return self._around_pixels(y)
         moved = np.abs(self._latest.centres - y).max(1) > _NEAR_ENOUGH
         warped = np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP
-        centres = np.rint(y).astype(np.int64)
-        usable = self._usable(centres, _CLOSE // 2)
+        usable = self._usable(np.rint(y), _CLOSE // 2)
         # Most matches rest from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
-        self._offset = np.where(anew[:, None], y - centres, self._offset)
-        back = np.linalg.inv(warp[anew]) @ self._offset[anew][:, :, None]
-        references = self._distances.reference(
-            self._previous, self.x[anew] - back[:, :, 0], self._contrast, warp[anew])
-        return self._fitted(references, y, anew, usable, centres, _CLOSE)
+        return self._kept(anew, usable, y, self._distances.between_pixels(
+            self._previous, self.x[anew], self._current, y[anew], warp[anew], self._contrast,
+            _CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit them with the references of whole pixels, as the paper does."""
-        side = self._config.window
+        radius = self._config.window // 2
         centres = np.rint(y - self._offset).astype(np.int64)
-        usable = self._usable(centres, side // 2)
+        usable = self._usable(centres, radius)
         anew = usable & (centres + self._offset != self._latest.centres).any(1)
         pixels = np.rint(self.x).astype(np.int64)
         if np.isnan(self._latest.centres).all():
             self._contrast = self._distances.contrast(
                 self._previous, pixels[usable], self._current, centres[usable])
         references = self._distances.reference(self._previous, pixels[anew], self._contrast)
-        return self._fitted(references, y, anew, usable, centres, side)
+        surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
+        return self._kept(anew, usable, y, fit_paraboloids(
+            surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
 
-    def _fitted(self, references: NDArray[Any], y: Array, anew: NDArray[np.bool_],
-                usable: NDArray[np.bool_], centres: Pixels, side: int) -> Paraboloids:
-        """Fit those of some matches (N,) bool anew, and keep the others."""
-        surfaces = self._distances.surfaces(references, self._current, centres[anew], side // 2)
-        fitted = fit_paraboloids(surfaces, centres[anew] + self._offset[anew],
-                                 self._config.window_sigma)
+    def _kept(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
+              fitted: Paraboloids) -> Paraboloids:
+        """Take paraboloids that were fitted anew, for a mask (N,) of the matches, to the rest."""
         self._latest = replace(_put(self._latest, fitted, anew), usable=usable)
         # A match that never had a surface stays where it is.
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
-    def _usable(self, centres: Pixels, radius: int) -> NDArray[np.bool_]:
+    def _usable(self, centres: NDArray[Any], radius: int) -> NDArray[np.bool_]:
         return self._has_reference & ~at(self._mask, centres) & self._distances.describable(
             centres, self._current.shape, radius)
 
@@ -152,6 +152,7 @@ class DescriptorDistances:
 
     def __init__(self, config: EstimatorConfig) -> None:
         self._grading, self._scale = config.grading, config.patch_scale
+        self._sigma = config.window_sigma
         self._tests = pattern(config.binary_tests, config.patch_scale)
 
     def seen(self, gray: Image) -> NDArray[Any]:
@@ -195,6 +196,19 @@ class DescriptorDistances:
         if self._grading:
             return graded_surfaces(reference, seen, centres, radius, self._grading, self._tests)
         return hamming_surfaces(reference, seen, centres, radius, self._tests)
+
+    def between_pixels(self, there: NDArray[Any], x: Array, here: NDArray[Any], y: Array,
+                       warp: Array, contrast: float, radius: int) -> Paraboloids:
+        """
+        Fit paraboloids to the distances in an image around y (N, 2), from references around x.
+
+        References are taken between pixels, so that a minimum at y comes to lie on a whole pixel:
+        there a paraboloid fits without a bias. warp: (N, 2, 2) how they are seen at y.
+        """
+        centres = np.rint(y).astype(np.int64)
+        back = np.linalg.inv(warp) @ (y - centres)[:, :, None]
+        references = self.reference(there, x - back[:, :, 0], contrast, warp)
+        return fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma)
 
 
 class PhotometricSurface:
@@ -259,6 +273,12 @@ class ReprojectionSurface:
         n = len(y)
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
                            np.zeros(n), np.ones(n, bool))
+
+
+def comparable(warp: Array) -> NDArray[np.bool_]:
+    """(N,) bool mask of warps (N, 2, 2) through which a patch is still like itself."""
+    least, most = stretches(warp)
+    return np.asarray((least > 1 / _MOST_STRETCH) & (most < _MOST_STRETCH))
 
 
 def with_minimum(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloids, int]:

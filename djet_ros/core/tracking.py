@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from djet_ros.core.basins import Basin, judged, right_basin
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
@@ -15,7 +16,6 @@ from djet_ros.core.geometry import (
     homogeneous,
     patch_warp,
     rays,
-    stretches,
 )
 from djet_ros.core.jet import (
     epipolar_residuals,
@@ -25,27 +25,13 @@ from djet_ros.core.jet import (
     minimise,
     Residuals,
     robust_scale,
-    Solution,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.rivals import (
-    apart,
-    change,
-    DECIDED,
-    goes_on,
-    preferences,
-    refined_rivals,
-    Rival,
-    second_motion,
-    SecondMotion,
-)
-from djet_ros.core.sketch import costs_in_front, Held, refine_all, Sketch
-from djet_ros.core.starts import all_round, thinned
-from djet_ros.core.surfaces import ResidualSurface, with_minimum
+from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
+from djet_ros.core.surfaces import comparable, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -57,38 +43,8 @@ class TrackTuning:
     # pixels; chosen, about a window: so near to the epipole the direction of a line is noise, and
     # a match that fits by chance would hold the epipole and make it look far surer than it is
     epipole_blur: float = 5.0
-    # robust standard deviations; chosen: a second motion in the scene fits many matches loosely,
-    # the camera's own fits most of them closely, so a loss that bends here tells basins apart
-    tight: float = 1.0
-    # chosen: where a start lies says little of its basin, so all make a few steps on some matches
-    steps_to_sketch: int = 4
-    matches_to_sketch: int = 800
-    # chosen: it costs little to refine all starts on so few, and there basins lie closer
-    few_matches: int = 400
-    # chosen: directions all round from which basins are looked for then
-    directions: int = 10
-    # chosen: the cheapest that lie in different basins are refined
-    refined_starts: int = 3
-    # rad; chosen: poses nearer than this lie in one basin
-    same_basin: float = 0.02
-    # chosen: steps on all matches before costs are compared
-    steps_to_compare: int = 7
-    # rad; chosen: what a rotation that was measured is not trusted with, and for how many matches'
-    # worth of surprise it counts
-    turn_slack: float = 2e-4
-    # rad; chosen: standard deviation of a rotation that is not yet refined to the end
-    turn_fits: float = 5e-4
-    # chosen: basins that are left to themselves to see whether they turn away
-    turned_starts: int = 5
-    # chosen: rounds in which residuals that do not belong together are left out, and from how many
-    # robust standard deviations on
-    core_rounds: int = 8
-    core: float = 2.5
     # bends of the loss; chosen: beyond, a match has next to no weight anyway
     by_itself: float = 2.0
-    turn_weight: float = 1000.0
-    # chosen: a patch that would be stretched or shrunk by more is a false match
-    most_stretch: float = 2.0
     # chosen: a body spread over less than this share of the area of the world's matches is not
     # mistaken for it
     small_body: float = 0.3
@@ -199,8 +155,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            turn: Turn | None, alive: NDArray[np.bool_]) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
-    poses, warp, begun, basin = starts, None, None, _Basin(starts[0], 1.0)
-    judged: tuple[Rival, ...] = ()
+    poses, warp, begun, basin = starts, None, None, Basin(starts[0], 1.0)
+    rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
@@ -218,18 +174,18 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                               config.weigh_by_fit)
         begun = begun or _Begun(problem, places, voting)
         if len(poses) > 1:
-            basin = _right_basin(problem, places, poses, config, prior, turn)
+            basin = right_basin(problem, places, poses, config, prior, turn)
         else:
             scale = _scale(epipolar_residuals(problem, poses[0].R, poses[0].t).r)
             basin = replace(basin, pose=poses[0], scale=scale, others_move=False)
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
-        converged = len(poses) == 1 and change(basin.pose, _pose(solution)) < config.epsilon
+        converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
         if last and basin.rivals:
             # Judge again between the basins, on the last surfaces.
-            solution, judged = _judged(problem, places, solution, basin.rivals, loss, prior)
-        pose = _pose(solution)
+            solution, rivals = judged(problem, places, solution, basin.rivals, loss, prior)
+        pose = solution.pose
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
             ours[voting] = np.abs(solution.residuals.r) < TUNING.by_itself * loss.scale
@@ -246,7 +202,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
             warp, plausible = _warps(pose, K, surface.x, optimum)
     assert begun is not None  # there is at least one iteration
     return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
-                 no_minimum, iteration, judged), begun
+                 no_minimum, iteration, rivals), begun
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
@@ -257,76 +213,6 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
     return Track(pose, Loss(), residuals, voting, paraboloids.minima(), optimum,
                  paraboloids.values(optimum), 0, 0)
-
-
-@dataclass(frozen=True)
-class _Basin:
-    """
-    A pose, the scale of the residuals there, and the poses of other basins.
-
-    others_move: whether most matches tell another motion.
-    """
-
-    pose: Pose
-    scale: float
-    others_move: bool = False
-    rivals: tuple[Pose, ...] = ()
-
-
-def _right_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                 config: EstimatorConfig, prior: Pose | None, turn: Turn | None) -> _Basin:
-    """Choose among starts by what they come to."""
-    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
-    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), TUNING.least_scale)
-    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
-    if turn is not None:
-        # Whatever moves as most matches do tells their noise, and what fits the turn fits it well.
-        scale = max(refine_all(some, starts, tight, TUNING.steps_to_sketch).scales().min(),
-                    TUNING.least_scale)
-        tight = replace(tight, scale=min(config.loss_scale, TUNING.tight) * scale)
-        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
-                                             _held(turn, scale)), tight, TUNING.turned_starts)
-    elif len(problem.blur) > TUNING.few_matches:
-        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
-                            TUNING.refined_starts)
-    else:
-        starts = [*starts, *all_round(starts[0].R, TUNING.directions)]
-    refined = refine_all(problem, starts, tight, TUNING.steps_to_compare)
-    possible, others_move = np.ones(len(refined), bool), False
-    if turn is not None and (turned_so := _turned_so(turn, refined)).any():
-        others_move = not turned_so[costs_in_front(problem, refined, tight).argmin()]
-        possible = turned_so
-    basins = _promising(problem, refined, tight, TUNING.refined_starts, possible)
-    best = basins.pop(_likeliest(problem, places, basins, tight, prior))
-    # All matches are placed equally well, whatever they move with.
-    scale = (min(map(_core_scale, refined.r)) if others_move
-             else robust_scale(epipolar_residuals(problem, best.R, best.t).r))
-    return _Basin(best, max(scale, TUNING.least_scale), others_move, tuple(basins))
-
-
-def _judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],
-            loss: Loss, prior: Pose | None) -> tuple[Solution, tuple[Rival, ...]]:
-    """Take the likeliest of a solution and its rivals, and tell how much it is preferred."""
-    poses = [_pose(solution), *refined_rivals(problem, rivals, loss)]
-    best = _likeliest(problem, places, poses, loss, prior)
-    if best != 0:
-        solution = minimise(problem, poses[best].R, poses[best].t, loss)
-        poses[best] = _pose(solution)
-    preferred = preferences(problem, places, poses, best, loss)
-    return solution, tuple(
-        Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
-        if apart(poses[best], pose) > TUNING.same_basin)
-
-
-def _likeliest(problem: JetProblem, places: Array, poses: list[Pose], loss: Loss,
-               prior: Pose | None) -> int:
-    """Which of some poses costs least, or, of those undecided between, is next to the prior."""
-    costs = costs_in_front(problem, refine_all(problem, poses, loss, 0), loss)
-    best = int(costs.argmin())
-    if prior is None:
-        return best
-    undecided = preferences(problem, places, poses, best, loss) < DECIDED
-    return min(np.flatnonzero(undecided).tolist(), key=lambda number: apart(prior, poses[number]))
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None) -> tuple[Pose, Pose, bool]:
@@ -345,55 +231,6 @@ def _of_the_camera(second: SecondMotion, prior: Pose | None) -> tuple[Pose, Pose
     if second.width > 1:
         return second.pose, second.first, True
     return second.first, second.pose, True
-
-
-def _core_scale(residuals: Array) -> float:
-    """Give the standard deviation of the residuals that belong together, which may be few."""
-    scale = robust_scale(residuals)
-    for _ in range(TUNING.core_rounds):
-        scale = robust_scale(residuals[np.abs(residuals) < TUNING.core * scale])
-    return scale
-
-
-def _turned_so(turn: Turn, sketch: Sketch) -> NDArray[np.bool_]:
-    """
-    (S,) bool mask of the poses whose rotation is the measured one, within what both are good for.
-
-    The motion of something that fills the image is found under the measured rotation too, by a
-    direction that makes up for the difference; left to itself it turns away.
-    """
-    off = Rotation.from_matrix(turn.R @ sketch.R.transpose(0, 2, 1)).as_rotvec()
-    allowed = turn.covariance + TUNING.turn_fits**2 * np.eye(3)
-    return np.asarray((off * np.linalg.solve(allowed, off.T).T).sum(1) < TUNING.inlier**2)
-
-
-def _held(turn: Turn | None, scale: float) -> Held | None:
-    """
-    Draw rotations to the one that was measured, while a basin is chosen.
-
-    The matches of something large that moves by itself outweigh what is left of the scene, unless
-    a measured rotation counts for more than all of them. In the end the matches decide alone.
-    """
-    if turn is None:
-        return None
-    variance = turn.covariance + TUNING.turn_slack**2 * np.eye(3)
-    return Held(turn.R, np.asarray(TUNING.turn_weight * scale**2 * np.linalg.inv(variance)))
-
-
-def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
-               possible: NDArray[np.bool_] | None = None) -> list[Pose]:
-    """Choose the cheapest poses that lie in different basins, up to a number of them."""
-    chosen: list[Pose] = []
-    for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
-        pose = sketch.pose(number)
-        if (possible is None or possible[number]) and all(
-                apart(other, pose) > TUNING.same_basin for other in chosen):
-            chosen.append(pose)
-    return chosen[:most]
-
-
-def _pose(solution: Solution) -> Pose:
-    return Pose(solution.R, solution.t)
 
 
 def _scale(residuals: Array) -> float:
@@ -428,10 +265,10 @@ def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array
 def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Tell how patches at x are seen at y, as they are where that is not plausible."""
     seen = growth(pose.R, pose.t, rays(K, x), rays(K, y))
-    seen = np.where(np.isnan(seen), 1.0, seen)  # without any parallax, or on the epipole
+    # Of the same size without any parallax, or on the epipole; gone where it comes too near.
+    seen = np.nan_to_num(seen, nan=1.0, posinf=-1.0, neginf=-1.0)
     warp = patch_warp(K, pose.R, y, seen)
-    least, most = stretches(warp)
-    plausible = (seen > 0) & (least > 1 / TUNING.most_stretch) & (most < TUNING.most_stretch)
+    plausible = (seen > 0) & comparable(warp)
     return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
 
 

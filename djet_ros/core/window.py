@@ -20,10 +20,12 @@ from djet_ros.core.bundle import (
     Landmarks,
     linearise,
     Linearised,
+    PosePrior,
     Poses,
     projected,
     Reduced,
 )
+from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
@@ -31,13 +33,12 @@ from djet_ros.core.geometry import (
     rays,
     skew,
     sphere_tangents,
-    stretches,
     unit,
 )
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
-from djet_ros.core.paraboloid import fit_paraboloids, inverse_2x2, Paraboloids
-from djet_ros.core.surfaces import DescriptorDistances, with_minimum
+from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
+from djet_ros.core.surfaces import comparable, DescriptorDistances, with_minimum
 from djet_ros.core.types import Array, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +71,6 @@ class WindowTuning:
     bend: float = 3.0
     # pixels; chosen, far below any noise
     least_scale: float = 0.05
-    # as for pairs: what would be stretched or shrunk by more is no good reference any more
-    most_stretch: float = 2.0
     # factor on the variances of observations: neighbours and later frames err alike
     inflation: float = 2.0
     # chosen: pixels between a landmark and a match of a pair that are taken for one another
@@ -84,12 +83,8 @@ class WindowTuning:
 
 TUNING = WindowTuning()
 
-# Information that holds the first pose where it is, and the first length: the unit of the track.
-_HELD = 1e10
+# Information that holds the first length where it is: the unit of the track.
 _UNIT = 1e8
-
-# Information where there is none, so that what hangs on it can be eliminated.
-_HARDLY = 1e-6
 
 # Information about the rotation of a pair without parallax, which has no covariance: 1 mrad.
 _ROTATION_ALONE = 1e6
@@ -130,9 +125,7 @@ class Window:
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
-        # What is known of the poses beside the landmarks: 1/2 d^T H d + g^T d, with d the step
-        # from where they were when they came.
-        self._H, self._g, self._known_at = np.eye(6) * _HELD, np.zeros(6), self._poses
+        self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
 
     @property
@@ -214,17 +207,14 @@ class Window:
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
         R, t = self._poses.R[-1], self._poses.t[-1]
-        new = (relative.R @ R)[None], (relative.R @ t + length * relative.t)[None]
-        self._poses, self._known_at = (
-            Poses(np.concatenate([poses.R, new[0]]), np.concatenate([poses.t, new[1]]))
-            for poses in (self._poses, self._known_at))
+        new = relative.R @ R, relative.R @ t + length * relative.t
+        self._poses, self._prior = self._poses.joined(*new), self._prior.with_frame(*new)
         # The second frame stays, for the unit is told by it.
         self._is_keyframe.append(self.is_new)
         self._has_landmarks.append(False)
         self._images.append(view.tested)
         self._mask = view.mask
         self._landmarks = self._landmarks.with_frame()
-        self._H, self._g = np.pad(self._H, (0, 6)), np.pad(self._g, (0, 6))
 
     def _add_pair(self, relative: RelativePose, length: float, first: bool) -> None:
         """Add what all matches of the pair tell of its rotation and direction to the prior."""
@@ -244,14 +234,9 @@ class Window:
         else:
             along = relative.t @ J[3:] / length
             information += _UNIT * np.outer(along, along)
-        H = np.zeros_like(self._H)
+        H = np.zeros_like(self._prior.H)
         H[-12:, -12:] = information
-        self._add_known(H, np.zeros(len(H)))
-
-    def _add_known(self, H: Array, g: Array) -> None:
-        """Add to the prior what is known around the poses as they are now."""
-        self._H += H
-        self._g += g - H @ self._poses.step_from(self._known_at)
+        self._prior.add(H, np.zeros(len(H)), self._poses)
 
     def _found(self, relative: RelativePose, length: float) -> None:
         """Make landmarks of the matches of a keyframe with the frame after it."""
@@ -288,9 +273,7 @@ class Window:
             mine = np.flatnonzero(wanted & (landmarks.anchors == anchor))
             turn = self._poses.R[newest] @ self._poses.R[anchor].T
             warp = patch_warp(self._K, turn, expected[mine], 1 / places[mine, 2])
-            least, most = stretches(warp)
-            limit = self._tuning.most_stretch
-            plausible = (least > 1 / limit) & (most < limit)
+            plausible = comparable(warp)
             mine, warp = mine[plausible], warp[plausible]
             if len(mine):
                 self._take(mine, self._surfaces(anchor, mine, warp, expected[mine], radius))
@@ -298,18 +281,13 @@ class Window:
     def _surfaces(self, anchor: int, mine: NDArray[np.int64], warp: Array, expected: Array,
                   radius: int) -> Paraboloids:
         """Paraboloids around expected places in the newest frame, for landmarks of an anchor."""
-        # References lie between pixels, so that the minimum is expected on a whole one: there a
-        # paraboloid fits without a bias.
-        centres = np.rint(expected).astype(np.int64)
-        back = np.linalg.inv(warp) @ (expected - centres)[:, :, None]
-        points = self._landmarks.points[mine] - back[:, :, 0]
+        points = self._landmarks.points[mine]
         contrast = self._distances.contrast(
-            self._images[anchor], np.rint(self._landmarks.points[mine]).astype(np.int64),
-            self._images[-1], centres)
-        reference = self._distances.reference(self._images[anchor], points, contrast, warp)
-        sampled = self._distances.surfaces(reference, self._images[-1], centres, radius)
-        return with_minimum(fit_paraboloids(sampled, expected, self._config.window_sigma),
-                            'drop')[0]
+            self._images[anchor], np.rint(points).astype(np.int64),
+            self._images[-1], np.rint(expected).astype(np.int64))
+        return with_minimum(self._distances.between_pixels(
+            self._images[anchor], points, self._images[-1], expected, warp, contrast, radius),
+            'drop')[0]
 
     def _take(self, mine: NDArray[np.int64], fits: Paraboloids) -> None:
         """Take the minima of paraboloids as observations, and their curvatures as weights."""
@@ -330,8 +308,7 @@ class Window:
         self._equalise()
         for _ in range(self._tuning.steps):
             reduced = self._reduced(self._linearised())
-            H, g = self._H + reduced.H, reduced.g + self._g + self._H @ (
-                self._poses.step_from(self._known_at))
+            H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
             self._poses = self._poses.moved(step)
             self._landmarks.rho += reduced.depth_change(step)
@@ -382,22 +359,13 @@ class Window:
         everything = self._landmarks
         self._landmarks = everything.of(everything.anchors == frame)
         reduced = self._reduced(linearise(self._K, self._poses, self._landmarks))
-        self._add_known(reduced.H, reduced.g)
+        self._prior.add(reduced.H, reduced.g, self._poses)
         self._landmarks = everything
 
     def _forget(self, frame: int) -> None:
         """Eliminate a frame from the prior, and drop it with its landmarks."""
-        gone = np.zeros(len(self._H), bool)
-        gone[6 * frame:6 * frame + 6] = True
-        own, others = self._H[np.ix_(gone, gone)], self._H[np.ix_(~gone, gone)]
-        # Of a frame that a mere turn led to, nothing may be known but its rotation.
-        own = own + np.diag(1e-9 * np.diag(own) + _HARDLY)
-        gain = np.linalg.solve(own, others.T).T
-        H = self._H[np.ix_(~gone, ~gone)] - gain @ others.T
-        self._H, self._g = (H + H.T) / 2, self._g[~gone] - gain @ self._g[gone]
-        left = ~gone[::6]
-        self._poses, self._known_at = (Poses(poses.R[left], poses.t[left])
-                                       for poses in (self._poses, self._known_at))
+        self._poses = self._poses.without_frame(frame)
+        self._prior = self._prior.without_frame(frame)
         self._landmarks = self._landmarks.without_frame(frame)
         self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
         lists: tuple[list[Any], ...] = self._images, self._is_keyframe, self._has_landmarks
@@ -417,11 +385,6 @@ def _spread(chosen_from: Array, present: Array, side: float, room: int) -> NDArr
 
     Cells in which there are present ones come later.
     """
-    cells, taken = (np.floor(points / side).astype(np.int64) @ (1, 2**20)
-                    for points in (chosen_from, present))
-    order = np.argsort(cells, kind='stable')
-    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order)) - np.repeat(first, count)
-    rank += np.isin(cells, taken)
+    cells, taken = (cells_of(points, side) for points in (chosen_from, present))
+    rank = rank_in_cells(cells, np.arange(len(cells))) + np.isin(cells, taken)
     return np.asarray(np.argsort(rank, kind='stable')[:max(room, 0)])

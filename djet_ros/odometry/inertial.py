@@ -15,7 +15,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from itertools import pairwise
 
-from djet_ros.core.fusion import difference, Turn
+from djet_ros.core.fusion import Turn
 from djet_ros.core.types import Array
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -168,7 +168,7 @@ class Gyro:
         noise = turn.covariance - J @ P @ J.T + covariance
         gain = P @ J.T @ np.linalg.inv(J @ P @ J.T + noise)
         keep = np.eye(3) - gain @ J
-        self.bias = self.bias - gain @ difference(turn, R)
+        self.bias = self.bias - gain @ turn.off(R)
         self.bias_covariance = keep @ P @ keep.T + gain @ noise @ gain.T
         self._learnt_ns = end_ns
 
@@ -179,7 +179,7 @@ class Gyro:
             return False
         sigma = float(np.sqrt(np.linalg.eigvalsh(turn.covariance)[-1]))
         white = self.noise.density * np.sqrt(integral.samples / integral.seconds)
-        angle = float(np.linalg.norm(difference(turn, np.eye(3))))
+        angle = float(np.linalg.norm(turn.off(np.eye(3))))
         return bool(sigma < _TELLING and angle < _AT_REST * sigma
                     and (integral.spread < _NOISE_AT_REST * white).all())
 

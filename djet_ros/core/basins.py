@@ -1,0 +1,188 @@
+"""Basins of the joint optimisation: which starting pose leads to the right one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.fusion import Turn
+from djet_ros.core.jet import (
+    epipolar_residuals,
+    JetProblem,
+    Loss,
+    minimise,
+    robust_scale,
+    Solution,
+)
+from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
+from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
+from djet_ros.core.starts import all_round, thinned
+from djet_ros.core.types import Array, Pose
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class BasinTuning:
+    """Constants of the choice, each with where it comes from ("chosen" was not searched)."""
+
+    # robust standard deviations; chosen: a second motion in the scene fits many matches loosely,
+    # the camera's own fits most of them closely, so a loss that bends here tells basins apart
+    tight: float = 1.0
+    # chosen: where a start lies says little of its basin, so all make a few steps on some matches
+    steps_to_sketch: int = 4
+    matches_to_sketch: int = 800
+    # chosen: it costs little to refine all starts on so few, and there basins lie closer
+    few_matches: int = 400
+    # chosen: directions all round from which basins are looked for then
+    directions: int = 10
+    # chosen: the cheapest that lie in different basins are refined
+    refined_starts: int = 3
+    # rad; chosen: poses nearer than this lie in one basin
+    same_basin: float = 0.02
+    # chosen: steps on all matches before costs are compared
+    steps_to_compare: int = 7
+    # pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
+    least_scale: float = 0.02
+    # rad; chosen: what a rotation that was measured is not trusted with, and for how many matches'
+    # worth of surprise it counts
+    turn_slack: float = 2e-4
+    turn_weight: float = 1000.0
+    # rad; chosen: standard deviation of a rotation that is not yet refined to the end
+    turn_fits: float = 5e-4
+    # standard deviations, the usual three, within which a rotation is the measured one
+    agreeing: float = 3.0
+    # chosen: basins that are left to themselves to see whether they turn away
+    turned_starts: int = 5
+    # chosen: rounds in which residuals that do not belong together are left out, and from how many
+    # robust standard deviations on
+    core_rounds: int = 8
+    core: float = 2.5
+
+
+TUNING = BasinTuning()
+
+
+@dataclass(frozen=True)
+class Basin:
+    """
+    A pose, the scale of the residuals there, and the poses of other basins.
+
+    others_move: whether most matches tell another motion.
+    """
+
+    pose: Pose
+    scale: float
+    others_move: bool = False
+    rivals: tuple[Pose, ...] = ()
+
+
+def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
+                config: EstimatorConfig, prior: Pose | None, turn: Turn | None) -> Basin:
+    """
+    Choose among starts by what they come to.
+
+    places: (N, 2) pixels of the matches; prior: the motion before, which decides where the matches
+    do not; turn: a rotation that was measured, which all of them have to have.
+    """
+    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
+    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), TUNING.least_scale)
+    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+    if turn is not None:
+        # Whatever moves as most matches do tells their noise, and what fits the turn fits it well.
+        scale = max(refine_all(some, starts, tight, TUNING.steps_to_sketch).scales().min(),
+                    TUNING.least_scale)
+        tight = replace(tight, scale=min(config.loss_scale, TUNING.tight) * scale)
+        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
+                                             _held(turn, scale)), tight, TUNING.turned_starts)
+    elif len(problem.blur) > TUNING.few_matches:
+        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
+                            TUNING.refined_starts)
+    else:
+        starts = [*starts, *all_round(starts[0].R, TUNING.directions)]
+    refined = refine_all(problem, starts, tight, TUNING.steps_to_compare)
+    possible, others_move = np.ones(len(refined), bool), False
+    if turn is not None and (turned_so := _turned_so(turn, refined)).any():
+        others_move = not turned_so[costs_in_front(problem, refined, tight).argmin()]
+        possible = turned_so
+    basins = _promising(problem, refined, tight, TUNING.refined_starts, possible)
+    best = basins.pop(_likeliest(losses_at(problem, basins, tight), places, basins, prior))
+    # All matches are placed equally well, whatever they move with.
+    scale = (min(map(_core_scale, refined.r)) if others_move
+             else robust_scale(epipolar_residuals(problem, best.R, best.t).r))
+    return Basin(best, max(scale, TUNING.least_scale), others_move, tuple(basins))
+
+
+def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],
+           loss: Loss, prior: Pose | None) -> tuple[Solution, tuple[Rival, ...]]:
+    """Take the likeliest of a solution and its rivals, and tell how much it is preferred."""
+    poses = [solution.pose, *refined_rivals(problem, rivals, loss)]
+    losses = losses_at(problem, poses, loss)
+    best = _likeliest(losses, places, poses, prior)
+    if best != 0:
+        solution = minimise(problem, poses[best].R, poses[best].t, loss)
+        poses[best] = solution.pose
+        losses[best] = losses_at(problem, [solution.pose], loss)[0]
+    preferred = preferences(losses, places, best)
+    return solution, tuple(
+        Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
+        if apart(poses[best], pose) > TUNING.same_basin)
+
+
+def _likeliest(losses: Array, places: Array, poses: list[Pose], prior: Pose | None) -> int:
+    """
+    Which of S poses costs least, or, of those undecided between, is next to the prior.
+
+    losses: (S, N) of the matches there; places: (N, 2) their pixels.
+    """
+    best = int(losses.sum(1).argmin())
+    if prior is None:
+        return best
+    undecided = preferences(losses, places, best) < DECIDED
+    return min(np.flatnonzero(undecided).tolist(), key=lambda number: apart(prior, poses[number]))
+
+
+def _core_scale(residuals: Array) -> float:
+    """Give the standard deviation of the residuals that belong together, which may be few."""
+    scale = robust_scale(residuals)
+    for _ in range(TUNING.core_rounds):
+        scale = robust_scale(residuals[np.abs(residuals) < TUNING.core * scale])
+    return scale
+
+
+def _turned_so(turn: Turn, sketch: Sketch) -> NDArray[np.bool_]:
+    """
+    (S,) bool mask of the poses whose rotation is the measured one, within what both are good for.
+
+    The motion of something that fills the image is found under the measured rotation too, by a
+    direction that makes up for the difference; left to itself it turns away.
+    """
+    off = turn.off(sketch.R)
+    allowed = turn.covariance + TUNING.turn_fits**2 * np.eye(3)
+    return np.asarray((off * np.linalg.solve(allowed, off.T).T).sum(1) < TUNING.agreeing**2)
+
+
+def _held(turn: Turn | None, scale: float) -> Held | None:
+    """
+    Draw rotations to the one that was measured, while a basin is chosen.
+
+    The matches of something large that moves by itself outweigh what is left of the scene, unless
+    a measured rotation counts for more than all of them. In the end the matches decide alone.
+    """
+    if turn is None:
+        return None
+    variance = turn.covariance + TUNING.turn_slack**2 * np.eye(3)
+    return Held(turn.R, np.asarray(TUNING.turn_weight * scale**2 * np.linalg.inv(variance)))
+
+
+def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
+               possible: NDArray[np.bool_] | None = None) -> list[Pose]:
+    """Choose the cheapest poses that lie in different basins, up to a number of them."""
+    chosen: list[Pose] = []
+    for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
+        pose = sketch.pose(number)
+        if (possible is None or possible[number]) and all(
+                apart(other, pose) > TUNING.same_basin for other in chosen):
+            chosen.append(pose)
+    return chosen[:most]

@@ -1,0 +1,26 @@
+"""Cells of an image: what makes points spread over it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def cells_of(points: NDArray[Any], side: float) -> NDArray[np.int64]:
+    """Give the numbers (N,) of the cells of a side in pixels in which points (N, 2) lie."""
+    return np.asarray(np.floor(points / side).astype(np.int64) @ (1, 2**20))
+
+
+def rank_in_cells(cells: NDArray[np.int64], worse: NDArray[Any]) -> NDArray[np.int64]:
+    """
+    Tell of each of N points how many of its cell come before it.
+
+    cells: (N,) numbers of their cells; worse: (N,) larger for those that come later.
+    """
+    order = np.lexsort((worse, cells))
+    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(first, count)
+    return rank
