@@ -130,7 +130,7 @@ def test_every_scene_starts_at_the_identity_and_moves_smoothly(name: str) -> Non
                                atol=1e-12)
     steps = np.linalg.inv(poses[:-1]) @ poses[1:]
     angles = np.arccos(np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-    assert np.degrees(angles).max() < 5
+    assert np.degrees(angles).max() < (16 if name == 'whip' else 5)
     assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 1.4
 
 

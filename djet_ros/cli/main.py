@@ -31,6 +31,7 @@ LAB = {
     'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
     'closure': 'how well the rotations of three frames agree: no ground truth needed',
     'coverage': 'are poses as sure as they say? errors against covariances, scene by scene',
+    'beside': 'what a gyro and masks are good for, on rendered scenes, with and without them',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
     'soak': 'run many frames through the odometry: does memory or latency grow?',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",

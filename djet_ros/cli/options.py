@@ -75,3 +75,19 @@ def numbers(text: str, option: str, form: str) -> list[float]:
     if len(values) != len(split(form)):
         raise DjetError(f"{option} is '{text}'; give {form}")
     return values
+
+
+def add_seeds(parser: argparse.ArgumentParser) -> None:
+    """Add --seeds, of rendered scenes."""
+    parser.add_argument('--seeds', type=_seeds, default='0-4', metavar='LIST',
+                        help='seeds of the scenes, such as 0,3 or 0-9 (default: %(default)s)')
+
+
+def _seeds(text: str) -> list[int]:
+    """Give the numbers of a text such as 0,3-5."""
+    try:
+        ends = [[int(end) for end in part.split('-')] for part in split(text)]
+        return [seed for end in ends for seed in range(end[0], end[-1] + 1)]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is no list of seeds such as 0,3 or 0-9") from error

@@ -9,7 +9,7 @@ from multiprocessing import get_context, parent_process
 import os
 import signal
 from threading import Thread
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from djet_ros import threads
 from djet_ros.errors import DjetError
@@ -20,6 +20,20 @@ from djet_ros.lab.store import in_order, RecordStore
 # Few enough that a broken run loses little, enough that features of the first frame don't count.
 PAIRS_PER_CHUNK = 5
 
+
+class Chunk(Protocol):
+    """Some pairs that are worked on together."""
+
+    @property
+    def name(self) -> str:
+        """Name that is the same in every run."""
+
+    @property
+    def count(self) -> int:
+        """How many pairs there are."""
+
+
+C = TypeVar('C', bound=Chunk)
 R = TypeVar('R')
 
 
@@ -29,7 +43,7 @@ def chunks_of(datasets: Sequence[Dataset], most: int = PAIRS_PER_CHUNK) -> list[
             for dataset in datasets for first in range(0, dataset.pairs, most)]
 
 
-def run(executor: Executor, chunks: Sequence[PairChunk], work: Callable[[PairChunk], list[R]],
+def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
         store: RecordStore[R], progress: Callable[[int, int], None]) -> list[R]:
     """
     Do the work of all chunks that the store does not have; gives all records in a fixed order.
@@ -58,7 +72,7 @@ def run(executor: Executor, chunks: Sequence[PairChunk], work: Callable[[PairChu
     return in_order(store, (chunk.name for chunk in chunks))
 
 
-def _keep_finished(futures: dict[Future[list[R]], PairChunk], store: RecordStore[R]) -> None:
+def _keep_finished(futures: dict[Future[list[R]], C], store: RecordStore[R]) -> None:
     for future, chunk in futures.items():
         if chunk.name not in store.chunks and future.done() and not future.cancelled() \
                 and future.exception() is None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from djet_ros.cli.options import add_frames, add_output, split
+from djet_ros.cli.options import add_frames, add_output, add_seeds, split
 from djet_ros.cli.terminal import new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
@@ -54,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='sequences with ground truth: folders or bags')
     parser.add_argument('--scenes', default='', metavar='LIST',
                         help=f'scenes to render, or all: of {", ".join(SCENES)}')
-    parser.add_argument('--seeds', type=_seeds, default='0-4', metavar='LIST',
-                        help='seeds of these scenes, such as 0,3 or 0-9 (default: %(default)s)')
+    add_seeds(parser)
     parser.add_argument('--frames', type=int, default=17, metavar='N',
                         help='frames of each rendered scene (default: %(default)s)')
     add_output(parser, 'folder of the results')
@@ -137,16 +136,6 @@ def _await(futures: Sequence[Any], progress: Callable[..., None]) -> None:
 
 def _whole(place: Path) -> bool:
     return any(place.glob('poses/*.txt'))
-
-
-def _seeds(text: str) -> list[int]:
-    """Give the numbers of a text such as 0,3-5."""
-    try:
-        ends = [[int(end) for end in part.split('-')] for part in split(text)]
-        return [seed for end in ends for seed in range(end[0], end[-1] + 1)]
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is no list of seeds such as 0,3 or 0-9") from error
 
 
 def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:

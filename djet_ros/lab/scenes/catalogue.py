@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
@@ -17,7 +17,12 @@ from djet_ros.lab.scenes.camera import (
     MarineSnow,
     SensorNoise,
 )
-from djet_ros.lab.scenes.excursions import build_forest, build_handheld, build_indoor
+from djet_ros.lab.scenes.excursions import (
+    build_forest,
+    build_handheld,
+    build_indoor,
+    build_whip,
+)
 from djet_ros.lab.scenes.panel import Mover, World
 from djet_ros.lab.scenes.route import (
     Dive,
@@ -171,6 +176,34 @@ def _build_moving(seed: int, size: tuple[int, int]) -> Scene:
                          World(still.panels, (Mover(panels, lorry),)))
 
 
+# Lorries that cross: metres ahead of the camera, metres a frame to the right, and between two.
+_CROSSINGS = ((6.0, 0.9, 17.0), (11.0, -0.7, 23.0))
+_ABREAST = 3
+
+
+def _build_traffic(seed: int, size: tuple[int, int]) -> Scene:
+    """Stand before a street on which lorries come from both sides."""
+    spot, rng = _on_the_spot(0.0), np.random.default_rng([seed, 6])
+    panels, here = truck(rng), spot.pose(0)
+    begins = rng.uniform(0, 20, len(_CROSSINGS))
+    movers = tuple(
+        Mover(panels, partial(_crossing, here, ahead, speed, gap, begin + number * gap))
+        for (ahead, speed, gap), begin in zip(_CROSSINGS, begins) for number in range(_ABREAST))
+    return _street_scene('traffic', seed, size, spot,
+                         World(_road_world(seed, True).panels, movers))
+
+
+def _crossing(here: Array, ahead: float, speed: float, gap: float, begin: float, index: int
+              ) -> Array:
+    """Pose (4, 4) of a lorry of a line that goes round and round, far out of sight at its ends."""
+    length = _ABREAST * gap
+    across = (begin + abs(speed) * index) % length - length / 2
+    way = level_pose(across if speed > 0 else -across, ahead, np.copysign(np.pi / 2, speed))
+    ground = here.copy()
+    ground[1, 3] = 0.0
+    return np.asarray(ground @ way)
+
+
 @lru_cache(maxsize=1)
 def _loop_world(seed: int) -> World:
     return World(street(_lap(1), _palette(seed, True), np.random.default_rng([seed, 2])))
@@ -248,4 +281,8 @@ SCENES: dict[str, Entry] = {
                       'looking round a study with a jerky hand, at times only turning'),
     'forest': Entry(12, 60, _DIVE_SIZE, build_forest,
                     'a path through a wood: weak, random texture'),
+    'whip': Entry(13, 60, _HAND_SIZE, build_whip,
+                  'swung to and fro in the study, 15 deg a frame'),
+    'traffic': Entry(14, 60, _CAR_SIZE, _build_traffic,
+                     'standing before a street that lorries cross', parallax=False),
 }

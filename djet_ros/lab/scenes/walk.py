@@ -1,4 +1,4 @@
-"""How people carry cameras: walking along a route, and looking round with a jerky hand."""
+"""How people carry cameras: walking along a route, with a jerky hand, and to and fro at speed."""
 
 from __future__ import annotations
 
@@ -133,3 +133,36 @@ class HandHeld:
 def _limited(vector: Array, most: float) -> Array:
     length = float(np.linalg.norm(vector))
     return vector * min(1.0, most / length) if length else vector
+
+
+@dataclass(frozen=True)
+class Whip:
+    """
+    A camera that is swung to the right and to the left, by the same angle from frame to frame.
+
+    place: (3,) in level axes, about which it also sways by up to 6 cm a frame; turn: radians per
+    frame; reach: radians to either side, a multiple of turn; tilt: how far down it looks; seed: of
+    the phases.
+    """
+
+    place: tuple[float, float, float]
+    turn: float
+    reach: float
+    tilt: float
+    seed: int = 0
+    limit: int = 10_000
+
+    def pose(self, index: int) -> Array:
+        """Pose (4, 4), camera to level axes."""
+        steps = round(self.reach / self.turn)
+        yaw = (abs((index + steps) % (4 * steps) - 2 * steps) - steps) * self.turn
+        sway = np.sin(self._phases + index * np.array([0.37, 0.53, 0.29, 0.47, 0.31]))
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_exp(-yaw * _YAW) @ rotation_exp(
+            (0.1 * sway[0] - self.tilt) * _PITCH) @ rotation_exp(0.08 * sway[1] * _ROLL)
+        pose[:3, 3] = self.place + sway[2:] * (0.12, 0.05, 0.1)
+        return pose
+
+    @cached_property
+    def _phases(self) -> Array:
+        return np.random.default_rng([self.seed, 25]).uniform(0, 2 * np.pi, 5)

@@ -1,0 +1,145 @@
+"""``djet lab beside``: what a gyro and masks are good for."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+import json
+
+from djet_ros.cli.options import add_output, add_seeds, split
+from djet_ros.cli.terminal import progress_bar
+from djet_ros.config.flags import add_flags, flag_values
+from djet_ros.config.flat import from_flat
+from djet_ros.errors import DjetError
+from djet_ros.lab.beside import (
+    is_wrong,
+    Moment,
+    NOTHING,
+    Row,
+    run_trial,
+    trial_rows,
+    TrialChunk,
+    TRIALS,
+)
+from djet_ros.lab.pairs import FAILURE
+from djet_ros.lab.runner import local_workers, run as run_chunks
+from djet_ros.lab.store import RecordStore
+from djet_ros.recordings.outputs import write_whole
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+# Pairs that are listed one by one at most.
+_LISTED = 20
+
+DESCRIPTION = """\
+Render ways through scenes that are hard for a camera alone (fast turns, two seconds of black
+images, a lorry that fills half of the picture, traffic before a camera that stands), and two that
+are not, and run the odometry through each with and without a gyro of a telephone's errors, or with
+an exact mask of what moves. Writes all of it as JSON. A run that was broken off is taken up where
+it ended.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument('--trials', default=','.join(TRIALS), metavar='LIST',
+                        help='(default: %(default)s)')
+    add_seeds(parser)
+    parser.add_argument('--frames', type=int, default=1000, metavar='N',
+                        help='of each trial at most (default: all, up to 301)')
+    add_output(parser, 'folder of the results')
+    parser.add_argument('--workers', type=int, metavar='N',
+                        help='processes on this machine (default: one for each core)')
+    add_flags(parser, ('estimator.max_features',))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all trials, and show what became of them."""
+    trials = split(args.trials)
+    if unknown := [name for name in trials if name not in TRIALS]:
+        raise DjetError(f"--trials has '{unknown[0]}'; choose of {', '.join(TRIALS)}")
+    if args.frames < 3 or (args.workers is not None and args.workers < 1):
+        raise DjetError(f'--frames is {args.frames} and --workers {args.workers}; at least three '
+                        'frames and one worker are needed')
+    args.output.mkdir(parents=True, exist_ok=True)
+    moments = _moments(args, [TrialChunk(name, seed, args.frames)
+                              for name in trials for seed in args.seeds])
+    rows = trial_rows(moments)
+    _show(rows, moments)
+    path = args.output / 'beside.json'
+    write_whole(path, json.dumps({'seeds': args.seeds, 'rows': [asdict(row) for row in rows]},
+                                 indent=1) + '\n')
+    print(f'figures: {path}')
+    return 0
+
+
+def _moments(args: argparse.Namespace, chunks: Sequence[TrialChunk]) -> list[Moment]:
+    config = from_flat(flag_values(args)).estimator
+    settings = {'frames': args.frames, 'estimator': asdict(config)}
+    with (RecordStore(args.output, Moment, settings, overwrite=args.overwrite) as store,
+          local_workers(args.workers) as executor, progress_bar('pairs') as progress):
+        return run_chunks(executor, chunks, partial(run_trial, config=config), store, progress)
+
+
+def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:
+    console = Console()
+    console.print(_pairs(rows))
+    print(f'failed: {FAILURE},\n  or a way where there was none; wrong: of those, the ones told '
+          'as if they were right; stood: told\n  as no motion; turn and way: errors of rotation '
+          'and direction in degrees, mean and worst of what\n  was told; ratio: of the mean, over '
+          'that with nothing; black images are not among these pairs')
+    if any(np.isfinite(row.dark_off_deg) or row.bias_off for row in rows):
+        console.print(_beyond(rows))
+        print('dark: worst turn since it was light, and its squared error over its covariance, 3 '
+              'on average if\n  that is true; bias: how far off at the end, as a share of the '
+              'true one')
+    if wrong := [moment for moment in moments if is_wrong(moment)]:
+        console.print(_list_of(wrong))
+
+
+def _pairs(rows: Sequence[Row]) -> Table:
+    table = _table('', 'with', 'pairs', 'failed', 'wrong', 'stood', 'turn', 'worst', 'ratio',
+                   'way', 'worst')
+    alone = {row.trial: row.rotation_deg[0] for row in rows if row.aid == NOTHING}
+    for row in rows:
+        ratio = row.rotation_deg[0] / max(alone.get(row.trial, float('nan')), 1e-9)
+        table.add_row(row.trial, row.aid, *map(str, (
+            row.pairs, row.failed, row.wrong, row.stood)),
+            *(_figure(value, 4) for value in row.rotation_deg), _figure(ratio, 2),
+            *(_figure(value, 3) for value in row.direction_deg))
+    return table
+
+
+def _beyond(rows: Sequence[Row]) -> Table:
+    table = _table('', 'with', 'dark: off deg', 'square', 'bias: off %, by seed')
+    for row in rows:
+        if np.isfinite(row.dark_off_deg) or row.bias_off:
+            table.add_row(row.trial, row.aid, _figure(row.dark_off_deg, 3),
+                          _figure(row.dark_surprise, 1),
+                          ' '.join(_figure(100 * one, 1) for one in row.bias_off))
+    return table
+
+
+def _list_of(wrong: Sequence[Moment]) -> Table:
+    table = _table('wrong', 'seed', 'with', 'frame', 'status', 'rotation deg', 'direction deg')
+    for one in wrong[:_LISTED]:
+        table.add_row(one.trial, str(one.seed), one.aid, str(one.frame), one.status,
+                      _figure(one.rotation_error_deg, 2), _figure(one.direction_error_deg, 1))
+    if len(wrong) > _LISTED:
+        table.add_row(f'and {len(wrong) - _LISTED} more')
+    return table
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify='right' if index > 1 else 'left', no_wrap=True)
+    return table
+
+
+def _figure(value: float, digits: int) -> str:
+    return f'{value:.{digits}f}' if np.isfinite(value) else '-'
