@@ -264,3 +264,17 @@ def test_a_pair_that_turned_otherwise_does_not_agree() -> None:
     sure = np.eye(3) * np.radians(0.004)**2
     assert agrees(Turn(rotation_exp(np.radians([0.03, 0, 0])), sure), visual)
     assert not agrees(Turn(rotation_exp(np.radians([0.3, 0, 0])), sure), visual)
+
+
+def test_a_turn_decides_between_two_motions_only_as_far_as_it_is_known() -> None:
+    rng = np.random.default_rng(3)
+    one, other = (rotation_exp(np.radians([0, angle, 0])) for angle in (0.0, 0.3))
+    wrong = {}
+    for sigma in np.radians([0.02, 0.1, 1.0]):
+        told = [Turn(rotation_exp(rng.normal(0, sigma, 3)) @ one, np.eye(3) * sigma**2)
+                for _ in range(500)]
+        wrong[sigma] = np.mean([turn.prefers(other, one) for turn in told])
+        right = np.mean([turn.prefers(one, other) for turn in told])
+        assert right == 1 if sigma < 1e-3 else right < 1
+    assert max(wrong.values()) < 0.01
+    assert right == 0  # by what is known to a degree

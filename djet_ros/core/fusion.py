@@ -15,6 +15,9 @@ _SLACK = np.radians(0.02)
 # Normalised squared difference (3 expected) that hardly ever comes by chance: 1 in 10^6.
 _SURPRISE = 31.0
 
+# Difference of normalised squares from which on one of two rotations is a hundred times likelier.
+_DECIDED = 2 * np.log(100)
+
 
 @dataclass(frozen=True)
 class Turn:
@@ -31,6 +34,12 @@ class Turn:
     def off(self, R: Array) -> Array:
         """Rotation vectors (…, 3) from the left that take R, (3, 3) or (N, 3, 3), to this."""
         return rotation_log(self.R @ R.swapaxes(-1, -2))
+
+    def prefers(self, R: Array, other: Array) -> bool:
+        """Tell whether this decides for one rotation (3, 3), found in images, and against one."""
+        allowed = self.covariance + _SLACK**2 * np.eye(3)
+        one, other = (z @ np.linalg.solve(allowed, z) for z in (self.off(R), self.off(other)))
+        return bool(other - one > _DECIDED)
 
 
 def agrees(turn: Turn, relative: RelativePose) -> bool:

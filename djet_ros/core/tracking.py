@@ -127,13 +127,13 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     if found is None:
         return None
     track, begun = found
-    if len(starts) == 1 or turn is not None:
+    if len(starts) == 1:
         return track
     second = second_motion(begun.problem, begun.places, track.pose, track.scale(),
                            config.min_matches)
     if second is None:
         return track
-    taken, other, guess = _of_the_camera(second, prior)
+    taken, other, guess = _of_the_camera(second, prior, turn)
     if taken is second.pose:
         members = np.zeros(len(y), bool)
         members[begun.voting] = second.members
@@ -215,13 +215,19 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
                  paraboloids.values(optimum), 0, 0)
 
 
-def _of_the_camera(second: SecondMotion, prior: Pose | None) -> tuple[Pose, Pose, bool]:
+def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
+                   ) -> tuple[Pose, Pose, bool]:
     """
     Tell the camera's motion from that of another body, and whether that is a guess.
 
-    It is the one that goes on like the motion before. Else it is the wider one, for the world
-    surrounds what moves in it: for sure where the other one is far smaller.
+    It is the one that turns as was measured, or that goes on like the motion before. Else it is
+    the wider one, for the world surrounds what moves in it: for sure where the other one is far
+    smaller.
     """
+    if turn is not None:
+        for one, other in ((second.first, second.pose), (second.pose, second.first)):
+            if turn.prefers(one.R, other.R):
+                return one, other, False
     if prior is not None:
         for one, other in ((second.first, second.pose), (second.pose, second.first)):
             if goes_on(prior, one, other):
