@@ -9,7 +9,8 @@ FRAMES ?= 21
 REAL_FRAMES ?=
 ONLY ?=
 SEEDS ?= 0,1,2,3,4
-PYTEST := python -m pytest -n auto --dist loadfile
+# in the order of their names: files of few tests, some of them long, would come last
+PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # the first that is there, works (a pyenv shim may not) and is new enough
 PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \

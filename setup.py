@@ -69,7 +69,7 @@ setup(
             'gtsam>=4.2.1,<5',
             'hypothesis>=6.98,<7',
             'pytest>=7.4,<10',
-            'pytest-xdist>=3.4,<4',
+            'pytest-xdist>=3.7,<4',
             # the oldest that builds wheels by itself, the newest that colcon accepts
             'setuptools>=70.1,<80',
         ],

@@ -10,17 +10,13 @@ from djet_ros.config.sections import Config, OdometryConfig, SlamConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.alignment import aligned, position_rmse
-from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, pose_of
-from djet_ros.odometry.scale import GroundTruthScale, UNKNOWN_LENGTH_SIGMA
-from djet_ros.odometry.tracker import Tracker
+from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
 from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.step_messages import StepMessages
-from djet_ros.recordings.recording import open_recording
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -563,44 +559,3 @@ def test_messages_that_say_nothing_are_counted_and_named_and_leave_a_hole(live):
     drive.go(pose(x=1.0))
     assert drive.slam.state == ('OK', 'mapping')
     assert [edge.kind for edge in drive.slam.map.edges] == ['unknown']
-
-
-# A rendered loop, with the real odometry
-
-def test_on_a_block_driven_twice_the_error_shrinks_by_a_factor(live, tmp_path):
-    """With small images, on which the odometry drifts a lot; lengths are the true ones."""
-    folder = render_sequence('loop', tmp_path, size=(310, 94))
-    config = from_flat({'odometry.scale': 'ground_truth', 'odometry.scale_uncertainty': 0.01,
-                        'estimator.max_features': 800})
-    source = open_recording(folder)
-    truth = dict(pose_of(one.message)
-                 for one in source.messages({source.ground_truth_topic}))
-    lengths = GroundTruthScale(np.array([*truth]),
-                               np.array([one[:3, 3] for one in truth.values()]), 0.01)
-    tracker = Tracker(config, message_type, lengths, source.image_topic)
-    slam = live(config, message_type, source.image_topic)
-    before, path = {}, None
-    for topic, _, message in source.messages({source.image_topic, source.info_topic}):
-        if topic == source.info_topic:
-            tracker.camera_info(message)
-            slam.camera_info(message)
-        elif topic == source.image_topic:
-            slam.image(message)
-            for name, said in tracker.image(message):
-                if name in ('relative_pose_cov', 'relative_pose_status', 'odometry'):
-                    take(slam, said)
-                if name == 'odometry':
-                    before.update([pose_of(said)])
-            while not slam.idle:
-                slam.work()
-    path = dict(slam.work(at_once=True))['path']
-    after = dict(pose_of(one) for one in path.poses)
-
-    def error(poses):
-        positions = np.array([poses[stamp][:3, 3] for stamp in after])
-        true = np.array([truth[stamp][:3, 3] for stamp in after])
-        return position_rmse(aligned(positions, true, scaled=False), true)
-
-    assert len(before) == 427
-    # What both laps have in common no loop can tell, and the odometry leaves little more.
-    assert error(after) < min(error(before) / 2, 0.25)

@@ -1,12 +1,24 @@
-"""A rendered block, driven twice: what closing the loop is good for."""
+"""
+A rendered block, driven twice: what closing the loop is good for.
+
+Images are small, so that the odometry drifts a lot; lengths are the true ones.
+"""
 
 import json
 import os
 import subprocess
 import sys
 
+from djet_ros.config.flat import from_flat
+from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.scenes.sequence import render_sequence
+from djet_ros.odometry.messages import pose_of
+from djet_ros.odometry.scale import GroundTruthScale
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.recording import open_recording
+import numpy as np
 import pytest
+from ros_messages import message_type
 
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 
@@ -15,7 +27,7 @@ DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; s
 def block(tmp_path_factory):
     """Folder of the sequence, in KITTI's layout."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    return render_sequence('loop', tmp_path_factory.mktemp('dataset'), size=(620, 188))
+    return render_sequence('loop', tmp_path_factory.mktemp('dataset'), size=(310, 94))
 
 
 def test_closing_the_loop_leaves_less_than_a_third_of_the_trajectory_error(block, tmp_path):
@@ -30,9 +42,54 @@ def test_closing_the_loop_leaves_less_than_a_third_of_the_trajectory_error(block
     assert said['frames'] == 427
     assert said['edges']['loop'] > 100
     assert said['rejected']['loop'] < 0.2 * said['edges']['loop']
-    assert before['ape_m'] > 0.03  # 1 in 10,000 of the way: there is something to be closed
+    assert before['ape_m'] > 0.1  # there is something to be closed
     assert after['ape_m'] < before['ape_m'] / 3
     if 'evo_ape_m' in before:
         assert after['evo_ape_m'] < before['evo_ape_m'] / 3
-        # Loops mend the way as a whole; from frame to frame it stays what it was, to a millimetre.
-        assert after['evo_rpe_m'] == pytest.approx(before['evo_rpe_m'], abs=0.001)
+        # Loops mend the way as a whole; from frame to frame it stays what it was.
+        assert after['evo_rpe_m'] == pytest.approx(before['evo_rpe_m'], rel=0.2)
+
+
+def test_live_it_shrinks_by_a_factor_too(block):
+    """With every second image: what is live may be slower than the camera."""
+    from djet_ros.posegraph.live_slam import LiveSlam
+    config = from_flat({'odometry.scale': 'ground_truth', 'odometry.scale_uncertainty': 0.01,
+                        'estimator.max_features': 800})
+    source = open_recording(block)
+    truth = dict(pose_of(one.message)
+                 for one in source.messages({source.ground_truth_topic}))
+    lengths = GroundTruthScale(np.array([*truth]),
+                               np.array([one[:3, 3] for one in truth.values()]), 0.01)
+    tracker = Tracker(config, message_type, lengths, source.image_topic)
+    slam = LiveSlam(config, message_type, source.image_topic)
+    hear = {'relative_pose_cov': slam.relative_pose, 'odometry': slam.odometry,
+            'relative_pose_status': slam.relative_pose_status}
+    before, images = {}, 0
+    for topic, _, message in source.messages({source.image_topic, source.info_topic}):
+        if topic == source.info_topic:
+            tracker.camera_info(message)
+            slam.camera_info(message)
+        if topic != source.image_topic:
+            continue
+        images += 1
+        if images % 2 == 0:
+            continue
+        slam.image(message)
+        for name, said in tracker.image(message):
+            if name in hear:
+                hear[name](said)
+            if name == 'odometry':
+                before.update([pose_of(said)])
+        while not slam.idle:
+            slam.work()
+    path = dict(slam.work(at_once=True))['path']
+    after = dict(pose_of(one) for one in path.poses)
+
+    def error(poses):
+        positions = np.array([poses[stamp][:3, 3] for stamp in after])
+        true = np.array([truth[stamp][:3, 3] for stamp in after])
+        return position_rmse(aligned(positions, true, scaled=False), true)
+
+    assert len(before) == 214
+    # What both laps have in common no loop can tell, and the odometry leaves little more.
+    assert error(after) < min(error(before) / 2, 0.25)
