@@ -44,6 +44,7 @@ def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(output)
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output, tmp_path):
     write_kitti_bag(KittiSequence(sequence), tmp_path / 'bag')
     run = bench(tmp_path / 'bag', '--output', tmp_path / 'bag.json', '--pairs', 2)

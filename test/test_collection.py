@@ -7,6 +7,8 @@ from pathlib import Path
 import subprocess
 import sys
 
+import pytest
+
 HERE = Path(__file__).parent
 
 # As launch_testing does, where nothing that the tests can do without is installed.
@@ -23,6 +25,7 @@ def pytest_pycollect_makemodule(module_path, parent):
 """
 
 
+@pytest.mark.slow
 def test_every_module_is_collected_where_a_plugin_imports_them_and_libraries_are_missing(
         tmp_path: Path) -> None:
     (tmp_path / 'eager.py').write_text(PLUGIN)

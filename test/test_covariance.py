@@ -13,6 +13,7 @@ from djet_ros.core.surfaces import DescriptorSurface, with_minimum
 from djet_ros.core.types import Status
 from djet_ros.lab.scenes.pair import render_pair
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
@@ -31,6 +32,7 @@ def normalised_squared_error(name: str, first: int) -> float:
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says():
     # Pairs far from one another, so that their errors are independent. True within a factor of
     # 2 in variance, 1.4 in standard deviation: errors of real surfaces are no Gaussians.

@@ -78,6 +78,7 @@ def test_pairs_are_summed_up_by_scene() -> None:
     assert rows[1].inside[-1][0] == 0
 
 
+@pytest.mark.slow
 def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path) -> None:
     command = ('--scenes', 'road', '--seeds', '1', '--frames', 4, '--output', tmp_path,
                '--workers', 1)

@@ -118,6 +118,7 @@ def test_reprojection_error_comes_as_near_to_the_true_pose_as_the_cramer_rao_bou
     assert np.abs(errors.mean(0) / np.sqrt(np.diag(bound) / TRIALS)).max() < 4  # no bias
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('motion', 'loss'), [
     *((motion, 'none') for motion in MOTIONS), ('sideways', 'geman_mcclure'),
     ('forward', 'cauchy'), ('backward', 'geman_mcclure')])
@@ -316,6 +317,7 @@ def pair_errors(config, K, frames, motions):
     return np.array([errors_of(result, *motion) for result, motion in zip(results, motions)])
 
 
+@pytest.mark.slow
 def test_descriptors_recover_rotation_to_a_hundredth_of_a_degree_on_rendered_frames():
     camera, frames, motions = drive('road', 8)
     errors = pair_errors(preset('best'), camera, frames[:6], motions[:5])

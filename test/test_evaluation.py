@@ -86,6 +86,7 @@ def without_times(path: Path) -> list[dict[str, str]]:
 
 # Tables and records
 
+@pytest.mark.slow
 def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
     table = rows(evaluated / 'table1.csv')
     assert list(table[0]) == COLUMNS
@@ -268,6 +269,7 @@ def torn_truth(road: Path, folder: Path) -> Path:
 
 # Sources
 
+@pytest.mark.slow
 def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path):
     write_kitti_bag(KittiSequence(road, end=4), tmp_path / 'bag')
     answer = djet('evaluate', tmp_path / 'bag', road, '--end', '4', '--methods', 'djet',
@@ -297,6 +299,7 @@ def test_a_folder_of_sequences_is_all_of_them_with_names_of_their_own(road, tmp_
 
 # Running on workers
 
+@pytest.mark.slow
 def test_one_and_two_workers_write_the_same_bytes(road, short, tmp_path):
     assert djet('evaluate', road, '--output', tmp_path, '--workers', '2', *RUN).returncode == 0
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
@@ -346,6 +349,7 @@ def workers_of(process: subprocess.Popen[str]) -> list[int]:
             if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path):
     children = workers_of(running)
     running.kill()
@@ -362,6 +366,7 @@ def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path)
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
 
 
+@pytest.mark.slow
 def test_a_workers_death_is_said_and_costs_only_its_chunk(road, short, running, tmp_path):
     for worker in workers_of(running):
         os.kill(worker, signal.SIGKILL)
@@ -382,6 +387,7 @@ def test_an_interrupt_is_one_line_and_keeps_what_was_done(running, tmp_path):
     assert chunks(tmp_path)
 
 
+@pytest.mark.slow
 def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--output', tmp_path)
     assert djet(*run, '--methods', 'djet').returncode == 0
@@ -394,6 +400,7 @@ def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     assert {row['method'] for row in rows(tmp_path / 'table1.csv')} == {'rpe'}
 
 
+@pytest.mark.slow
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
            '--output', tmp_path)
@@ -483,6 +490,7 @@ def test_evo_finds_no_error_in_the_truth_itself(evaluated):
 
 # Ablation
 
+@pytest.mark.slow
 def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     answer = djet('ablate', road, '--end', '4', '--output', tmp_path, '--windows', '3,5',
                   '--parts', 'window,recentring,starts', '--presets', 'best,paper')

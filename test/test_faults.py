@@ -78,6 +78,7 @@ def wait_for(ready: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(4))
 def test_what_was_written_before_a_kill_is_readable(drive, tmp_path, seed):
     results = tmp_path / 'results'

@@ -113,6 +113,7 @@ def on_a_robot():
     yield from drive()
 
 
+@pytest.mark.slow
 def test_with_a_base_frame_the_odometry_is_that_of_the_vehicle_by_the_bags_own_tf(tmp_path):
     path = record(tmp_path / 'bag', on_a_robot())
     for name, words in (('camera', ()), ('base', ('--base-frame', 'base_link'))):
@@ -162,6 +163,7 @@ def test_the_summary_holds_counts_and_errors(replayed):
         assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
 
 
+@pytest.mark.slow
 def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
     results, _ = replayed
     assert summary(results)['drift'] is None

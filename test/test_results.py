@@ -55,6 +55,7 @@ def part(output: Path) -> Any:
     return json.loads(output.read_text())['parts'][SCENE]
 
 
+@pytest.mark.slow
 def test_every_method_is_measured_on_every_pair(part):
     methods = {one['method'] for one in part['methods']}
     assert {'djet', 'rpe', 'pjet', 'five_point', 'opencv_ransac'} <= methods
@@ -73,6 +74,7 @@ def test_standing_still_is_no_failure_and_has_no_direction(part):
     assert part['odometry']['rotation']['max'] < bound
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_taken_over_and_other_settings_begin_anew(output, tmp_path):
     begun = tmp_path / 'results.json'
     begun.write_text(output.read_text())

@@ -26,6 +26,7 @@ def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
                           capture_output=True, text=True, timeout=300, check=False)
 
 
+@pytest.mark.slow
 def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path) -> None:
     output = tmp_path / 'deep' / 'soak.json'
     run = djet_soak('--output', output, '--frames', FRAMES)
@@ -61,6 +62,7 @@ def soak_leaking() -> dict[str, Any]:
     return soak(100, most_growth_mb=10.0)
 
 
+@pytest.mark.slow
 def test_a_leak_is_found() -> None:
     # In a process of its own: what earlier tests have freed here would be taken first, unseen.
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as fresh:
