@@ -138,7 +138,8 @@ def test_a_bag_with_an_imu_played_live_gives_the_poses_of_djet_replay_to_the_las
         expected = {topic: [serialised(m.message) for m in replayed.messages({topic})]
                     for topic in poses}
     live(*EVERY, '-p', 'odometry.imu:=true', '-r', 'imu:=/imu/data_raw', topic=RECTIFIED)
-    player = start('play', bag, '--rate', '2')
+    # The samples have to come although images wait for room.
+    player = start('play', bag, '--rate', '20')
     peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
     player.finish()
     for topic in poses:

@@ -12,6 +12,7 @@ from typing import Any
 
 from cards import Cards, K, pose, SIZE
 from djet_ros.odometry.messages import pose_of, stamp_ns
+from djet_ros.recordings.decoding import MAKE
 import numpy as np
 import pytest
 from ros_graph import command, ENVIRONMENT, NodeProcess, nodes as processes, Peer, peer
@@ -40,6 +41,8 @@ ODOMETRY_PARAMETERS = {'estimator.max_features': 800, 'ros.queue_policy': 'every
 SLAM_PARAMETERS = {'estimator.max_features': 800, 'ros.queue_policy': 'every',
                    'slam.keyframe_distance': 0.4, 'slam.loop_gap': 0.5,
                    'slam.path_period': 0.0, 'slam.optimise_period': 0.0}
+# The camera on its vehicle: ahead of the base and above it, looking to the left.
+TO_THE_LEFT = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
 
 Heard = dict[str, list[Any]]
 
@@ -94,19 +97,23 @@ def transforms(heard: Heard, parent: str) -> dict[int, Any]:
                 if one.header.frame_id == parent)
 
 
-def worst(poses: dict[int, Any]) -> float:
-    """Give the largest distance from the way to the right, of poses by stamp."""
-    return max(float(np.linalg.norm(here[:3, 3] - [0, -WAYS[(stamp - START) // PERIOD], 0]))
-               for stamp, here in poses.items())
+def worst(poses: dict[int, Any], to_the_right: list[int]) -> float:
+    """Give the largest distance from the way to the camera's right, of poses by stamp."""
+    return max(float(np.linalg.norm(
+        here[:3, 3] - WAYS[(stamp - START) // PERIOD] * np.array(to_the_right)))
+        for stamp, here in poses.items())
 
 
-@pytest.fixture
-def driven(listener: Peer, camera: Peer,
-           nodes: Callable[..., NodeProcess]) -> Iterator[NodeProcess]:
-    """Give the pose graph's process, after a way to the right and back."""
-    nodes('vo_node', **ODOMETRY_PARAMETERS)
-    graph = nodes('pose_graph_node', **SLAM_PARAMETERS)
-    listener.wait('both nodes', lambda heard: said('waiting for odometry')(heard), 60)
+def drive(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess],
+          **parameters: Any) -> NodeProcess:
+    """Go to the right and back, and give the pose graph's process."""
+    nodes('vo_node', **ODOMETRY_PARAMETERS, **parameters)
+    graph = nodes('pose_graph_node', **SLAM_PARAMETERS, **parameters)
+    listener.wait('both nodes', said('waiting for the mounting of the camera on tf' if parameters
+                                     else 'waiting for odometry'), 60)
+    if parameters:
+        camera.advertise('/tf_static', TYPES['/tf'], 2, durability='transient_local', depth=1)
+        camera.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', TO_THE_LEFT))
     advertise(camera, 2)
     see(camera, WAYS)
     last = START + (len(WAYS) - 1) * PERIOD
@@ -115,7 +122,14 @@ def driven(listener: Peer, camera: Peer,
     return graph
 
 
-def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:
+@pytest.fixture
+def driven(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> NodeProcess:
+    """Give the pose graph's process, after a way to the right and back."""
+    return drive(listener, camera, nodes)
+
+
+def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
+    """Wait until the loops are closed, and check the path and the frames."""
     values = listener.wait('loops', lambda heard: (found := said('mapping')(heard))
                            and int(found['keyframes waiting']) == 0
                            and int(found['loops']) >= 3 and found, 60)
@@ -124,20 +138,36 @@ def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: No
     assert path.header.frame_id == 'map'
     told = dict(pose_of(one) for one in listener.heard[ODOMETRY])
     # Loops can't mend what is exact to 3 cm already.
-    assert worst(dict(pose_of(one) for one in path.poses)) < max(worst(told), 0.03)
+    assert worst(dict(pose_of(one) for one in path.poses), to_the_right) < max(
+        worst(told, to_the_right), 0.03)
     # REP 105: odom -> camera is the odometry's alone, and map -> odom carries the correction
-    map_to_odom, odom_to_camera = (transforms(listener.heard, frame) for frame in ('map', 'odom'))
-    assert map_to_odom.keys() == odom_to_camera.keys() == told.keys()
+    map_to_odom, odom_to_child = (transforms(listener.heard, frame) for frame in ('map', 'odom'))
+    assert map_to_odom.keys() == odom_to_child.keys() == told.keys()
     for stamp in told:
-        assert np.allclose(told[stamp], odom_to_camera[stamp], atol=1e-12)
+        assert np.allclose(told[stamp], odom_to_child[stamp], atol=1e-12)
     # the first path to a frame goes out with the frame's own correction
-    first = {}
+    first: dict[int, Any] = {}
     for message in listener.heard[PATH]:
         stamp, here = pose_of(message.poses[-1])
         first.setdefault(stamp, here)
     assert len(first) == len(WAYS)
     for stamp, here in first.items():
-        assert np.allclose(map_to_odom[stamp] @ odom_to_camera[stamp], here, atol=1e-9)
+        assert np.allclose(map_to_odom[stamp] @ odom_to_child[stamp], here, atol=1e-9)
+
+
+def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:
+    check_the_map(listener, to_the_right=[0, -1, 0])
+
+
+def test_with_a_base_frame_the_map_is_of_the_vehicle_by_the_mounting_on_tf(
+        listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> None:
+    pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    drive(listener, camera, nodes, **{'odometry.base_frame': 'base_link'})
+    # What the camera that looks to the left has on its right is ahead of the vehicle.
+    check_the_map(listener, to_the_right=[1, 0, 0])
+    pairs = {(one.header.frame_id, one.child_frame_id) for message in listener.heard['/tf']
+             for one in message.transforms}
+    assert pairs == {('map', 'odom'), ('odom', 'base_link')}
 
 
 def test_a_reset_forgets_the_map_and_goes_on(
@@ -161,16 +191,20 @@ def test_a_signal_ends_it_cleanly(
 
 def test_what_is_missing_is_said_with_its_resolved_name(
         listener: Peer, nodes: Callable[..., NodeProcess]) -> None:
+    nodes('vo_node')
+    listener.ask('published', topic=ODOMETRY)
     graph = nodes('pose_graph_node')
     listener.wait('diagnostics', said('waiting for odometry'), 60)
     for _ in range(100):
-        if 'waiting for relative_pose_cov' in graph.log:
+        if 'waiting for camera_info' in graph.log:
             break
         sleep(0.1)
-    for line in (f'waiting for odometry on {ODOMETRY}: nobody publishes it',
+    for line in (f'waiting for odometry on {ODOMETRY}: 1 publish it, none sends',
                  f'waiting for image on {IMAGE}: nobody publishes it',
                  f'waiting for camera_info on {INFO}: nobody publishes it'):
         assert line in graph.log
+    # The odometry's debug_image is an image, too, and not meant.
+    assert 'did you mean' not in graph.log
 
 
 def node(*words: str, before: str = '') -> subprocess.CompletedProcess[str]:

@@ -137,9 +137,11 @@ def launched(environment: dict[str, str], log: Path, *words: str, until: str,
              times: int = 1) -> str:
     """Run ros2 launch until its output has a text so often, end it by Ctrl-C, give the output."""
     with log.open('w') as file:
-        process = subprocess.Popen(['ros2', 'launch', 'djet_ros', *words], env=environment,
-                                   stdout=file, stderr=subprocess.STDOUT,
-                                   start_new_session=True)
+        # A shell's background job, such as this run of the tests may be, has Ctrl-C switched off.
+        process = subprocess.Popen(
+            ['ros2', 'launch', 'djet_ros', *words], env=environment, stdout=file,
+            stderr=subprocess.STDOUT, start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     try:
         end = monotonic() + 30
         while log.read_text().count(until) < times and monotonic() < end \

@@ -125,17 +125,26 @@ class Subscription:
     """Hands messages of one topic to a callback; the callbacks are called by Graph.spin."""
 
     def __init__(self, reader: DataReader, topic: str, profile: Profile, batch: int,
-                 callback: Callable[[Any, Any], None]) -> None:
+                 callback: Callable[[Any, Any], None], ready: Callable[[], bool] | None) -> None:
         self.topic = topic
         self.profile = profile
+        self.waited_for = False
         self._reader = reader
         self._batch = batch
         self._callback = callback
+        self._ready = ready
         self._garbage = 0
         self.condition = ReadCondition(reader, _ANY)
 
+    @property
+    def ready(self) -> bool:
+        """Whether messages are to be taken now."""
+        return self._ready is None or self._ready()
+
     def dispatch(self) -> None:
         """Hand out what has come, up to the size of a batch."""
+        if not self.ready:
+            return
         for sample in self._reader.take(self._batch, self.condition):
             if sample.sample_info.valid_data:
                 self._callback(sample.data, sample.sample_info)
@@ -209,12 +218,13 @@ class Graph:
 
     def listen(self, topic: str, ros_type: str, callback: Callable[[Any], None],
                profile: Profile = DEFAULT_PROFILE, *, batch: int = 100,
-               garbage: Callable[[str], None] = lambda reason: None) -> Subscription:
+               garbage: Callable[[str], None] = lambda reason: None,
+               ready: Callable[[], bool] | None = None) -> Subscription:
         """
         Hand the messages on a topic to a callback.
 
         batch: how many at most before it is the turn of other topics; garbage: is told of each
-        sample that is no such message, and why.
+        sample that is no such message, and why; ready: see ``Middleware.listen``.
         """
         def take(data: bytes, _: Any) -> None:
             try:
@@ -226,26 +236,35 @@ class Graph:
             callback(message)
 
         subscription = self.listen_raw(f'rt{topic}', dds_type_name(ros_type), take, profile,
-                                       _type_hash(ros_type), batch)
+                                       _type_hash(ros_type), batch, ready)
         subscription.topic = topic
         return subscription
 
     def listen_raw(self, dds_topic: str, dds_type: str, callback: Callable[[Any, Any], None],
-                   profile: Profile, user_data: str, batch: int = 100) -> Subscription:
+                   profile: Profile, user_data: str, batch: int = 100,
+                   ready: Callable[[], bool] | None = None) -> Subscription:
         """Hand CDR and sample information on a topic, under its DDS names, to a callback."""
         reader = DataReader(self._participant,
                             Topic(self._participant, dds_topic, sample_type(dds_type)),
                             _qos(profile, user_data))
-        subscription = Subscription(reader, dds_topic, profile, batch, callback)
-        self._waiting.attach(subscription.condition)
+        subscription = Subscription(reader, dds_topic, profile, batch, callback, ready)
         self._subscriptions.append(subscription)
         return subscription
 
     def spin(self, seconds: float) -> None:
         """Wait for messages, at most for some time, and hand them out in order of listening."""
+        for subscription in self._subscriptions:
+            self._wait_for(subscription, wanted=subscription.ready)
         self._waiting.wait(duration(seconds=seconds))
         for subscription in list(self._subscriptions):
             subscription.dispatch()
+
+    def _wait_for(self, subscription: Subscription, *, wanted: bool) -> None:
+        """Be woken up by messages, or not: those that are not taken would do so at once."""
+        if wanted != subscription.waited_for:
+            subscription.waited_for = wanted
+            change = self._waiting.attach if wanted else self._waiting.detach
+            change(subscription.condition)
 
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""

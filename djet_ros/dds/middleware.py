@@ -12,7 +12,6 @@ from djet_ros.dds.graph import Graph, Publisher, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
 from djet_ros.live.middleware import Offer, Profile
-from djet_ros.live.topics import IMAGE_TYPES
 from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
 from djet_ros.odometry.static_frames import StaticFrames, TOPIC, TYPE
 from djet_ros.recordings.decoding import message_type
@@ -77,11 +76,11 @@ class DdsMiddleware:
         return self._graph.advertise(topic, kind)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile) -> Subscription:
+               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
         """Hand the messages on a topic to a callback."""
-        # One image at a time: it waits where the queue is full, and services need their turn.
+        # One at a time, where another may have to wait.
         return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
-                                  batch=1 if kind in IMAGE_TYPES.values() else 100)
+                                  batch=100 if ready is None else 1, ready=ready)
 
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""

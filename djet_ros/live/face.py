@@ -17,6 +17,9 @@ from djet_ros.odometry.tracker import Outgoing
 
 _TICK = 1.0
 
+# Seconds to wait for messages at most: with room for images, and until there is.
+_PAUSE, _MOMENT = 0.1, 0.005
+
 _IMAGE = IMAGE_TYPES['raw']
 
 
@@ -35,6 +38,10 @@ class LiveSession(Protocol):
 
     def tick(self) -> None:
         """Say what no message makes it say; called once a second."""
+
+    @property
+    def has_room(self) -> bool:
+        """Whether an image would be taken at once."""
 
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""
@@ -68,7 +75,8 @@ class Face:
         self.session.start()
         try:
             while not stop.is_set():
-                self._middleware.spin(0.1)
+                # Nothing wakes it up where an image has been worked on, and others wait for room.
+                self._middleware.spin(_PAUSE if self.session.has_room else _MOMENT)
                 if self.session.failed:
                     return 1
                 if monotonic() - self._last_tick >= _TICK:
@@ -107,7 +115,9 @@ class Face:
             return (f'nobody publishes it, but {topic}/compressed; set '
                     'ros.image_transport:=compressed')
         own = {self._middleware.resolve(full_name(output)) for output in self._outputs}
-        elsewhere = sorted(set(self._middleware.published(wanted)) - set(self._kinds) - own)
+        # What an odometry draws for people is no camera.
+        elsewhere = sorted(name for name in set(self._middleware.published(wanted)).difference(
+            self._kinds, own) if not name.endswith('/debug_image'))
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
         return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
 
@@ -134,18 +144,23 @@ class Face:
                 self._middleware.resolve(full_name(topic)), outputs[topic])
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile) -> Subscription:
+               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
         """Subscribe to a resolved topic; a publisher that does not fit is reported."""
         self._kinds[topic] = kind
-        self._inputs.append(self._middleware.listen(topic, kind, callback, profile))
+        self._inputs.append(self._middleware.listen(topic, kind, callback, profile, ready))
         return self._inputs[-1]
 
     def listen_to_camera(self, image: str, info: str, transport: str, profile: Profile) -> None:
         """Subscribe to images and their CameraInfo, which may be latched; the last inputs."""
+        def ready() -> bool:
+            return self.session.has_room
+
         self._info_topic = info
-        # CameraInfo first: of two that wait, it is to be taken before its image.
-        self.listen(info, INFO_TYPE, self.session.camera_info, profile)
-        self._images = self.listen(image, IMAGE_TYPES[transport], self.session.image, profile)
+        # CameraInfo first: of two that wait, it is to be taken before its image; and none that
+        # belongs to an image that has to wait. What comes beside them must not wait.
+        self.listen(info, INFO_TYPE, self.session.camera_info, profile, ready)
+        self._images = self.listen(image, IMAGE_TYPES[transport], self.session.image, profile,
+                                   ready)
 
     # Once a second
 

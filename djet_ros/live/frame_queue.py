@@ -64,6 +64,12 @@ class FrameQueue(Generic[Item]):
             self._changed.notify_all()
             return item
 
+    @property
+    def has_room(self) -> bool:
+        """Whether ``put`` would not have to wait."""
+        with self._changed:
+            return self._drops or self._has_room()
+
     def clear(self) -> int:
         """Throw away what waits, and tell how many items that was."""
         with self._changed:

@@ -72,6 +72,11 @@ class GraphSession:
 
     # What comes in
 
+    @property
+    def has_room(self) -> bool:
+        """Whether an image would be taken at once, as all are."""
+        return True
+
     def odometry(self, message: Any) -> None:
         """Take an Odometry."""
         self._take('odometry', lambda: self._slam.odometry(message))
@@ -148,7 +153,7 @@ class GraphSession:
     def _log_loops(self) -> None:
         loops = self._slam.map.count('loop')
         if loops > self._loops:
-            self._wiring.log('info', f'{loops - self._loops} loops closed, {loops} in all, among '
+            self._wiring.log('info', f'loops closed: {loops - self._loops} more, {loops} in all, among '
                              f'{len(self._slam.map.keyframes)} keyframes')
         self._loops = loops
 

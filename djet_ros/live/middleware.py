@@ -96,8 +96,13 @@ class Middleware(Protocol):
         """Publish messages of a ROS type on a topic, by its resolved name."""
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile) -> Subscription:
-        """Hand the messages on a topic, by its resolved name, to a callback."""
+               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
+        """
+        Hand the messages on a topic, by its resolved name, to a callback.
+
+        ready: asked before each message; while it says no, messages wait in the middleware, and
+        those of other topics go on.
+        """
 
     def offers(self, topic: str) -> Sequence[Offer]:
         """Give who publishes a topic, by its resolved name."""

@@ -171,6 +171,11 @@ class Session:
 
     # What comes in
 
+    @property
+    def has_room(self) -> bool:
+        """Whether an image would be taken at once; with the policy 'every' it may have to wait."""
+        return self._queue.has_room
+
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""
         self._last_image = monotonic()

@@ -12,6 +12,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
 from djet_ros.odometry.messages import pose_of
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -59,16 +60,29 @@ class RosPublisher:
         return int(self._publisher.get_subscription_count())
 
 
+class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
+    """Leaves messages in the middleware for as long as nobody is ready to take them."""
+
+    def __init__(self, ready: Callable[[], bool]) -> None:
+        super().__init__()
+        self._ready = ready
+
+    def can_execute(self, entity: Any) -> bool:
+        """Tell the executor whether to look for messages, and to hand one out."""
+        return self._ready() and bool(super().can_execute(entity))
+
+
 class RosSubscription:
     """Hears one topic, and counts what its events tell."""
 
     def __init__(self, node: Node, topic: str, kind: str, callback: Callable[[Any], None],
-                 profile: Profile) -> None:
+                 profile: Profile, ready: Callable[[], bool] | None) -> None:
         self.topic = topic
         self._lost = self._refused = 0
         with _asked_for(node, topic):
             self._subscription = node.create_subscription(
                 message_type(kind), topic, callback, _qos(profile),
+                callback_group=None if ready is None else _WhenReady(ready),
                 event_callbacks=SubscriptionEventCallbacks(
                     incompatible_qos=self._note_refusal, message_lost=self._note_loss),
                 # Overrides are by topic; a latched subscription takes after the publisher.
@@ -144,9 +158,9 @@ class RosMiddleware:
                 qos_overriding_options=_OVERRIDES))
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile) -> RosSubscription:
+               profile: Profile, ready: Callable[[], bool] | None = None) -> RosSubscription:
         """Hand the messages on a topic to a callback; overrides as for ``advertise``."""
-        return RosSubscription(self._node, topic, kind, callback, profile)
+        return RosSubscription(self._node, topic, kind, callback, profile, ready)
 
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""
