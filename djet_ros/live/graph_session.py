@@ -153,8 +153,8 @@ class GraphSession:
     def _log_loops(self) -> None:
         loops = self._slam.map.count('loop')
         if loops > self._loops:
-            self._wiring.log('info', f'loops closed: {loops - self._loops} more, {loops} in all, among '
-                             f'{len(self._slam.map.keyframes)} keyframes')
+            self._wiring.log('info', f'loops closed: {loops - self._loops} more, {loops} in all, '
+                             f'among {len(self._slam.map.keyframes)} keyframes')
         self._loops = loops
 
     def _take_images(self) -> None:
