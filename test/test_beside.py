@@ -18,7 +18,8 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
 from djet_ros.live.session import Session
-from djet_ros.odometry.messages import MessageFactory
+from djet_ros.odometry.messages import MessageFactory, pose_of
+from djet_ros.odometry.moving_frames import MovingFrames
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.mask_files import still_mask
@@ -352,7 +353,7 @@ def test_masks_are_undistorted_with_their_images() -> None:
     mask[:, :60] = 0
     one.mask(image(mask, stamp_ns=START))
     assert one._camera is not None
-    left_out = one._beside.left_out(START, mask.shape, one._camera)
+    left_out = one._beside.left_out(START, 'camera', mask.shape, one._camera)
     assert left_out is not None
     # The edge of a barrel image is pulled in at its middle less than at its corners.
     ends = [int(np.flatnonzero(row)[-1]) for row in left_out[[0, 119]]]
@@ -420,3 +421,96 @@ def test_static_frames_are_chained_in_both_directions() -> None:
     assert np.allclose(frames.transform('imu', 'base_link'), np.linalg.inv(a @ b))
     assert frames.transform('base_link', 'camera') is None
     assert np.array_equal(frames.transform('imu', 'imu'), np.eye(4))
+
+
+# Another odometry by tf
+
+def moved(stamp: int, parent: str, child: str, pose: Array) -> Any:
+    return MAKE.frame(stamp, parent, child, pose)
+
+
+def test_frames_that_move_are_chained_between_their_stamps() -> None:
+    frames = MovingFrames()
+    a, b, c = pose(x=1.0, yaw=0.3), pose(z=2.0, yaw=-0.2), pose(x=0.1)
+    frames.add(moved(0, 'mast', 'camera', c), static=True)
+    for stamp, yaw in ((0, 0.0), (100, 0.4), (300, 0.4)):
+        frames.add(moved(stamp, 'base_link', '/mast', pose(yaw=yaw)), static=False)
+    for stamp, where in ((0, a), (200, a @ b)):
+        frames.add(moved(stamp, '/odom', 'base_link', where), static=False)
+    found = frames.poses('odom', 'camera', np.array([0, 50, 100, 200, 250]))
+    assert np.allclose(found[0], a @ c)
+    assert np.allclose(found[3], a @ b @ pose(yaw=0.4) @ c)
+    assert np.allclose(found[1][:3, 3], (a @ pose(z=0.5, yaw=-0.05) @ pose(yaw=0.2) @ c)[:3, 3],
+                       atol=0.01)
+    assert np.isnan(found[4]).all()
+    # Downwards, and of another tree.
+    down = frames.poses('camera', 'odom', np.array([0]))
+    assert np.allclose(down[0], np.linalg.inv(a @ c))
+    assert np.isnan(frames.poses('map', 'camera', np.array([0]))).all()
+    assert frames.covers('odom', 'camera', 200) and not frames.covers('odom', 'camera', 250)
+    assert frames.covers('base_link', 'camera', 300) and not frames.covers('map', 'camera', 0)
+    frames.forget_before(200)
+    assert np.isfinite(frames.poses('odom', 'camera', np.array([200]))).all()
+
+
+def test_a_circle_of_frames_ends() -> None:
+    frames = MovingFrames()
+    frames.add(moved(0, 'a', 'b', np.eye(4)), static=False)
+    frames.add(moved(0, 'b', 'a', np.eye(4)), static=False)
+    assert np.isnan(frames.poses('odom', 'a', np.array([0]))).all()
+
+
+def tf_of(drive: Drive, index: int, T: Array) -> Any:
+    return moved(START + index * PERIOD, 'wheels', 'base_link',
+                 T @ drive.poses[index] @ np.linalg.inv(T))
+
+
+def test_tf_gives_what_the_topic_gives(drive: Drive) -> None:
+    T = pose(x=1.2, yaw=0.4)
+    by_topic = tracker(**{'odometry.scale': 'guess'})
+    by_tf = tracker(**{'odometry.scale': 'guess', 'odometry.guess_frame': 'wheels'})
+    mounted = moved(START, 'base_link', 'camera', T)
+    by_topic.guess(odometry(drive, 0, T))
+    by_topic.mount_beside('guess', pose_of(mounted.transforms[0])[1])
+    assert by_tf.lacks(drive.image(0)) == 'guess'
+    by_tf.tf_static(mounted)
+    for i in range(len(drive.images)):
+        by_topic.guess(odometry(drive, i, T))
+        by_tf.tf(tf_of(drive, i, T))
+        assert by_tf.lacks(drive.image(i)) == ''
+        for one in (by_topic, by_tf):
+            one.image(drive.image(i))
+        assert by_topic.last is not None and by_tf.last is not None
+        assert np.allclose(by_topic.last.pose, by_tf.last.pose, rtol=0, atol=1e-9)
+    assert by_tf.last.measured and by_tf.last.status.value == 'OK'
+
+
+def test_a_frame_that_tf_does_not_know_is_said_with_its_names(drive: Drive) -> None:
+    one = tracker(**{'odometry.guess': True, 'odometry.guess_frame': 'wheels'})
+    for i in range(6):
+        one.image(drive.image(i))
+    assert "where 'camera' is in 'wheels' (odometry.guess_frame)" in said(one)['no guess in time']
+
+
+def test_our_own_echo_is_refused_as_a_guess() -> None:
+    with pytest.raises(DjetError, match="guess_frame is 'odom'"):
+        from_flat({'odometry.guess_frame': 'odom', 'ros.publish_tf': True})
+
+
+def test_live_follows_tf_to_the_last_bit(live: Any, drive: Drive) -> None:
+    values = {'odometry.guess': True, 'odometry.guess_frame': 'wheels'}
+    T, alone = pose(x=1.2, yaw=0.4), tracker(**values)
+    session, one, graph = live(**values)
+    for face in (alone, session):
+        face.tf_static(moved(START, 'base_link', 'camera', T))
+    expected = []
+    for i in range(len(drive.images)):
+        alone.tf(tf_of(drive, i, T))
+        expected += [serialised(message.message) for message in alone.image(drive.image(i))
+                     if message.topic in POSES]
+        session.image(drive.image(i))  # before what belongs to it
+        session.tf(tf_of(drive, i, T))
+    wait_for(one, len(drive.images))
+    session.configure(one.config)
+    assert [serialised(message.message) for message in graph.published
+            if message.topic in POSES] == expected

@@ -129,6 +129,30 @@ def test_with_a_base_frame_the_odometry_is_that_of_the_vehicle_by_the_bags_own_t
     assert np.array_equal(read_tum(tmp_path / 'base' / 'trajectory_tum.txt')[1], camera)
 
 
+def test_tf_of_a_recording_gives_the_lengths_through_a_frame_that_moves(tmp_path):
+    """Messages of tf come between the images, a little after the one that they cover."""
+    here = np.eye(4)
+
+    def told():
+        nonlocal here
+        for topic, message, stamp in on_a_robot():
+            yield topic, message, stamp
+            if topic == IMAGE_TOPIC:
+                base = AHEAD @ here @ np.linalg.inv(AHEAD)
+                yield '/tf', MAKE.frame(stamp, 'wheels', 'base_link', base), stamp + 20_000_000
+                here = here @ STEP
+
+    path, words = record(tmp_path / 'bag', told()), ('--scale', 'guess', '--guess-frame', 'wheels')
+    djet('replay', path, '--output', tmp_path / 'out', *words)
+    assert summary(tmp_path / 'out')['pairs_of_known_scale'] == FRAMES - 1
+    _, camera = read_tum(tmp_path / 'out' / 'trajectory_tum.txt')
+    true = [np.linalg.matrix_power(STEP, i)[:3, 3] for i in range(FRAMES)]
+    assert np.allclose(camera[:, :3, 3], true, atol=0.02)
+    without = djet('replay', record(tmp_path / 'none', drive()), '--output', tmp_path / 'no',
+                   *words, expect=2)
+    assert 'has no /tf, which odometry.guess_frame asks for' in without.stderr
+
+
 def test_a_recording_that_does_not_tell_the_mounting_says_so_in_a_line(tmp_path, folder):
     path = record(tmp_path / 'bag', drive())
     for source in (path, folder):

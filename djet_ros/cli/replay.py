@@ -32,7 +32,7 @@ is told per 100 m, as the KITTI benchmark has it, where the way is that long.
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
           'odometry.camera_height', 'odometry.camera_pitch', 'odometry.rectified',
           'odometry.frame_convention', 'odometry.base_frame', 'odometry.imu', 'odometry.guess',
-          'odometry.mask', 'odometry.mask_file')
+          'odometry.guess_frame', 'odometry.mask', 'odometry.mask_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +53,7 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth instead of the recording's own: a TUM file, or a KITTI "
                         'file with a row for each image')
-    add_topics(parser, 'image', 'info', *BESIDE)
+    add_topics(parser, 'image', 'info', *(what for what in BESIDE if what != 'tf'))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,7 +77,7 @@ def configured(args: argparse.Namespace) -> Config:
 def replayed(args: argparse.Namespace, config: Config, recording: Path, folder: Path) -> Outcome:
     """Replay a recording, of which the options tell the topics and poses, into a folder."""
     source = open_recording(recording, args.image_topic, args.info_topic, args.poses,
-                            beside={what: getattr(args, f'{what}_topic')
+                            beside={what: getattr(args, f'{what}_topic', None)
                                     for what in _wanted_beside(config.odometry)})
     try:
         with ResultsFolder(folder, config, args.overwrite) as results, \
@@ -89,8 +89,9 @@ def replayed(args: argparse.Namespace, config: Config, recording: Path, folder: 
 
 def _wanted_beside(config: OdometryConfig) -> list[str]:
     """Name what the odometry goes by beside the images."""
-    wanted = {'speed': config.scale == 'speed', 'imu': config.imu,
-              'guess': config.guess or config.scale == 'guess', 'mask': config.mask}
+    guess = config.guess or config.scale == 'guess'
+    wanted = {'speed': config.scale == 'speed', 'imu': config.imu, 'mask': config.mask,
+              'guess': guess and not config.guess_frame, 'tf': guess and config.guess_frame}
     return [what for what, is_wanted in wanted.items() if is_wanted]
 
 

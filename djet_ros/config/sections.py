@@ -66,6 +66,10 @@ class OdometryConfig:
     guess: bool = parameter(
         False, 'whether another odometry (topic guess, nav_msgs/Odometry) says where to begin to '
         'look for a motion; its length is taken by scale guess')
+    guess_frame: str = parameter(
+        '', 'frame on tf that stands still, such as odom: the guess is then how the frame of the '
+        'camera moves in it, through whatever is between them on /tf and /tf_static; empty takes '
+        'topic guess')
     mask: bool = parameter(
         False, 'whether each image waits a moment for its mask (topic mask, mono8, by the same '
         'stamp), of which pixels below 128 are left out')
@@ -210,8 +214,12 @@ class Config:
     ros: NodeConfig = field(default_factory=NodeConfig)
 
     def __post_init__(self) -> None:
-        """Refuse an unknown preset."""
+        """Refuse an unknown preset, and a guess that would be our own echo."""
         check(self)
+        if self.ros.publish_tf and self.odometry.guess_frame == self.odometry.odom_frame:
+            raise ValueError(f"guess_frame is '{self.odometry.guess_frame}', which is what this "
+                             'odometry publishes on tf itself; give it another odom_frame, or '
+                             'no ros.publish_tf')
 
 
 SECTIONS = ('estimator', 'odometry', 'slam', 'ros')

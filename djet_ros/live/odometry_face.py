@@ -6,15 +6,20 @@ from dataclasses import replace
 
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
-from djet_ros.live.middleware import Middleware
+from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.session import Session
 from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
+from djet_ros.odometry.moving_frames import TOPIC as TF
+from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.mask_files import still_mask
 
 # Messages beside the images that the middleware keeps while an image waits for room: seconds of
 # the fastest IMU.
 _DEPTH = 2000
+
+# Those of /tf_static, of which each robot_state_publisher has one.
+_FRAMES_DEPTH = 100
 
 
 class OdometryFace(Face):
@@ -34,7 +39,7 @@ class OdometryFace(Face):
                     speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES)),
                     still_mask=still_mask(config.odometry.mask_file)), self,
             {'image': image, 'camera_info': info})
-        self._hears_speed = False
+        self._hears_speed = self._hears_tf = False
         self._hears_beside: set[str] = set()
         self._connect(config)
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
@@ -52,8 +57,9 @@ class OdometryFace(Face):
         """Make the publishers and the subscriptions that a configuration asks for."""
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
+        guess = odometry.guess or odometry.scale == 'guess'
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,
-                  'guess': odometry.guess or odometry.scale == 'guess'}
+                  'guess': guess and not odometry.guess_frame}
         frames = bool(odometry.base_frame) or wanted['guess'] or (
             odometry.imu and odometry.imu_quaternion() is None)
         if frames and not self._follows_frames:
@@ -64,6 +70,12 @@ class OdometryFace(Face):
             self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
                         getattr(self.session, what),
                         replace(input_profile(config.ros), depth=_DEPTH))
+        if guess and odometry.guess_frame and not self._hears_tf:
+            self._hears_tf = True
+            self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
+                        replace(input_profile(config.ros), depth=_DEPTH))
+            self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
+                        Profile(depth=_FRAMES_DEPTH, latched=True))
         if config.odometry.scale == 'speed' and not self._hears_speed:
             self._hears_speed = True
             for topic, kind in SPEED_TYPES.items():

@@ -197,6 +197,14 @@ class Session:
         """Take an Odometry as a guess of where the camera went."""
         self._take('guess', message)
 
+    def tf(self, message: Any) -> None:
+        """Take a TFMessage of /tf."""
+        self._take('tf', message)
+
+    def tf_static(self, message: Any) -> None:
+        """Take a TFMessage of /tf_static."""
+        self._take('tf_static', message)
+
     def mask(self, message: Any) -> None:
         """Take the mask of the image that has its stamp."""
         self._take('mask', message)

@@ -8,6 +8,7 @@ from typing import Any
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.frame_guess import FrameGuess
 from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.inertial import Gyro, GyroNoise
@@ -57,14 +58,13 @@ class Beside:
             self.gyro.configure(noise, offset)
         if self.gyro is not None and (quaternion := config.imu_quaternion()) is not None:
             self.gyro.mount(Rotation.from_quat(quaternion).as_matrix())
-        if isinstance(scale, GuessScale):
-            if self.guess is not None and self.guess.mounting is not None:
-                scale.guess.mount(self.guess.mounting)
-            self.guess = scale.guess
-        elif not config.guess:
+        still = self.guess.still if isinstance(self.guess, FrameGuess) else ''
+        if not (config.guess or isinstance(scale, GuessScale)):
             self.guess = None
-        else:
-            self.guess = self.guess or Guess()
+        elif self.guess is None or still != config.guess_frame:
+            self.guess = FrameGuess(config.guess_frame) if config.guess_frame else Guess()
+        if isinstance(scale, GuessScale) and self.guess is not None:
+            scale.guess = self.guess
 
     def reset(self) -> None:
         """Forget what was measured; mountings and the gyro's bias stay."""
@@ -89,10 +89,15 @@ class Beside:
 
     def other_odometry(self, message: Any) -> None:
         """Take an Odometry; of it the pose."""
-        if self.guess is None:
+        if self.guess is None or isinstance(self.guess, FrameGuess):
             return
         self._frames['guess'] = message.child_frame_id
         self.guess.add(*pose_of(message))
+
+    def tf(self, message: Any, *, static: bool) -> None:
+        """Take a TFMessage."""
+        if isinstance(self.guess, FrameGuess):
+            self.guess.hear(message, static=static)
 
     def mask(self, message: Any) -> None:
         """Take the mask of an image."""
@@ -100,18 +105,22 @@ class Beside:
 
     # What an image needs
 
-    def lacks(self, stamp: int) -> str:
+    def lacks(self, stamp: int, image_frame: str) -> str:
         """Name what has still to come for an image, if anything."""
+        if isinstance(self.guess, FrameGuess):
+            camera, axes = mounted_frame(self._config, image_frame)
+            self.guess.look_for(camera)
+            self.guess.mount(axes)
         if self.gyro is not None and not self.gyro.covers(stamp):
             return 'imu'
         if self.guess is not None and not self.guess.covers(stamp):
             return 'guess'
         return 'mask' if self._config.mask and not self._masks.has(stamp) else ''
 
-    def left_out(self, stamp: int, shape: tuple[int, ...], camera: Camera
+    def left_out(self, stamp: int, image_frame: str, shape: tuple[int, ...], camera: Camera
                  ) -> NDArray[np.bool_] | None:
         """Give the mask of an image that is worked on now; see ``Masks.of``."""
-        self._lacking.append(self.lacks(stamp))
+        self._lacking.append(self.lacks(stamp, image_frame))
         return self._masks.of(stamp, shape, camera)
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
@@ -159,6 +168,10 @@ class Beside:
         seen = 'no sample has come' if what == 'imu' and not self._samples else (
             f'{self._lacking.count(what)} of the newest {len(self._lacking)} images were worked '
             'on without it')
+        if what == 'guess' and isinstance(self.guess, FrameGuess):
+            return Complaint(f'no {what} in time', 'WARN', (
+                f"tf does not tell in time where '{self.guess.camera}' is in "
+                f"'{self.guess.still}' (odometry.guess_frame); have it published, {_CLOCKS}"))
         return Complaint(f'no {what} in time', 'WARN', (
             f"odometry asks for '{what}', and {seen}; publish it, {_CLOCKS}"))
 

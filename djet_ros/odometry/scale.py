@@ -292,6 +292,7 @@ class GuessScale(ScaleSource):
 
     def __init__(self, uncertainty: float = 0.05) -> None:
         self._uncertainty = uncertainty
+        # Replaced by the one that hears something.
         self.guess = Guess()
 
     def why_unknown(self, stamp_ns: int) -> str:

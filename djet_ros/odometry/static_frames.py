@@ -15,7 +15,7 @@ TOPIC, TYPE = '/tf_static', 'tf2_msgs/msg/TFMessage'
 Transform = Callable[[str, str], Array | None]
 
 # Frames that are kept: more than any robot has.
-_MOST = 10_000
+MOST = 10_000
 
 
 class StaticFrames:
@@ -32,7 +32,7 @@ class StaticFrames:
             # tf of ROS 1 had names with a slash in front.
             child, parent = (name.lstrip('/') for name in (
                 one.child_frame_id, one.header.frame_id))
-            if np.isfinite(pose).all() and (child in self._parents or len(self._parents) < _MOST):
+            if np.isfinite(pose).all() and (child in self._parents or len(self._parents) < MOST):
                 self._parents[child] = parent, pose
 
     def transform(self, parent: str, child: str) -> Array | None:
@@ -42,6 +42,10 @@ class StaticFrames:
             if frame in above:
                 return np.asarray(np.linalg.inv(above[frame]) @ pose)
         return None
+
+    def above(self, frame: str) -> tuple[str, Array] | None:
+        """Give what a frame stands on, and itself in that (4, 4)."""
+        return self._parents.get(frame)
 
     def _upwards(self, frame: str) -> Iterator[tuple[str, Array]]:
         """Yield a frame and those it stands on, each with the first one in it (4, 4)."""

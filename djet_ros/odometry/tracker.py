@@ -163,7 +163,8 @@ class Tracker:
         try:
             raw = gray_image(message)
             gray = self._camera.undistort(raw)
-            left_out = self._beside.left_out(stamp, raw.shape, self._camera)
+            left_out = self._beside.left_out(stamp, message.header.frame_id, raw.shape,
+                                             self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
@@ -229,6 +230,14 @@ class Tracker:
         """Take an Odometry as a guess, for odometry.guess and odometry.scale 'guess'."""
         self._beside.other_odometry(message)
 
+    def tf(self, message: Any) -> None:
+        """Take a TFMessage of /tf, for odometry.guess_frame."""
+        self._beside.tf(message, static=False)
+
+    def tf_static(self, message: Any) -> None:
+        """Take a TFMessage of /tf_static, for odometry.guess_frame."""
+        self._beside.tf(message, static=True)
+
     def mask(self, message: Any) -> None:
         """Take the mask of an image, for odometry.mask."""
         self._beside.mask(message)
@@ -239,7 +248,7 @@ class Tracker:
 
         A face waits for it for a moment. What comes later is of no use to that image.
         """
-        return self._beside.lacks(stamp_ns(image.header))
+        return self._beside.lacks(stamp_ns(image.header), image.header.frame_id)
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
         """Name frames (parent, child) of which a mounting is still wanted, by 'imu' or 'guess'."""

@@ -50,7 +50,11 @@ BESIDE = {
     'imu': ('sensor_msgs/msg/Imu',),
     'guess': ('nav_msgs/msg/Odometry',),
     'mask': IMAGE_TYPES,
+    'tf': ('tf2_msgs/msg/TFMessage',),
 }
+
+# Words by which those are known of which others have the type as well.
+_KNOWN_BY = {'mask': re.compile('mask'), 'tf': re.compile('^/tf$')}
 
 
 class Recording(Closing):
@@ -203,10 +207,13 @@ class BagRecording(Recording):
             # The bag's own ground truth is no measurement, even where other poses replace it.
             fitting = [topic.name for topic in self._fitting(BESIDE[what]) if topic.name not in (
                 self._ground_truth_topic(), self.image_topic)
-                and (what != 'mask' or 'mask' in topic.name)]
+                and (what not in _KNOWN_BY or _KNOWN_BY[what].search(topic.name))]
             chosen = [topic for topic in fitting if name in (None, topic)]
             if len(chosen) == 1:
                 yield what, chosen[0]
+            elif strict and what == 'tf':
+                raise DjetError(f'{self.bag.path} has no /tf, which odometry.guess_frame asks '
+                                'for; record it too')
             elif strict:
                 raise DjetError(f"{self.bag.path}: one topic of '{what}' is needed; choose one "
                                 f'with --{what}-topic from: {", ".join(fitting) or "none"}')

@@ -101,6 +101,7 @@ class Replay:
             self._truth.add(*pose_of(message.message))
         elif what == 'frames':
             self._frames.add(message.message)
+            self._tracker.tf_static(message.message)
         elif what is not None:
             getattr(self._tracker, what)(message.message)
         return self._work_off(message.stamp_ns)

@@ -123,8 +123,10 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
 
 def _possible(config: Config) -> Config:
     """Refuse what can't be had in this ROS."""
-    if config.ros.publish_tf and find_spec('tf2_msgs') is None:
-        raise DjetError('ros.publish_tf is true, and the package tf2_msgs is not installed: '
+    asked = ('ros.publish_tf is true' if config.ros.publish_tf else
+             'odometry.guess_frame is set' if config.odometry.guess_frame else '')
+    if asked and find_spec('tf2_msgs') is None:
+        raise DjetError(f'{asked}, and the package tf2_msgs is not installed: '
                         'apt install ros-$ROS_DISTRO-tf2-msgs')
     return config
 
