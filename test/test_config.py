@@ -6,7 +6,7 @@ from pathlib import Path
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
 from djet_ros.config.sections import Config, SECTIONS
-from djet_ros.config.yaml_files import dump_yaml, load_yaml
+from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import live_choices, with_live_values
@@ -213,3 +213,28 @@ def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
     # every other choice is as good live as offline
     assert all(live_choices(item) == item.description.choices
                for item in flat(Config()).values() if item.name != 'odometry.scale')
+
+
+@pytest.mark.parametrize(('name', 'node', 'meant'), [
+    ('/**', '/vo_node', True), ('/**', '/left/eye', True), ('/*', '/eye', True),
+    ('/*', '/left/eye', False), ('vo_node', '/vo_node', True), ('/vo_node', '/vo_node', True),
+    ('vo_node', '/left/vo_node', False), ('/left/vo_node', '/left/vo_node', True),
+    ('/**/vo_node', '/left/vo_node', True), ('/*/vo_node', '/left/vo_node', True),
+    ('vo_node', '/vo_node_2', False), ('vo.node', '/vo_node', False)])
+def test_a_file_for_other_nodes_alone_is_said_as_ros_understands_names(
+        tmp_path, name, node, meant):
+    path = written(tmp_path, f"'{name}': {{ros__parameters: {{preset: paper}}}}")
+    said = why_unused(path, node)
+    assert said == '' if meant else said == (
+        f"{path} is for /{name.strip('/')}, and nothing is taken from it: this node is {node}; "
+        "'/**' is for all")
+
+
+def test_a_file_for_several_nodes_is_for_each_of_them(tmp_path):
+    path = written(tmp_path, """
+        left: {vo_node: {ros__parameters: {preset: paper}}}
+        other: {ros__parameters: {}}
+    """)
+    assert why_unused(path, '/left/vo_node') == why_unused(path, '/other') == ''
+    assert 'is for /left/vo_node, /other, and' in why_unused(path, '/vo_node')
+    assert 'is for no node, and' in why_unused(written(tmp_path, '{}'), '/vo_node')

@@ -180,6 +180,15 @@ def test_vo_launch_names_the_node_and_starts_it_again_after_an_error(
 
 
 @pytest.mark.ros
+def test_a_file_of_parameters_that_is_not_there_ends_the_launch(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
+                    until='params_file')
+    assert 'params_file:=/no/such.yaml is no file' in said
+    assert 'process started' not in said
+
+
+@pytest.mark.ros
 def test_two_cameras_have_their_own_nodes_and_topics(
         environment: dict[str, str], tmp_path: Path) -> None:
     said = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',

@@ -501,6 +501,16 @@ def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
     assert "unknown parameter 'name_of_robot'" in one.log
     # The file may serve the pose graph too.
     assert 'slam.loop_gap' not in one.log
+    assert 'nothing is taken' not in one.log
+
+
+def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
+    path = tmp_path / 'own.yaml'
+    path.write_text('vo_node: {ros__parameters: {odometry: {max_gap: 3}}}')
+    with nodes(tmp_path, IMAGE) as start:
+        one = start('-r', '__ns:=/left', '--params-file', str(path))
+        wait_for_log(one, f'{path} is for /vo_node, and nothing is taken from it: this node is '
+                          "/left/vo_node; '/**' is for all")
 
 
 def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
@@ -551,6 +561,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-r', '__node:=bad-name'], "Couldn't parse remap rule: '-r __node:=bad-name'"),
     (['--log-level', 'shout'], "Couldn't parse log level: '--log-level shout'"),
     (['--no-such-flag'], '--no-such-flag'),
+    (['--', '-x'], "nobody knows what '-x' is; words for ROS, such as -r image:="),
     (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
      "/image can not be had with qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
     (['-p', 'qos_overrides./image.subscription.depth:=many'],

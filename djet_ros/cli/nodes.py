@@ -61,7 +61,9 @@ def _run(name: str, description: str, *, without_ros: str,
         prog=name, description=description, epilog=_EPILOG.format(name=name),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
-        parser.parse_args(running.own_words())
+        if (rest := parser.parse_known_args(running.own_words())[1]):
+            raise DjetError(f"nobody knows what '{one_line(rest[0])}' is; words for ROS, such as "
+                            "-r image:=/camera/image_raw, stand after '--ros-args'")
         return 0 if stop.is_set() else int(running.run_node(name, make, stop))
     except DjetError as error:
         return _fail(name, str(error))

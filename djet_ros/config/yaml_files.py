@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
+import re
 import textwrap
 from typing import Any
 
@@ -64,6 +65,40 @@ def _ours(content: Any) -> Any:
             merged.update((key, value) for key, value in _flatten(parameters)
                           if not is_ros_own(key))
     return merged
+
+
+def why_unused(path: Path, node: str) -> str:
+    """
+    Say that a file of ROS parameters is for other nodes alone; nothing where it is for this one.
+
+    node: its full name, such as '/left/vo_node'. DjetError where the file can't be read.
+    """
+    names = list(_addressees(read_yaml(path)))
+    if any(re.fullmatch(_pattern(name), node) for name in names):
+        return ''
+    return (f"{path} is for {', '.join(names) or 'no node'}, and nothing is taken from it: this "
+            f"node is {node}; '/**' is for all")
+
+
+# Namespaces in one another, deeper than anybody's.
+_DEPTH = 20
+
+
+def _addressees(content: Any, above: str = '', depth: int = 0) -> Iterator[str]:
+    """Give the names, perhaps with wildcards, of the nodes that ROS takes a file to be for."""
+    if not isinstance(content, dict) or depth > _DEPTH:
+        return
+    for key, value in content.items():
+        if key == 'ros__parameters':
+            yield above
+        else:
+            yield from _addressees(value, f'{above}/{str(key).strip("/")}', depth + 1)
+
+
+def _pattern(name: str) -> str:
+    """Give the regular expression for what ROS means by the name of a node with wildcards."""
+    wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
+    return ''.join(wildcards.get(part, f'/{re.escape(part)}') for part in name.split('/')[1:])
 
 
 def is_ros_own(name: str) -> bool:

@@ -139,6 +139,7 @@ class Session:
         self._beside: deque[tuple[str, Any]] = deque(maxlen=_WAITING_BESIDE)
         self._came = Event()
         self._counted_drops = self._lost = 0
+        self._said_drops = False
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
         self._log = Throttle(wiring)
@@ -230,6 +231,7 @@ class Session:
             self._latencies.clear()
             self._log.clear()
             self._counted_drops, self._lost = self._queue.dropped, 0
+            self._said_drops = False
             self._tracker.reset()
             self._say()
         return self._note(f'reset: forgot {processed} images and their poses; '
@@ -371,8 +373,11 @@ class Session:
             self._counted_drops += new
             counts = self._tracker.counts
             self._tracker.count_dropped('queue_full', new)
-            self._log.warn('queue_full', f'{counts.dropped["queue_full"]} of {counts.received} '
-                           'images dropped: they come faster than they are worked on')
+            if not self._said_drops:
+                self._said_drops = True
+                self._wiring.log('warning', f'{counts.dropped["queue_full"]} of {counts.received} '
+                                 'images dropped: they come faster than they are worked on; the '
+                                 'diagnostics count them')
 
     def _take_info(self, info: Any) -> None:
         if info is not self._taken_info:
@@ -410,7 +415,6 @@ class Session:
         """Put what there is to mend into the log, once for as long as it is."""
         complaints = self._tracker.complaints
         for one in complaints:
-            # The queue's drops are said as they come.
-            if one.name not in self._complained and not one.name.endswith('under load'):
+            if one.name not in self._complained:
                 self._log.warn(one.name, f'{one.name}: {one.text}')
         self._complained = {one.name for one in complaints}

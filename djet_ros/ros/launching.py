@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from djet_ros.errors import DjetError
 from launch import LaunchContext
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitution import Substitution
@@ -60,6 +62,10 @@ def node(executable: str, name: str | Substitution, *files: str, **parameters: A
     files: arguments that hold a parameter file; parameters: on top of these, with __ for a dot.
     """
     def describe(context: LaunchContext) -> list[Node]:
+        for file in files:
+            # ROS would say it in passing and start the node without.
+            if not (path := Path(LaunchConfiguration(file).perform(context))).is_file():
+                raise DjetError(f'{file}:={path} is no file')
         values = {key.replace('__', '.'): value for key, value in parameters.items()}
         # An empty one would take away what a file says.
         if base_frame := LaunchConfiguration('base_frame').perform(context):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+import sys
 from typing import Any
 
 from djet_ros.config.flat import flat, FlatParameter, from_flat, why_unknown
 from djet_ros.config.sections import Config
-from djet_ros.config.yaml_files import is_ros_own
+from djet_ros.config.yaml_files import is_ros_own, why_unused
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import FIXED, live_choices, ODOMETRY, SHARED, with_live_values
 from rcl_interfaces.msg import (
@@ -87,11 +90,23 @@ def graph_parameters(node: Node) -> Config:
 def _given(node: Node) -> dict[str, Any]:
     """Values that came with the start, by names that some node of ours has."""
     known = flat(Config())
+    for path in _files(sys.argv):
+        if why := why_unused(path, node.get_fully_qualified_name()):
+            node.get_logger().warning(why)
     values = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
     for name in values:
         if name not in known and not is_ros_own(name):
             node.get_logger().warning(why_unknown(name))
     return {name: value for name, value in values.items() if name in known}
+
+
+def _files(words: Sequence[str]) -> Iterator[Path]:
+    """Give the parameter files that a command line has for ROS."""
+    for_ros = False
+    for word, following in pairwise(words):
+        for_ros = word == '--ros-args' or (for_ros and word != '--')
+        if for_ros and word == '--params-file':
+            yield Path(following)
 
 
 def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any], *,
