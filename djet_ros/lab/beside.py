@@ -29,6 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+# Metres that are none.
+_NOWHERE = 1e-9
+
 NOTHING, GYRO, MASK = 'nothing', 'gyro', 'mask'
 
 
@@ -81,7 +84,8 @@ class Moment:
     """
     What became of a frame, by its pair and by all of the way to it.
 
-    dark: whether it is black; tracked: whether a motion was told; stood: whether that was none;
+    dark: whether it or what it is related to is black; tracked: whether a motion was told; stood:
+    whether that was none;
     failed: see ``pairs.FAILURE``; errors of the pair in degrees, NaN where there is none;
     dark_off_deg: of the turn in the dark up to a black frame; surprise: its square over its
     covariance, 3 on average if that is true; bias_off: of the gyro's bias, as a share of it.
@@ -187,12 +191,14 @@ class _Run:
             rotation = np.degrees(rotation_angle(true_motion[:3, :3], result.motion[:3, :3]))
         if tracked and result.motion[:3, 3].any() and has_direction(true_motion):
             direction = np.degrees(direction_angle(true_motion[:3, 3], result.motion[:3, 3]))
-        dark = index in TRIALS[self._chunk.trial].dark
+        black = TRIALS[self._chunk.trial].dark
+        dark = index in black or previous in black
         off, surprise = self._off_since_light(index, result) if dark else (float('nan'),) * 2
         if not dark:
             self._light = index, result
         # A way that was told where there was none is wrong, whatever its rotation.
-        invented = tracked and not has_direction(true_motion) and bool(result.motion[:3, 3].any())
+        stands = not (np.abs(true_motion[:3, 3]) > _NOWHERE).any()
+        invented = tracked and stands and bool(result.motion[:3, 3].any())
         return Moment(
             self._chunk.trial, self._chunk.seed, self._aid, index, result.status.value,
             dark, tracked, result.stationary,

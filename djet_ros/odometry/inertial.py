@@ -33,8 +33,9 @@ _BACK_NS = 500_000_000
 _FASTEST, _FAST = 200.0, 3.0
 _EQUAL_IN_A_ROW = 3
 
-# Standard deviation of a bias that nobody has measured yet, in rad/s: cheap gyros, warming up.
-_BIAS_AT_FIRST = 0.02
+# Standard deviation of a bias that nobody has measured yet, in rad/s: of cheap gyros, warming up,
+# hardly any is beyond 0.05.
+_BIAS_AT_FIRST = 0.05 / 3
 
 # Standard deviation by which an interpolated rate is off, as a share of its change.
 _INTERPOLATION = 1 / 6

@@ -30,8 +30,12 @@ TRACKED = (Status.OK, Status.NO_PARALLAX)
 STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
 
 # Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
-# that are where they were if the camera stands in front of traffic.
-_CELL, _STILL = 32, 0.2
+# that are where they were if the camera stands in front of traffic; chosen: and if it has stood
+# before, as most do where they begin.
+_CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
+
+# Times the displacement of what stands still up to which something hardly moves.
+_HARDLY = 3
 
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4
@@ -128,6 +132,7 @@ class VisualOdometry:
         self._one_scale.reset()
         self._prior: RelativePose | None = None
         self._bad_pairs = self._since_ns = self._known_ns = 0
+        self._stood = True
         self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
 
     def process(self, frame: Frame) -> OdometryResult:
@@ -165,7 +170,7 @@ class VisualOdometry:
         self._pose, self._pose_covariance = result.pose, result.pose_covariance
         self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
-        self._prior, self._bad_pairs = relative, 0
+        self._prior, self._bad_pairs, self._stood = relative, 0, False
         return result
 
     def _known(self, frame: Frame) -> Known:
@@ -204,16 +209,20 @@ class VisualOdometry:
         """
         Tell traffic from a motion of the camera: the gyro felt nothing, and much did not move.
 
-        A part of the matches all over the image has to be where it was. Slow motion does not
-        pass for standstill for long, as the reference frame stays and displacements add up.
+        A part of the matches all over the image has to be where it was; a smaller one will do for
+        a camera that stood before. To one that moves, some things hardly move and more of them
+        move a little; before one that stands, things move or do not. Slow motion does not pass for
+        standstill for long, as the reference frame stays and displacements add up.
         """
         if self._gyro is None or not len(relative.x) or not self._gyro.at_rest(
                 self._since_ns, frame.stamp_ns):
             return False
-        still = np.linalg.norm(relative.y - relative.x, axis=1) < self._config.standstill
+        shift = np.linalg.norm(relative.y - relative.x, axis=1) / self._config.standstill
+        still, hardly = shift < 1, (shift >= 1) & (shift < _HARDLY)
         cells = np.floor_divide(relative.x, _CELL)
         spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
-        return bool(still.mean() > _STILL and spread > _STILL)
+        least = _STILL_AS_BEFORE if self._stood else _STILL
+        return bool(still.mean() > least and spread > least and still.sum() > hardly.sum())
 
     def _nothing_moved(self, relative: RelativePose) -> bool:
         # Two equal images are DEGENERATE to most estimators, for want of any residual.
@@ -256,7 +265,7 @@ class VisualOdometry:
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
-        self._bad_pairs = 0
+        self._bad_pairs, self._stood = 0, True
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
                               standstill_covariance(relative, length), stationary=True)
         if self._gyro is not None:
