@@ -3,13 +3,14 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 
-from cards import Cards, K, pose, SIZE
+from cards import Cards, DEPTHS, K, pose, SIZE
 import cv2
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
@@ -23,7 +24,7 @@ from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
-from djet_ros.replay.drift import drift
+from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 import numpy as np
@@ -211,6 +212,18 @@ def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
     assert told['ground_truth']['translation_percent'] == pytest.approx(
         expected.translation_percent, rel=1e-3)
     assert 0 < expected.translation_percent < 10
+    assert told['none']['scale_change'] is None
+    assert told['ground_truth']['scale_change'] == pytest.approx(1, abs=1e-6)
+
+
+def test_the_scale_at_the_end_is_told_over_that_at_the_start():
+    rng = np.random.default_rng(4)
+    steps = rng.uniform(0.5, 2, (200, 1)) * [[0.6, 0.0, 0.8]]
+    truth = np.cumsum(steps, axis=0)
+    grown = np.cumsum(steps * np.geomspace(3, 3.3, 200)[:, None], axis=0)
+    assert scale_change(truth, truth) == pytest.approx(1)
+    assert scale_change(7 * truth, truth) == pytest.approx(1)
+    assert scale_change(grown, truth) == pytest.approx(1.1**0.9, rel=0.005)
 
 
 def test_both_trajectories_have_a_pose_for_each_frame(replayed):
@@ -238,6 +251,19 @@ def test_the_bag_holds_what_the_live_node_publishes(replayed):
     axes = np.eye(4)
     axes[:3, :3] = OPTICAL_TO_BODY
     assert np.allclose(chained, axes @ poses[-1] @ axes.T, atol=1e-9)
+
+
+def test_landmarks_lie_on_the_cards(replayed):
+    results, _ = replayed
+    head, _, data = (results / 'landmarks.ply').read_bytes().partition(b'end_header\n')
+    count = int(re.search(rb'element vertex (\d+)', head)[1])
+    assert count > 50
+    assert len(data) == 12 * count
+    # In the length of the first step, as the trajectory is.
+    depths = np.frombuffer(data, '<f4').reshape(-1, 3)[:, 2] * np.linalg.norm(STEP[:3, 3])
+    off = np.abs(depths[:, None] / DEPTHS - 1).min(1)
+    assert np.median(off) < 0.02
+    assert np.quantile(off, 0.9) < 0.1
 
 
 def test_each_image_has_a_row(replayed):

@@ -1,6 +1,6 @@
 """One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
 
-from cards import Cards, pose
+from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.odometry.frame import Frame
@@ -156,6 +156,19 @@ def test_the_window_keeps_few_images(cards):
     assert len(window._landmarks) < 2000
     assert window.landmarks().shape[1] == 3
     assert (window.landmarks()[:, 2] > 0).mean() > 0.9
+
+
+def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards):
+    drive, depths = Drive(cards), []
+    for number in range(24):
+        result, = drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03)])
+        here = result.pose[:3, :3] @ drive.odometry.landmarks(settled=True).T
+        depths.append((here.T + result.pose[:3, 3])[:, 2] * np.hypot(0.32, 0.03))
+    left = [part for part in depths if len(part)]
+    assert 2 <= len(left) < 20  # not with each frame, but with keyframes
+    off = np.abs(np.concatenate(left)[:, None] / DEPTHS - 1).min(1)
+    assert len(off) > 50
+    assert np.median(off) < 0.03
 
 
 def test_another_estimator_goes_on_at_the_last_speed(cards):

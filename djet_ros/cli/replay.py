@@ -119,4 +119,6 @@ def _table(summary: dict[str, Any]) -> Table:
         table.add_row('  rotation (r_rel)', f"{drift['rotation_deg_per_100m']:.3f} deg per 100 m")
         if drift['translation_percent'] is not None:
             table.add_row('  translation (t_rel)', f"{drift['translation_percent']:.2f} %")
+        if drift['scale_change'] is not None:
+            table.add_row('  scale, end over start', f"{drift['scale_change']:.3f}")
     return table

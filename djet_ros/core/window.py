@@ -113,6 +113,8 @@ class Window:
     Poses of keyframes and of the newest frame, and the inverse depths of their landmarks.
 
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
+
+    settled: (M, 3) places, in the newest frame, of landmarks that it was the last to refine.
     """
 
     def __init__(self, config: EstimatorConfig, tuning: WindowTuning = TUNING) -> None:
@@ -127,6 +129,7 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
+        self.settled = np.empty((0, 3))
 
     @property
     def is_new(self) -> bool:
@@ -157,15 +160,21 @@ class Window:
         # What is no keyframe goes, and so does the oldest where there are too many.
         if len(self._images) > 2 and not self._is_keyframe[-2]:
             self._forget(len(self._images) - 2)
+        self.settled = np.empty((0, 3))
         if sum(self._is_keyframe) > self._tuning.keyframes:
+            self.settled = self._places(self._landmarks.anchors == 0)
             self._take_along(0)
             self._forget(0)
         return addition
 
     def landmarks(self) -> Array:
         """Places (M, 3) of landmarks in the newest frame, in the unit of the track."""
+        return self._places(np.ones(len(self._landmarks), bool))
+
+    def _places(self, chosen: NDArray[np.bool_]) -> Array:
+        """Places (M, 3), in the newest frame, of those of some landmarks (N,) that are sure."""
         sure = self._landmarks.of(np.asarray(
-            (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
+            chosen & (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
         places = in_frame(self._K, self._poses, sure, len(self._images) - 1)
         return np.asarray(places / sure.rho[:, None])
 

@@ -104,11 +104,16 @@ class OneScale:
         usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * float(np.exp(self._log))
         return Length(usual, usual, True, self._metric, False)
 
-    def landmarks(self) -> Array:
-        """Places (M, 3) of landmarks in the camera of the newest step, in its lengths' unit."""
+    def landmarks(self, settled: bool = False) -> Array:
+        """
+        Places (M, 3) of landmarks in the camera of the newest step, in its lengths' unit.
+
+        settled: of those that it was the last step to refine, instead of those in the window.
+        """
         if self._speed is None or not self._source.carried:
             return np.empty((0, 3))
-        return self._window.landmarks() * float(np.exp(self._log))
+        places = self._window.settled if settled else self._window.landmarks()
+        return places * float(np.exp(self._log))
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
         """Add a frame to the window; None where no length comes of it, and it begins anew."""

@@ -297,10 +297,29 @@ class Tracker:
 
     def landmarks(self) -> Outgoing | None:
         """Give the landmarks of the last pair; None where none of them carry its scale."""
-        if self._frame is None or self.last is None or self.last.status not in TRACKED \
-                or self.last.stationary or not len(places := self._odometry.landmarks()):
+        if self._frame is None or self.last is None or not self._moved \
+                or not len(places := self._odometry.landmarks()):
             return None
         return Outgoing('landmarks', self._messages.landmarks(self.last, places))
+
+    def settled(self) -> Array:
+        """Places (M, 3), in the first camera, of landmarks that the last pair refined last."""
+        return self._in_first(self._odometry.landmarks(settled=True))
+
+    def unsettled(self) -> Array:
+        """Places (M, 3), in the first camera, of landmarks that the next pair may refine."""
+        return self._in_first(self._odometry.landmarks())
+
+    def _in_first(self, places: Array) -> Array:
+        if self.last is None or not self._moved:
+            return np.empty((0, 3))
+        return np.asarray(places @ self.last.pose[:3, :3].T + self.last.pose[:3, 3])
+
+    @property
+    def _moved(self) -> bool:
+        """Whether the last image went on from the one before."""
+        return self.last is not None and self.last.status in TRACKED \
+            and not self.last.stationary
 
     def _without_camera(self, stamp: int) -> list[Outgoing]:
         """Drop an image for want of a camera; an unusable CameraInfo stays the problem."""

@@ -122,9 +122,13 @@ class VisualOdometry:
         if anew and self._last is not None:
             self._one_scale.begin(self._view)
 
-    def landmarks(self) -> Array:
-        """Places (M, 3) of the landmarks that carry the scale, in the newest tracked camera."""
-        return self._one_scale.landmarks()
+    def landmarks(self, settled: bool = False) -> Array:
+        """
+        Places (M, 3) of the landmarks that carry the scale, in the newest tracked camera.
+
+        settled: of those that are not refined any more from that frame on, instead.
+        """
+        return self._one_scale.landmarks(settled)
 
     def reset(self) -> None:
         """Forget everything; the next frame is the first."""

@@ -66,6 +66,21 @@ def one_factor(places: Array, truth: Array) -> float:
     return float(there / here) if here > 0 else 1.0
 
 
+def scale_change(places: Array, truth: Array) -> float:
+    """
+    Scale of a path (N, 3) over the last tenth of the true way, over that in the first tenth.
+
+    Lengths of steps are summed up over either; 1 where the path has one scale.
+    """
+    here, there = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (places, truth))
+    way = np.cumsum(there)
+    # At least a step each: that in which the first tenth ends, and that in which the last begins.
+    first, last = way - there <= 0.1 * way[-1], way >= 0.9 * way[-1]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return float(here[last].sum() / there[last].sum()
+                     / (here[first].sum() / there[first].sum()))
+
+
 def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
     """First and last frames (M,) of all segments of a path (N, 3), and their lengths (M,)."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))

@@ -25,7 +25,7 @@ from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
-from djet_ros.replay.drift import drift, one_factor
+from djet_ros.replay.drift import drift, one_factor, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
@@ -80,6 +80,7 @@ class Replay:
             for _ in range(self._work_off(None)):
                 if progress is not None:
                     progress()
+            self._folder.add_landmarks(self._tracker.unsettled())
             complete, problem = True, self._complaint()
         except DjetError as error:
             problem = str(error)
@@ -146,6 +147,7 @@ class Replay:
                                   result.motion_covariance, result.scale_known,
                                   metric=result.metric))
             self._folder.add_frame(number, result, seconds)
+            self._folder.add_landmarks(tracker.settled())
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
         self._publish(outgoing, message.stamp_ns)
@@ -271,8 +273,10 @@ class _Log:
         found = drift(truth[known], poses)
         if found is None:
             return None
-        return {**asdict(found), 'translation_percent':
-                None if self.scale is Scale.UNKNOWN else found.translation_percent}
+        if self.scale is Scale.UNKNOWN:
+            return {**asdict(found), 'translation_percent': None, 'scale_change': None}
+        change = scale_change(poses[:, :3, 3], truth[known][:, :3, 3])
+        return {**asdict(found), 'scale_change': change if np.isfinite(change) else None}
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""

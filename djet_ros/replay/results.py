@@ -4,6 +4,7 @@ The results folder of a replay: everything is written as it comes, so that nothi
 * trajectory_tum.txt, trajectory_kitti.txt: one pose per processed frame, camera in the first
   camera, along optical axes; the last known pose where the motion could not be estimated
 * frames.csv: one row per image
+* landmarks.ply: the points that carried the scale, in the first camera; where it was carried
 * bag/: what a live node would have published
 * config.yaml: the parameters in force
 * summary.json: counts, errors, and whether the run came to its end
@@ -27,6 +28,7 @@ from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.outputs import make_room, write_whole
+from djet_ros.recordings.point_clouds import PointFile
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
 from djet_ros.replay.pair_errors import PairErrors
@@ -36,8 +38,9 @@ from numpy.typing import NDArray
 SUMMARY = 'summary.json'
 PLOT = 'trajectory.png'
 BAG = 'bag'
-_FILES = (SUMMARY, PLOT, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv', 'errors.csv',
-          'config.yaml')
+LANDMARKS = 'landmarks.ply'
+_FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
+          'errors.csv', 'config.yaml')
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
@@ -68,6 +71,7 @@ class ResultsFolder(Closing):
         self._trajectories = [TumWriter(path / 'trajectory_tum.txt'),
                               KittiWriter(path / 'trajectory_kitti.txt')]
         self._bag = ResultBag(path / BAG)
+        self._landmarks: PointFile | None = None
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
         """Write what became of a processed image, and how long it took; counted from 0."""
@@ -79,6 +83,19 @@ class ResultsFolder(Closing):
     def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
         """Write that an image was dropped or rejected, and why."""
         self._row((image, stamp_ns, 'UNUSED', reason, *[''] * (len(COLUMNS) - 4)))
+
+    def add_landmarks(self, places: Array) -> None:
+        """Write landmarks (M, 3) that are not refined any more, in the first camera."""
+        if not len(places):
+            return
+        try:
+            if self._landmarks is None:
+                self._landmarks = PointFile(
+                    self.path / LANDMARKS, 'first camera: x right, y down, z ahead; in the '
+                    'lengths of trajectory_tum.txt')
+            self._landmarks.add(places)
+        except OSError as error:
+            raise _blame(self.path, error) from error
 
     def publish(self, outgoing: Outgoing, stamp_ns: int) -> None:
         """Write a message under the topic that the live node has for it."""
@@ -113,6 +130,8 @@ class ResultsFolder(Closing):
             self._table.close()
             for trajectory in self._trajectories:
                 trajectory.close()
+            if self._landmarks is not None:
+                self._landmarks.close()
         except OSError as error:
             raise _blame(self.path, error) from error
         finally:
