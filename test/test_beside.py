@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 import re
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
@@ -266,6 +266,22 @@ def test_live_gives_the_poses_of_the_tracker_to_the_last_bit(
     assert [serialised(message.message) for message in graph.published
             if message.topic in POSES] == [serialised(message.message) for message in expected
                                            if message.topic in POSES]
+
+
+def test_with_every_an_image_waits_for_as_long_as_samples_come(live: Any, drive: Drive) -> None:
+    session, one, graph = live(**IMU, **{'ros.queue_policy': 'every'})
+    for i in range(3):
+        session.image(drive.image(i))
+    for message in drive.imu()[:int(2 * PERIOD * 1e-9 * Mems.rate) + 1]:
+        session.imu(message)
+        sleep(0.01)
+    wait_for(one, 3)
+    session.configure(one.config)  # let in when the last image is published
+    expected = played(tracker(**IMU), drive, drive.imu())
+    ours = [serialised(message.message) for message in graph.published if message.topic in POSES]
+    assert ours == [serialised(message.message) for message in expected
+                    if message.topic in POSES][:len(ours)]
+    assert len(ours) > 3
 
 
 def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Drive) -> None:

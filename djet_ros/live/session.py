@@ -36,6 +36,9 @@ _WAITING_BESIDE = 10_000
 # Seconds for which an image waits for what belongs to it: the gyro's rates, its mask.
 _PATIENCE = 0.1
 
+# With the queue policy 'every': from the last message beside the images, and this in all.
+_LONGEST_PATIENCE = 2.0
+
 _LATENCIES = 100
 
 # States that somebody asked for, or that are logged with the names of topics.
@@ -138,6 +141,7 @@ class Session:
         # What came beside the images, each with the name of the tracker's method that takes it.
         self._beside: deque[tuple[str, Any]] = deque(maxlen=_WAITING_BESIDE)
         self._came = Event()
+        self._came_at = -np.inf
         self._counted_drops = self._lost = 0
         self._said_drops = False
         self._latencies = Latencies()
@@ -212,6 +216,7 @@ class Session:
 
     def _take(self, what: str, message: Any) -> None:
         self._beside.append((what, message))
+        self._came_at = monotonic()
         self._came.set()
 
     def count_lost(self, number: int) -> None:
@@ -340,13 +345,16 @@ class Session:
 
     def _await_what_belongs_to(self, received: _Received) -> None:
         """Wait a moment for what an image is to be worked on with, if it has not come yet."""
-        end = received.at + _PATIENCE
+        # Where nothing may be lost, on a slow machine what belongs to it comes late, but comes on.
+        patient = self._tracker.config.ros.queue_policy == 'every'
+        latest = monotonic() + _LONGEST_PATIENCE
         while not self._stopping and received.at > self._forgotten:
             self._came.clear()
             with self._lock:
                 self._hand_on()
                 lacking = self._tracker.lacks(received.image)
-            left = end - monotonic()
+            since = max(received.at, self._came_at) if patient else received.at
+            left = min(since + _PATIENCE, latest) - monotonic()
             if not lacking or left <= 0:
                 return
             self._came.wait(left)
