@@ -1,5 +1,7 @@
 """The ground under the camera: how far it moved, how sure that is, and when nothing is said."""
 
+from dataclasses import replace
+
 from cards import Cards, K as CARDS_K, pose, REST
 import cv2
 from djet_ros.config.flat import from_flat
@@ -8,6 +10,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.ground import Ground
+from djet_ros.core.masks import blocked
 from djet_ros.core.types import RelativePose, Status, View
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
@@ -155,6 +158,23 @@ def test_what_moves_with_the_camera_is_no_ground(floor):
     after[100:] = before[100:]
     assert Ground(K, SIZE[::-1], 0.0).motion(
         view(before), view(after), moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
+
+
+def test_what_is_masked_is_no_ground_and_the_rest_tells(floor):
+    """The right half of the picture moves with the camera; each image has a mask of its own."""
+    before, after = floor.gray(seed=1), floor.gray(z=0.8, seed=2)
+    before[:, 200:] = after[:, 200:] = floor.gray(seed=3)[:, 200:]
+    mask = np.zeros(SIZE[::-1], bool)
+    mask[:, 200:] = True
+    motion = moved(floor_pose(0.0), floor_pose(0.0, z=0.8))
+    ground = Ground(K, SIZE[::-1], 0.0)
+    for masked in ((True, True), (True, False), (False, True)):
+        seen = ground.motion(*(replace(view(gray), mask=blocked(mask) if one else None)
+                               for gray, one in zip((before, after), masked)), motion)
+        if all(masked):
+            assert abs(seen.value[0] - 0.8 / HEIGHT) < 3 * np.sqrt(seen.covariance[0, 0])
+            assert seen.correlation > 0.8
+    assert ground.motion(view(before), view(after), motion) is None
 
 
 def test_a_camera_that_sees_no_ground_says_nothing(floor):

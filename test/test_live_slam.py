@@ -296,6 +296,21 @@ class Drive:
                           for stamp, _ in pairs]) for poses in (self.told, dict(pairs))]
 
 
+def test_keyframes_of_a_live_map_have_the_masks_of_their_images(live):
+    """One for all images, and one by its stamp."""
+    still = np.zeros(SIZE[::-1], bool)
+    still[200:] = True
+    slam = live(replace(FEW_FEATURES, slam=QUICK), message_type, 'image_rect', still_mask=still)
+    slam.camera_info(camera_info(K, SIZE))
+    moving = np.full(SIZE[::-1], 255, np.uint8)
+    moving[:, :50] = 0
+    for stamp in (START, START + PERIOD):
+        slam.image(image(Cards().gray(REST), stamp_ns=stamp))
+    slam.mask(image(moving, stamp_ns=START + PERIOD))
+    assert np.array_equal(slam._frame(START).left_out, still)
+    assert np.array_equal(slam._frame(START + PERIOD).left_out, still | (moving < 128))
+
+
 @pytest.fixture(scope='module')
 def driven(live):
     drive = Drive(live)

@@ -12,11 +12,13 @@ import time
 
 from cards import Cards, DEPTHS, K, pose, SIZE
 import cv2
+from djet_ros.config.flat import from_flat
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
+from djet_ros.posegraph.keyframe_images import frame_finder
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
@@ -99,6 +101,25 @@ def drive(change=lambda i, message: message, info=True):
 
 def summary(results):
     return json.loads((results / 'summary.json').read_text())
+
+
+def test_images_of_keyframes_have_the_masks_that_the_odometry_had(tmp_path):
+    """Each mask is recorded a little after its image; those of one image are missing."""
+    def messages():
+        for i, (topic, message, stamp) in enumerate(drive()):
+            yield topic, message, stamp
+            if topic == IMAGE_TOPIC and i // 2 != 3:
+                mask = np.full(SIZE[::-1], 255, np.uint8)
+                mask[:, :10 + i // 2] = 0
+                yield '/camera/mask', image(mask, stamp_ns=stamp), stamp + 30_000_000
+
+    config = from_flat({'odometry.mask': True})
+    with open_recording(record(tmp_path / 'bag', messages()), IMAGE_TOPIC,
+                        beside={'mask': None}) as recording:
+        frame_at = frame_finder(recording, config)
+        for i in (0, 1, 3, 5):
+            left_out = frame_at(SECOND + i * SECOND // 10).left_out
+            assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
 
 
 # Of the vehicle

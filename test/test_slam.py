@@ -294,6 +294,39 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
         assert np.array_equal(edge.covariance, other.covariance)
 
 
+def bonneted(frame, mask):
+    """Give the frame of a car whose own bonnet hides the lower third, and its mask or None."""
+    gray = frame.gray.copy()
+    bonnet = np.random.default_rng(0).integers(0, 256, gray.shape, np.uint8)
+    gray[160:] = cv2.GaussianBlur(bonnet, (0, 0), 1.5)[160:]
+    return replace(frame, gray=gray, left_out=mask)
+
+
+def test_the_own_bonnet_gives_no_feature_of_a_place_and_no_match_of_a_loop():
+    """At one place, at another, and at the first again, a little aside."""
+    here, there = Cards(0), Cards(1)
+    frames = [here.frame(1.0, pose()), there.frame(1.1, pose(x=5.0)),
+              here.frame(1.2, pose(x=0.4), noise=1)]
+    mask = np.zeros(frames[0].gray.shape, bool)
+    mask[160:] = True
+    found, lowest = [], []
+    with KeyframeFile() as file:
+        for given, kept in ((mask, {}), (mask, file), (None, {})):
+            finder = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.05), kept)
+            edges = []
+            for i, frame in enumerate(frames):
+                finder.add(bonneted(frame, given))
+                edges += finder.loops(i)
+            found.append(edges)
+            lowest.append(max(one.features.points[:, 1].max() for one in kept.values()))
+            assert all((one.frame.left_out is None) == (given is None) for one in kept.values())
+    assert max(lowest[:2]) < 160 - 12 and lowest[2] > 160
+    (edge,), (again,) = found[:2]
+    assert (edge.source, edge.target) == (2, 0)
+    assert np.allclose(unit(edge.motion[:3, 3]), [-1, 0, 0], atol=0.05)
+    assert np.array_equal(edge.motion, again.motion)
+
+
 # Lengths of loops
 
 def seen(points, motion, noise=0.0, seed=0):

@@ -12,6 +12,7 @@ from djet_ros.cli.terminal import new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
+from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
@@ -35,7 +36,7 @@ own lengths are known (--scale, --scale-uncertainty) decides what loops may chan
 
 _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
                  'odometry.camera_height', 'odometry.camera_pitch',
-                 'odometry.scale_uncertainty')
+                 'odometry.scale_uncertainty', 'odometry.mask', 'odometry.mask_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,9 +66,9 @@ def run(args: argparse.Namespace) -> int:
         outcome = replayed(args, config, args.input, results)
         if outcome.problem:
             raise DjetError(outcome.problem)
-    source, name = _source(results, args)
+    config = with_values(load_yaml(results / 'config.yaml'), of_slam)
+    source, name = _source(results, args, config)
     try:
-        config = with_values(load_yaml(results / 'config.yaml'), of_slam)
         steps = read_steps(results)
         with progress_bar('frames') as progress:
             slam = run_slam(steps, source, config, progress, args.output)
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _source(results: Path, args: argparse.Namespace) -> tuple[Recording, str]:
+def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Recording, str]:
     """Open the recording that results are of, and give its name too."""
     summary = read_yaml(results / REPLAY_SUMMARY)
     if not isinstance(summary, dict) or not isinstance(summary.get('source'), str):
@@ -90,7 +91,8 @@ def _source(results: Path, args: argparse.Namespace) -> tuple[Recording, str]:
         raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
                         '--source where it is')
     topic = args.image_topic or (str(summary.get('image_topic')) if is_bag(path) else None)
-    return open_recording(path, topic, args.info_topic, args.poses), summary['source']
+    beside = {'mask': args.mask_topic} if config.odometry.mask else {}
+    return (open_recording(path, topic, args.info_topic, args.poses, beside), summary['source'])
 
 
 def _table(summary: dict[str, Any]) -> Table:

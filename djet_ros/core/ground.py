@@ -169,6 +169,8 @@ class Ground:
         power = np.maximum(cv2.blur(detail**2, (TUNING.side, TUNING.side)), 0.0)
         inner, rim = np.full(gray.shape, np.nan, np.float32), TUNING.side // 2
         inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + TUNING.noise))[rim:-rim, rim:-rim]
+        if view.mask is not None:
+            inner[view.mask[self._top:]] = np.nan
         return inner
 
     def _seen_again(self, R: Array, t: Array, m: Array) -> Array:
@@ -299,8 +301,8 @@ def _sampled(image: Image, pixels: Array) -> Array:
 
 
 def _correlation(a: Array, b: Array) -> float:
-    """Correlation of two samples (N,) where the second is there; 0 if that is too little."""
-    there = np.isfinite(b)
+    """Correlation of two samples (N,) where both are there; 0 if that is too little."""
+    there = np.isfinite(a) & np.isfinite(b)
     if there.sum() < max(TUNING.least_pixels, len(b) / 4):
         return 0.0
     a, b = a[there], b[there]

@@ -46,6 +46,7 @@ class GraphSession:
         self._queue: FrameQueue[_Task] = FrameQueue('latest', _WAITING)
         # Taken by the thread before anything else: what waits here costs it nothing.
         self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
+        self._masks: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._infos: deque[Any] = deque(maxlen=1)
         self._latencies = Latencies()
         self._lost = self._loops = 0
@@ -93,6 +94,10 @@ class GraphSession:
         """Take an Image or a CompressedImage."""
         self._heard['image'] = monotonic()
         self._images.append(message)
+
+    def mask(self, message: Any) -> None:
+        """Take the mask of the image that has its stamp."""
+        self._masks.append(message)
 
     def camera_info(self, message: Any) -> None:
         """Take a CameraInfo."""
@@ -162,6 +167,8 @@ class GraphSession:
             self._slam.camera_info(self._infos.popleft())
         while self._images:
             self._slam.image(self._images.popleft())
+        while self._masks:
+            self._slam.mask(self._masks.popleft())
 
     def _forget(self) -> list[Outgoing]:
         self._slam.reset()

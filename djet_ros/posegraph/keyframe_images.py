@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -14,10 +15,15 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.closing import Closing
+from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
 import numpy as np
+
+# Recorded nanoseconds for which an image waits for its mask, as in a replay.
+_PATIENCE_NS = 10**9
 
 
 class KeyframeImage(NamedTuple):
@@ -51,7 +57,8 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
         frame = image.frame
         try:
             offset = self._file.seek(0, 2)
-            for array in (frame.gray, frame.K,
+            left_out = np.empty((0, 0), bool) if frame.left_out is None else frame.left_out
+            for array in (frame.gray, frame.K, left_out,
                           *(getattr(image.features, name) for name in self._features)):
                 np.save(self._file, array, allow_pickle=False)
         except OSError as error:
@@ -59,15 +66,16 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
                             f'{error.strerror}; make room, or take fewer keyframes '
                             '(--keyframe-distance)') from error
         nothing = np.empty((0, 0), np.uint8)
-        self._kept[number] = _Kept(offset, replace(frame, gray=nothing))
+        self._kept[number] = _Kept(offset, replace(frame, gray=nothing, left_out=None))
 
     def __getitem__(self, number: int) -> KeyframeImage:
         """Read a keyframe."""
         offset, frame = self._kept[number]
         self._file.seek(offset)
-        gray, K, *features = (np.load(self._file, allow_pickle=False)
-                              for _ in range(2 + len(self._features)))
-        return KeyframeImage(replace(frame, gray=gray, K=K),
+        gray, K, left_out, *features = (np.load(self._file, allow_pickle=False)
+                                        for _ in range(3 + len(self._features)))
+        return KeyframeImage(replace(frame, gray=gray, K=K,
+                                     left_out=left_out if left_out.size else None),
                              Features(**dict(zip(self._features, features))))
 
     def __contains__(self, number: object) -> bool:
@@ -104,24 +112,36 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
 
     It raises DjetError for a stamp of which the recording has no image, or not in this order.
     """
-    images = _images(recording, config)
+    masks = Masks(still_mask(config.odometry.mask_file))
+    images = _images(recording, config, masks)
 
     def frame_at(stamp: int) -> Frame:
         for camera, message in images:
             if stamp_ns(message.header) == stamp:
-                return Frame(camera.undistort(gray_image(message)), camera.K, stamp,
-                             message.header.frame_id)
+                raw = gray_image(message)
+                return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
+                             masks.of(stamp, raw.shape, camera))
         raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
                         'give the recording that was replayed')
     return frame_at
 
 
-def _images(recording: Recording, config: Config) -> Iterator[tuple[Camera, Any]]:
-    """Images of a recording, each with its camera."""
+def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tuple[Camera, Any]]:
+    """Images of a recording, each with its camera, once their masks are among those given."""
     rectified = means_rectified(config.odometry.rectified, recording.image_topic)
     camera: Camera | None = None
-    for topic, _, message in recording.messages({recording.image_topic, recording.info_topic}):
+    mask_topic = recording.beside.get('mask', '') if config.odometry.mask else ''
+    waiting: deque[tuple[int, Camera, Any]] = deque()
+    for topic, recorded, message in recording.messages(
+            {recording.image_topic, recording.info_topic, mask_topic}):
         if topic == recording.info_topic:
             camera = Camera.from_info(message, rectified)
         elif topic == recording.image_topic and camera is not None:
-            yield camera, message
+            waiting.append((recorded, camera, message))
+        elif topic == mask_topic:
+            masks.add(message)
+        while waiting and (not mask_topic or recorded - waiting[0][0] >= _PATIENCE_NS
+                           or masks.has(stamp_ns(waiting[0][2].header))):
+            yield waiting.popleft()[1:]
+    for _, of_image, message in waiting:
+        yield of_image, message

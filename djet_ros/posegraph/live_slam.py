@@ -15,6 +15,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
+from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import (
     MessageFactory,
     MessageType,
@@ -28,6 +29,7 @@ from djet_ros.posegraph.keyframe_map import KeyframeMap
 from djet_ros.posegraph.step_messages import StepMessages
 from djet_ros.posegraph.steps import Step
 import numpy as np
+from numpy.typing import NDArray
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
 
@@ -38,6 +40,7 @@ class LiveSlam:
 
     config: slam, and what it shares with the odometry (estimator, odometry.frame_convention,
     odometry.camera_frame, odometry.base_frame, odometry.rectified, odometry.scale_uncertainty);
+    still_mask is what odometry.mask_file leaves out of all images, (H, W) bool;
     message_type gives the class for a type name; image_topic is the resolved name of the images'
     topic, by which odometry.rectified 'auto' goes; node is the name by which the diagnostics are
     told from those of others.
@@ -47,7 +50,8 @@ class LiveSlam:
     """
 
     def __init__(self, config: Config, message_type: MessageType, image_topic: str = '',
-                 node: str = 'pose_graph_node') -> None:
+                 node: str = 'pose_graph_node',
+                 still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config, self.slam = config, config.slam
         # What a face adds to each diagnostics message.
         self.face_values: dict[str, str] = {}
@@ -62,11 +66,13 @@ class LiveSlam:
         self._info: Any = None
         self._camera: Camera | None = None
         self._images: OrderedDict[int, Any] = OrderedDict()
+        self._masks = Masks(still_mask)
         self.reset()
 
     def reset(self) -> None:
         """Forget the map and everything that waits; the CameraInfo stays."""
         self._images.clear()
+        self._masks.reset()
         self._begin()
 
     def _begin(self) -> None:
@@ -123,6 +129,10 @@ class LiveSlam:
         self._images.move_to_end(stamp)
         if len(self._images) > self.slam.image_buffer:
             self._images.popitem(last=False)
+
+    def mask(self, message: Any) -> None:
+        """Take the mask of an image, for odometry.mask."""
+        self._masks.add(message)
 
     def relative_pose(self, message: Any) -> list[Outgoing]:
         """Take a PoseWithCovarianceStamped of the current camera in the previous one."""
@@ -236,8 +246,9 @@ class LiveSlam:
         if message is None or self._camera is None:
             return None
         try:
-            return Frame(self._camera.undistort(gray_image(message)), self._camera.K, stamp,
-                         message.header.frame_id)
+            raw = gray_image(message)
+            return Frame(self._camera.undistort(raw), self._camera.K, stamp,
+                         message.header.frame_id, self._masks.of(stamp, raw.shape, self._camera))
         except BadMessage as problem:
             self._reject('image', problem)
             return None

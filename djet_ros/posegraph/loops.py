@@ -11,6 +11,7 @@ from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rays, unit
+from djet_ros.core.masks import blocked
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
@@ -58,7 +59,8 @@ class EdgeFinder:
     def add(self, frame: Frame, before: Edge | None = None) -> None:
         """Take the next keyframe, later than all others, and the edge from its neighbour."""
         number = self._first + len(self._stamps)
-        features = self._near.features(frame.gray)
+        mask = None if frame.left_out is None else blocked(frame.left_out)
+        features = self._near.features(frame.gray, mask)
         self._kept[number] = KeyframeImage(frame, features)
         self._stamps.append(frame.stamp_ns)
         self._places.add(features)
@@ -161,7 +163,7 @@ class EdgeFinder:
 
     def _view(self, keyframe: int) -> View:
         frame, features = self._kept[keyframe]
-        return self._wide.view(frame.gray, frame.K, features)
+        return self._wide.view(frame.gray, frame.K, features, frame.left_out)
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
