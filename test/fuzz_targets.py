@@ -30,10 +30,12 @@ from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
-from djet_ros.recordings.datasets import euroc, tum_rgbd
+from djet_ros.recordings.datasets import euroc, seven_scenes, tum_rgbd
 from djet_ros.recordings.decoding import decoder, jazzy, message_type
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
+from djet_ros.recordings.kitti_raw import kitti_raw
+from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
@@ -463,6 +465,87 @@ def euroc_folder(place: Path) -> None:
         for i, stamp in enumerate(stamps)))
 
 
+IMU_ROWS = '#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z\n' + ''.join(
+    f'{1403636579763555584 + i * 20_000_000},-0.1,0.2,1.5e-3,9.8,0.1,-0.2\n' for i in range(6))
+
+
+def euroc_with_imu(place: Path) -> None:
+    euroc_folder(place)
+    (place / 'mav0' / 'imu0').mkdir()
+    (place / 'mav0' / 'imu0' / 'data.csv').write_text(IMU_ROWS)
+    (place / 'mav0' / 'imu0' / 'sensor.yaml').write_text(
+        'T_BS:\n  data: [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n')
+
+
+def euroc_of_opencv(place: Path) -> None:
+    """With a camera as OpenCV's FileStorage writes it."""
+    euroc_folder(place)
+    (place / 'mav0' / 'cam0' / 'sensor.yaml').write_text(
+        f'%YAML:1.0\n---\n{SENSOR.replace("T_BS:", "T_BS: !!opencv-matrix")}')
+
+
+def tum_vi_folder(place: Path) -> None:
+    euroc_folder(place)
+    (place / 'mav0' / 'cam0' / 'sensor.yaml').unlink()
+    (place / 'dso').mkdir()
+    (place / 'dso' / 'camchain.yaml').write_text(
+        'cam0:\n  T_cam_imu:\n  - [0.0, -1.0, 0.0, -0.02]\n  - [1.0, 0.0, 0.0, -0.06]\n'
+        '  - [0.0, 0.0, 1.0, 0.01]\n  - [0.0, 0.0, 0.0, 1.0]\n  camera_model: pinhole\n'
+        '  distortion_coeffs: [0.0034, 0.0007, -0.002, 0.0002]\n'
+        '  distortion_model: equidistant\n  intrinsics: [60.0, 60.5, 31.0, 23.0]\n')
+
+
+def kitti_with_imu(place: Path) -> None:
+    kitti_folder(place)
+    sequence = place / 'sequences' / '00'
+    with (sequence / 'calib.txt').open('a') as calib:
+        calib.write('Tr_imu_to_cam: 0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3\n')
+    (sequence / 'imu.csv').write_text(IMU_ROWS.replace('14036365797', ''))
+
+
+def seven_scenes_folder(place: Path) -> None:
+    for i in range(FRAMES):
+        (place / f'frame-{i:06d}.color.png').write_bytes(PNG)
+        (place / f'frame-{i:06d}.pose.txt').write_text(
+            '0.6 0 0.8 1\n0 1 0 -2.5e-3\n-0.8 0 0.6 3\n0 0 0 1\n')
+
+
+def kitti_raw_folder(place: Path) -> None:
+    for inner in ('image_00', 'oxts'):
+        (place / inner / 'data').mkdir(parents=True)
+        (place / inner / 'timestamps.txt').write_text(''.join(
+            f'2011-09-26 13:02:25.{i}64389445\n' for i in range(FRAMES)))
+    for i in range(FRAMES):
+        (place / 'image_00' / 'data' / f'{i:010d}.png').write_bytes(PNG)
+        (place / 'oxts' / 'data' / f'{i:010d}.txt').write_text(
+            f'49.0 8.40000{i} 115.5 0.01 -0.02 0.3 ' + '0.5 ' * 23 + '4\n')
+    (place / 'calib_cam_to_cam.txt').write_text(
+        'calib_time: 09-Jan-2012 13:57:47\nS_00: 30 26\nK_00: 70 0 15 0 70 13 0 0 1\n'
+        'D_00: -0.3 0.1 0 0 0\nS_rect_00: 24 20\nR_rect_00: 1 0 0 0 1 0 0 0 1\n'
+        'P_rect_00: 50 0 12 0 0 50 10 0 0 0 1 0\n')
+    (place / 'calib_velo_to_cam.txt').write_text('R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.3\n')
+    (place / 'calib_imu_to_velo.txt').write_text('R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n')
+
+
+def mask_of(data: bytes) -> None:
+    """Read a mask, and take an image with it."""
+    with folder() as place:
+        (place / 'mask.png').write_bytes(data)
+        with only_our_errors():
+            mask = still_mask(str(place / 'mask.png'))
+            assert mask is not None and mask.dtype == bool and mask.ndim == 2
+            one = Tracker(Config(), message_type, still_mask=mask)
+            one.camera_info(camera_info(K, SIZE))
+            one.image(image(PICTURE, stamp_ns=SECOND))
+            assert one.counts.received == 1
+
+
+def mask_seeds() -> list[bytes]:
+    half = np.where(np.arange(SIZE[0]) < 80, 0, 255).astype(np.uint8)
+    return [cv2.imencode(f'.{kind}', np.tile(half, (SIZE[1], 1)))[1].tobytes()
+            for kind in ('png', 'jpg')]
+
+
 def varos_folder(place: Path) -> None:
     camera = place / 'vehicle0' / 'cam0'
     (camera / 'A').mkdir(parents=True)
@@ -570,6 +653,20 @@ TARGETS: dict[str, Target] = {
     'euroc_camera': sequence_target(euroc_folder, 'mav0/cam0/sensor.yaml', euroc),
     'euroc_truth': sequence_target(
         euroc_folder, 'mav0/state_groundtruth_estimate0/data.csv', euroc),
+    'euroc_imu': sequence_target(euroc_with_imu, 'mav0/imu0/data.csv', euroc),
+    'euroc_imu_mounting': sequence_target(euroc_with_imu, 'mav0/imu0/sensor.yaml', euroc),
+    'opencv_yaml': sequence_target(euroc_of_opencv, 'mav0/cam0/sensor.yaml', euroc),
+    'tum_vi_camera': sequence_target(tum_vi_folder, 'dso/camchain.yaml', euroc),
+    'kitti_imu': sequence_target(kitti_with_imu, 'sequences/00/imu.csv', kitti),
+    'seven_scenes_truth': sequence_target(
+        seven_scenes_folder, 'frame-000001.pose.txt', seven_scenes),
+    'kitti_raw_clock': sequence_target(kitti_raw_folder, 'image_00/timestamps.txt', kitti_raw),
+    'kitti_raw_camera': sequence_target(kitti_raw_folder, 'calib_cam_to_cam.txt', kitti_raw),
+    'kitti_raw_mounting': sequence_target(kitti_raw_folder, 'calib_imu_to_velo.txt', kitti_raw),
+    'kitti_raw_oxts': sequence_target(
+        kitti_raw_folder, 'oxts/data/0000000001.txt', kitti_raw),
+    'kitti_raw_oxts_clock': sequence_target(kitti_raw_folder, 'oxts/timestamps.txt', kitti_raw),
+    'mask_file': Target(mask_seeds, mask_of),
     'varos_stamps': sequence_target(
         varos_folder, 'vehicle0/cam0/camM0_timestamps.csv', VarosSequence),
     'varos_truth': sequence_target(

@@ -171,6 +171,15 @@ def test_tum_vi_has_its_camera_from_kalibr_and_its_truth_from_mocap(asl: Path) -
         euroc(asl)
 
 
+@pytest.mark.parametrize('sensor', ['cam0', 'imu0'])
+def test_a_number_too_large_for_any_mounting_is_an_error_of_one_line(
+        asl: Path, sensor: str) -> None:
+    path = asl / 'mav0' / sensor / 'sensor.yaml'
+    path.write_text(path.read_text().replace('data: [0.0', f'data: [{10**400}', 1))
+    with pytest.raises(DjetError, match=f'{sensor}/sensor.yaml is no ASL'):
+        euroc(asl)
+
+
 # TUM-like folders and 7-Scenes
 
 def test_jpeg_images_are_read_where_png_are(tmp_path: Path) -> None:
@@ -284,6 +293,8 @@ def test_unrectified_images_of_a_raw_drive_have_their_distortion(raw: Path) -> N
     ('../calib_cam_to_cam.txt', 'P_rect_00', 'P_rect_99', "has no line 'P_rect_00:'"),
     ('../calib_cam_to_cam.txt', 'P_rect_00: 50.0', 'P_rect_00: -50.0', 'is no camera'),
     ('../calib_velo_to_cam.txt', 'T: 0', 'T:', 'T has 2 numbers, 3 belong there'),
+    ('../calib_velo_to_cam.txt', 'R: 0 -1 0', 'R: 0 1 0', 'velo_to_cam.txt: pose 0 is no'),
+    ('../calib_cam_to_cam.txt', 'R_rect_00: 1', 'R_rect_00: -1', 'cam_to_cam.txt: pose 0 is no'),
     ('image_00/timestamps.txt', '2011-09-26', '2011-13-26', 'line 1.*is no stamp'),
     ('image_00/timestamps.txt', '2011-09-26', '1911-09-26', 'is no stamp between'),
     ('oxts/data/0000000001.txt', '49.0', '', 'has 29 numbers'),

@@ -190,7 +190,7 @@ def _asl_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
         camera_in_body = _rigid(sensor['T_BS']['data'])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
                         f'{one_line(error)}') from error
     check_rigid(camera_in_body[None], path)
@@ -207,7 +207,7 @@ def _kalibr_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
         intrinsics = [float(value) for value in camera['intrinsics']]
         distortion = [float(value) for value in camera['distortion_coeffs']]
         body_in_camera = _rigid(camera['T_cam_imu'])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise DjetError(f'{path} is no camera chain of Kalibr (cam0: intrinsics, T_cam_imu): '
                         f'{one_line(error)}') from error
     check_rigid(body_in_camera[None], path)
@@ -238,7 +238,7 @@ def _asl_imu(folder: Path, camera_in_body: Array) -> ImuTrack | None:
         sensor = read_yaml(path)
         try:
             imu_in_body = _rigid(sensor['T_BS']['data'])
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise DjetError(f'{path} is no ASL sensor description (T_BS): '
                             f'{one_line(error)}') from error
         check_rigid(imu_in_body[None], path)

@@ -16,6 +16,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.imu import ImuTrack
+from djet_ros.recordings.kitti import check_rigid
 from djet_ros.recordings.text import (
     check_positions,
     increasing,
@@ -125,6 +126,9 @@ def _camera(path: Path, size: tuple[int, int]) -> tuple[Array, Array, Array]:
     if tuple(rectified) == size:
         P, R = _calibration(path, ('P_rect_00', 12), ('R_rect_00', 9))
         K, distortion, turn = P.reshape(3, 4)[:, :3], np.zeros(5), R.reshape(3, 3)
+        rectified_axes = np.eye(4)
+        rectified_axes[:3, :3] = turn
+        check_rigid(rectified_axes[None], path)
     elif tuple(raw) == size:
         K, distortion = _calibration(path, ('K_00', 9), ('D_00', 5))
         K, turn = K.reshape(3, 3), np.eye(3)
@@ -150,9 +154,11 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
         return None
     pose = np.eye(4)
     for name in names:
-        R, T = _calibration(_beside(folder, name), ('R', 9), ('T', 3))
+        path = _beside(folder, name)
+        R, T = _calibration(path, ('R', 9), ('T', 3))
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = R.reshape(3, 3), T
+        check_rigid(step[None], path)
         pose = step @ pose
     turn = np.eye(4)
     turn[:3, :3] = rectifying
