@@ -278,3 +278,25 @@ def test_a_turn_decides_between_two_motions_only_as_far_as_it_is_known() -> None
         assert right == 1 if sigma < 1e-3 else right < 1
     assert max(wrong.values()) < 0.01
     assert right == 0  # by what is known to a degree
+
+
+def test_a_bias_that_something_else_has_taught_is_unlearnt() -> None:
+    """At first the images tell the turn of a lorry for a second, and then that of the world."""
+    poses = way(frames=160)
+    gyro, biases = felt_by(poses, Mems(), 6)
+    sure, lorry = np.eye(3) * np.radians(0.01)**2, rotation_exp(np.radians([0, 0.2, 0.1]))
+    fitted = []
+    for i in range(len(poses) - 1):
+        R = relative(poses, i, i + 1)
+        seen = RelativePose(Status.OK, lorry @ R if i < 10 else R, np.array([0, 0, 1.0]),
+                            covariance_6=np.block([[sure, np.zeros((3, 3))],
+                                                   [np.zeros((3, 6))]]))
+        turn = gyro.turn(i * PERIOD, (i + 1) * PERIOD)
+        assert turn is not None
+        agreed = agrees(turn, seen)
+        gyro.judge(agreed)
+        if agreed:
+            gyro.learn(i * PERIOD, (i + 1) * PERIOD, seen.R, sure)
+        fitted.append(gyro.fits)
+    assert not all(fitted) and fitted[-1]
+    assert np.linalg.norm(gyro.bias - biases[-1]) < 0.1 * np.linalg.norm(biases[-1])

@@ -15,8 +15,8 @@ _SLACK = np.radians(0.02)
 # Normalised squared difference (3 expected) that hardly ever comes by chance: 1 in 10^6.
 _SURPRISE = 31.0
 
-# Difference of normalised squares from which on one of two rotations is a hundred times likelier.
-_DECIDED = 2 * np.log(100)
+# Difference of normalised squares from which on one of two rotations is a thousand times likelier.
+_DECIDED = 2 * np.log(1000)
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,8 @@ class Gyro:
     def __init__(self, noise: GyroNoise, offset_ns: int = 0) -> None:
         self.configure(noise, offset_ns)
         self.to_camera: Array | None = None
-        self.bias, self.bias_covariance = np.zeros(3), np.eye(3) * _BIAS_AT_FIRST**2
         self._learnt_ns: int | None = None
+        self._unlearn()
         self._verdicts: deque[bool] = deque(maxlen=_JUDGED)
         self.reset()
 
@@ -186,12 +186,21 @@ class Gyro:
 
     def judge(self, agreed: bool) -> None:
         """Take whether the images told the same turn, as far as both knew it."""
+        fitted = self.fits
         self._verdicts.append(agreed)
+        if fitted and not self.fits:
+            # The bias may have been learnt from something that moved by itself.
+            self._unlearn()
 
     @property
     def fits(self) -> bool:
         """Whether most of the newest turns were those that the images told."""
         return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
+
+    def _unlearn(self) -> None:
+        """Know no more of the bias than of any gyro's."""
+        self.bias, self.bias_covariance = np.zeros(3), np.eye(3) * _BIAS_AT_FIRST**2
+        self._learnt_ns = None
 
     def _bias_at(self, end_ns: int) -> Array:
         """Covariance (3, 3) of the bias, which wanders since it was learnt."""
