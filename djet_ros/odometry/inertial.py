@@ -86,6 +86,7 @@ class Gyro:
     def __init__(self, noise: GyroNoise, offset_ns: int = 0) -> None:
         self.configure(noise, offset_ns)
         self.to_camera: Array | None = None
+        self.bias: Array = np.zeros(3)
         self._learnt_ns: int | None = None
         self._unlearn()
         self._verdicts: deque[bool] = deque(maxlen=_JUDGED)
