@@ -107,13 +107,14 @@ def worst(poses: dict[int, Any], to_the_right: list[int]) -> float:
 def drive(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess],
           **parameters: Any) -> NodeProcess:
     """Go to the right and back, and give the pose graph's process."""
+    if parameters:
+        # There before the nodes, as on a robot: nothing tells when they have heard it.
+        camera.advertise('/tf_static', TYPES['/tf'], 0, durability='transient_local', depth=1)
+        camera.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', TO_THE_LEFT))
     nodes('vo_node', **ODOMETRY_PARAMETERS, **parameters)
     graph = nodes('pose_graph_node', **SLAM_PARAMETERS, **parameters)
     listener.wait('both nodes', said('waiting for the mounting of the camera on tf' if parameters
                                      else 'waiting for odometry'), 60)
-    if parameters:
-        camera.advertise('/tf_static', TYPES['/tf'], 2, durability='transient_local', depth=1)
-        camera.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', TO_THE_LEFT))
     advertise(camera, 2)
     see(camera, WAYS)
     last = START + (len(WAYS) - 1) * PERIOD
