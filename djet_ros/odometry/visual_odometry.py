@@ -197,7 +197,8 @@ class VisualOdometry:
             return relative
         agreed = agrees(told, relative)
         self._gyro.judge(agreed)
-        if agreed:
+        # What bridges bad pairs may be the motion of what made them bad.
+        if agreed and not self._bad_pairs:
             self._gyro.learn(self._since_ns, frame.stamp_ns, relative.R,
                              relative.covariance_6[:3, :3])
         if turn is None:
