@@ -3,6 +3,7 @@
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.types import Pose
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
 from djet_ros.odometry.visual_odometry import TRACKED, VisualOdometry
@@ -169,6 +170,22 @@ def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards)
     off = np.abs(np.concatenate(left)[:, None] / DEPTHS - 1).min(1)
     assert len(off) > 50
     assert np.median(off) < 0.03
+
+
+def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_them(cards):
+    """Seen from the side any depth fits two frames: there the epipolar lines are level."""
+    ways = [pose(x=0.32)] * 8
+    pair = Drive(cards).go(ways)[-1].relative
+    drive = Drive(cards)
+    drive.go(ways[:-1])
+    scale = drive.odometry._one_scale  # as it was before the last frame
+    aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    assert scale.agrees(aside, pair.x, pair.y_opt)
+    assert scale.agrees(Pose(aside.R, -aside.t), pair.x, pair.y_opt)  # chirality is for others
+    wrong = pair.x + np.random.default_rng(6).permutation(pair.y_opt - pair.x)
+    assert scale.agrees(aside, pair.x, wrong) is False
+    few = np.arange(4)
+    assert scale.agrees(aside, pair.x[few], wrong[few]) is None
 
 
 def test_another_estimator_goes_on_at_the_last_speed(cards):

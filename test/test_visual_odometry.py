@@ -63,6 +63,25 @@ def test_poses_are_the_current_camera_in_the_first_and_in_the_previous_one(cards
     assert results[3].previous_stamp_ns == results[2].stamp_ns
 
 
+def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
+    """Else the next pair has two steps in it, over which what the smaller body shows is gone."""
+    world, body = Cards(), Cards(seed=6)
+
+    def image(number):
+        left = world.gray(pose(z=0.12 * number), noise=number)
+        right = body.gray(pose(x=0.1 * number, z=-0.25 * number), noise=number)
+        left[:, 190:] = right[:, 190:]
+        return Frame(left, K, number * 10**8)
+
+    vo = odometry(ConstantScale(1.0))
+    results = [vo.process(image(number)) for number in range(4)]
+    assert [r.status for r in results[1:]] == [Status.TWO_MOTIONS] * 3
+    assert [r.previous_stamp_ns for r in results[1:]] == [0, 10**8, 2 * 10**8]
+    # … and what was between them is unknown from then on.
+    assert (np.diag(results[2].pose_covariance) >= np.diag(results[1].pose_covariance)).all()
+    assert results[3].pose_covariance[0, 0] > 1e5
+
+
 def test_without_a_scale_a_translation_has_length_one_and_says_that_it_is_no_metre(cards):
     result = drive(odometry(UnitScale()), cards, [np.eye(4), STEP])[-1]
     assert np.linalg.norm(result.motion[:3, 3]) == pytest.approx(1)

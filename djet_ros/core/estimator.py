@@ -214,7 +214,8 @@ class TwoViewEstimator:
             status, R, t, *covariances, x=x, y=y, y_opt=track.y_opt,
             inliers=inliers, residuals=line_distances(lines, y),
             hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
-            indefinite=track.indefinite, iterations=track.iterations)
+            indefinite=track.indefinite, iterations=track.iterations,
+            rivals=tuple(rival.pose for rival in track.rivals))
 
     def _false_alarm(self, track: Track, agreeing: int, shape: tuple[int, ...]) -> bool:
         """

@@ -14,7 +14,7 @@ from djet_ros.core.covariance import summed_by_cell
 from djet_ros.core.geometry import facing
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_at, losses_in_front, refine_all
-from djet_ros.core.starts import FORWARD, thinned
+from djet_ros.core.starts import all_round, FORWARD, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,9 @@ _STRAY, _MEMBER = 6.0, 3.0
 
 # chosen: a body with less than this share of the world's matches is not mistaken for it.
 _SMALL_SHARE = 0.125
+
+# chosen: directions all round from which it is looked for.
+_DIRECTIONS = 10
 
 # A second motion is looked for among so many strays at most.
 _STRAYS = 150
@@ -129,7 +132,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     if len(strays) < least:
         return None
     alone = problem.subset(strays)
-    starts = [first, Pose(first.R, FORWARD), *(Pose(first.R, axis) for axis in np.eye(3))]
+    starts = [first, Pose(first.R, FORWARD), *all_round(first.R, _DIRECTIONS)]
     rough = Loss('geman_mcclure', _STRAY * scale)
     found = refine_all(alone.subset(thinned(len(strays), _STRAYS)), starts, rough, _STEPS)
     tight = Loss('geman_mcclure', _MEMBER * scale)

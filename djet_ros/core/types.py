@@ -94,7 +94,8 @@ class RelativePose:
     hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
     losses: (N,) each match's loss on its surface, the last known one where it was culled;
     culled: how many matches had no surface in the end; indefinite: how many surfaces had no
-    minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds.
+    minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other motions
+    that were considered, the signs of their t open.
     """
 
     status: Status
@@ -113,3 +114,4 @@ class RelativePose:
     indefinite: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)
+    rivals: tuple[Pose, ...] = ()

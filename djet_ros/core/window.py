@@ -39,7 +39,7 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
 from djet_ros.core.surfaces import comparable, DescriptorDistances, with_minimum
-from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -75,6 +75,10 @@ class WindowTuning:
     inflation: float = 2.0
     # chosen: pixels between a landmark and a match of a pair that are taken for one another
     beside: float = 1.5
+    # pixels; chosen: what a match is off at most, but for false ones; and the share by which the
+    # depth of a landmark may be
+    matched: float = 0.4
+    known: float = 0.15
     # chosen: inverse depth, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length
@@ -180,22 +184,52 @@ class Window:
 
     def _length(self, relative: RelativePose, guess: float) -> float:
         """Length of the pair: a robust mean over landmarks beside which it has a match."""
-        before = self._landmarks.of(np.asarray(
-            self._landmarks.seen[:, -1] & (self._landmarks.rho > 0)))
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        if not relative.t.any() or len(before) < self._tuning.few or not len(x):
+        known, match = self._beside(x, self._landmarks.seen[:, -1])
+        if not relative.t.any() or len(known) < self._tuning.few:
             return guess
+        in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x[match]),
+                                         rays(self._K, y[match]))
+        length = _weighted_median(in_units / known, known / sigma)
+        return length if length > 0 else guess
+
+    def _beside(self, x: Array, chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
+        """
+        Tell which of the pixels x (N, 2) of the newest frame lie beside some of the landmarks.
+
+        Gives inverse depths (M,) there of those that do, and indices (M,) into x.
+        """
+        before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
+        if not len(before) or not len(x):
+            return np.empty(0), np.empty(0, np.int64)
         places = in_frame(self._K, self._poses, before, len(self._images) - 1)
         away, match = cKDTree(x).query(projected(self._K, places),
                                        distance_upper_bound=self._tuning.beside)
         near = np.isfinite(away) & (places[:, 2] > 0)
-        if near.sum() < self._tuning.few:
-            return guess
-        in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x),
-                                         rays(self._K, y))
-        known = (before.rho / places[:, 2])[near]
-        length = _weighted_median(in_units[match[near]] / known, known / sigma[match[near]])
-        return length if length > 0 else guess
+        return (before.rho / places[:, 2])[near], match[near]
+
+    def agreement(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
+        """
+        Count landmarks that lie where a motion has them, and all that were asked.
+
+        pose: from the newest frame to another one, the sign of t open; x, y: (N, 2) matched pixels
+        of the two. Asked are landmarks with a match beside them that were seen more than twice, so
+        that their depths do not come from one pair. The motion's length is the one that serves
+        them best.
+        """
+        newest = self._landmarks.seen[:, -1] & (self._landmarks.seen.sum(1) > 2)
+        finite = np.isfinite(y).all(1)
+        x, y = x[finite], y[finite]
+        known, match = self._beside(x, newest)
+        if not len(known):
+            return 0, 0
+        in_units, sigma = inverse_depths(pose.R, pose.t, rays(self._K, x[match]),
+                                         rays(self._K, y[match]))
+        length = _weighted_median(in_units / known, known / sigma)
+        noise = self._tuning.matched / self._K[0, 0] * sigma
+        off = np.abs(in_units - length * known)
+        agree = off < self._tuning.outlier * noise + self._tuning.known * abs(length) * known
+        return int(agree.sum()), len(known)
 
     def _choose_keyframe(self) -> None:
         """Make the newest frame a keyframe where landmarks moved since the last, or are gone."""

@@ -10,10 +10,11 @@ coarse or missing, and where the source falls silent the last factor goes on, le
 from __future__ import annotations
 
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.types import Array, RelativePose, View
+from djet_ros.core.types import Array, Pose, RelativePose, View
 from djet_ros.core.window import Addition, Window
 from djet_ros.odometry.scale import Length, ScaleSource, unknown
 import numpy as np
+from scipy.special import bdtr
 
 # Standard deviation of the factor's logarithm where a track was torn: the camera may go on faster
 # or slower than it did.
@@ -35,6 +36,11 @@ _SURPRISE, _IN_A_ROW = 16.0, 8
 
 # A length below this, in metres, says that the camera stands, and nothing of the factor.
 _STANDING = 0.01
+
+
+# Least share of landmarks that agree with a right motion (0.75 was the least that was seen), how
+# improbable fewer have to be, and how many landmarks tell nothing.
+_RIGHT, _BY_CHANCE, _FEW = 0.75, 1e-3, 8
 
 
 class OneScale:
@@ -114,6 +120,21 @@ class OneScale:
             return np.empty((0, 3))
         places = self._window.settled if settled else self._window.landmarks()
         return places * float(np.exp(self._log))
+
+    def agrees(self, pose: Pose, x: Array, y: Array) -> bool | None:
+        """
+        Tell whether a motion from the newest frame of the track gives landmarks their depths.
+
+        x, y: (N, 2) matched pixels. A wrong motion gives others, as it explains two frames alone.
+        False where so few landmarks agree as by chance in one of a thousand right motions; None
+        where there are too few to tell.
+        """
+        if not self._source.carried or self._window.is_new:
+            return None
+        agree, asked = self._window.agreement(pose, x, y)
+        if asked < _FEW:
+            return None
+        return bool(bdtr(agree, asked, _RIGHT) >= _BY_CHANCE)
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
         """Add a frame to the window; None where no length comes of it, and it begins anew."""

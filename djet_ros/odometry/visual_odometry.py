@@ -9,7 +9,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import agrees, fused, Turn
 from djet_ros.core.starts import Known
-from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.core.types import Array, Pose, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
@@ -25,6 +25,10 @@ import numpy as np
 
 # Statuses under which the motion of a pair was estimated.
 TRACKED = (Status.OK, Status.NO_PARALLAX)
+
+# Statuses of pairs whose images are good, and tell two motions: from the newest image on it may be
+# told again, while over two steps what the bodies have in common is gone.
+UNDECIDED = (Status.AMBIGUOUS, Status.TWO_MOTIONS)
 
 # Statuses of a frame at which the odometry started or restarted, without a pair.
 STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
@@ -91,7 +95,8 @@ class VisualOdometry:
     The reference frame is the newest frame that was tracked, by three rules:
     * a bad pair keeps it, so that one bad frame is bridged by the next good one; after max_lost
       bad pairs in a row each newest frame becomes the reference, until one pair is good again.
-      The motion in between is missing then, and the pose's covariance says so;
+      The motion in between is missing then, and the pose's covariance says so. A pair that two
+      motions explain does not keep it, for its images are good;
     * while the camera stands still it stays, so that noise does not add up;
     * a gap of more than max_gap, another image size or another camera begin a new reference at
       the last pose; a step back in time restarts everything.
@@ -160,7 +165,7 @@ class VisualOdometry:
         self._scale.observe(*span, self._view, view, relative)
         if self._stands_still(frame, relative):
             return self._stay(frame, relative, self._one_scale.of_rest(span))
-        relative = self._weighed(frame, relative, known.turn)
+        relative = self._weighed(frame, self._by_depths(relative), known.turn)
         if relative.status not in TRACKED:
             return self._lose(frame, view, relative, self._one_scale.of_rest(span))
 
@@ -176,6 +181,19 @@ class VisualOdometry:
         self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs, self._stood = relative, 0, False
         return result
+
+    def _by_depths(self, relative: RelativePose) -> RelativePose:
+        """Let depths that other frames have told decide between a motion and its rivals."""
+        if relative.status not in (Status.OK, Status.AMBIGUOUS):
+            return relative
+        agrees = self._one_scale.agrees(Pose(relative.R, relative.t), relative.x, relative.y_opt)
+        if relative.status is Status.OK and agrees is False:
+            return replace(relative, status=Status.AMBIGUOUS)
+        if relative.status is Status.AMBIGUOUS and agrees and all(
+                self._one_scale.agrees(rival, relative.x, relative.y) is False
+                for rival in relative.rivals):
+            return replace(relative, status=Status.OK)
+        return relative
 
     def _known(self, frame: Frame) -> Known:
         """Collect what others than the images tell of the way to a frame."""
@@ -285,14 +303,16 @@ class VisualOdometry:
               length: Length) -> OdometryResult:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
-        given_up = self._bad_pairs >= self._config.max_lost
+        undecided = relative.status in UNDECIDED
+        given_up = undecided or self._bad_pairs >= self._config.max_lost
         motion, covariance = self._carried(frame)
         result = self._result(frame, relative.status, relative, length, motion, covariance)
         if given_up:
             self._refer_to(frame, view)
             self._one_scale.begin(view)
-            self._prior, self._pose = None, result.pose
-            self._pose_covariance = result.pose_covariance
+            self._pose, self._pose_covariance = result.pose, result.pose_covariance
+            if self._bad_pairs >= self._config.max_lost:
+                self._prior = None
         return result
 
     def _refer_to(self, frame: Frame, view: View) -> None:
