@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 # A landmark that was projected from this near or from behind, in its anchor's depths.
 _NEAREST = 1e-3
 
+# Pixels beyond which nothing need be told apart; they fit into an integer.
+_FAR_OUT = 1e6
+
 # Information that holds a pose where it is.
 _HELD = 1e10
 
@@ -174,7 +177,7 @@ def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
 def projected(K: Array, places: Array) -> Array:
     """Project places (N, 3) in a camera to pixels (N, 2); what is behind it goes far out."""
     image = places @ K.T
-    return np.asarray(image[:, :2] / np.maximum(image[:, 2:], _NEAREST))
+    return np.clip(image[:, :2] / np.maximum(image[:, 2:], _NEAREST), -_FAR_OUT, _FAR_OUT)
 
 
 @dataclass(frozen=True)

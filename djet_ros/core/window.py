@@ -306,8 +306,6 @@ class Window:
         places = in_frame(self._K, self._poses, landmarks, newest)
         expected = projected(self._K, places)
         radius = self._config.window // 2
-        # What is far out of the image need not be a number that fits into an integer.
-        expected = np.clip(expected, -1e6, 1e6)
         wanted = (places[:, 2] > 0) & ~at(self._mask, expected) & self._distances.describable(
             expected, self._images[newest].shape, radius)
         # One that neither of the last two frames saw is gone.
@@ -394,8 +392,9 @@ class Window:
         # inverse, so that what the unit has drifted by before is not in it.
         block = H[-6:, -6:]
         covariance = np.linalg.inv(block + np.diag(1e-12 * np.diag(block)))
-        along = unit(t)
-        return Addition(R, t, length, float(np.sqrt(along @ covariance[3:, 3:] @ along)))
+        variance = float(unit(t) @ covariance[3:, 3:] @ unit(t))
+        # Where rounding leaves less than nothing, nobody knows.
+        return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf)
 
     def _take_along(self, frame: int) -> None:
         """Take what the landmarks of a frame tell into the prior, before it goes."""
