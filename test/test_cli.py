@@ -73,6 +73,7 @@ def test_every_command_has_help(command: str) -> None:
     assert answer.stderr == ''
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('verb', LAB)
 def test_the_old_spelling_of_a_lab_verb_works_with_a_hint_of_one_line(verb: str) -> None:
     old, new = djet(verb, '--help'), djet('lab', verb, '--help')

@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 from ros_messages import camera_info, IMAGE, image, IMAGE_TYPE, INFO, INFO_TYPE, SEEN, serialised
 
-pytestmark = needs_dds
+pytestmark = [needs_dds, pytest.mark.slow]
 
 RECTIFIED = '/camera/image_rect'
 FRAMES = 12

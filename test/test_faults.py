@@ -24,6 +24,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+pytestmark = pytest.mark.slow
+
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 ONE_THREAD = {**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
