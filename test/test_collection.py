@@ -33,7 +33,9 @@ def test_every_module_is_collected_where_a_plugin_imports_them_and_libraries_are
                                           os.environ.get('PYTHONPATH', '')]))
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '--collect-only', '-q', '-p', 'eager', '-p',
-         'no:cacheprovider', str(HERE)], env={**os.environ, 'PYTHONPATH': paths},
+         'no:cacheprovider', str(HERE)],
+        # colcon hands its own options on in PYTEST_ADDOPTS
+        env={**os.environ, 'PYTHONPATH': paths, 'PYTEST_ADDOPTS': ''},
         capture_output=True, text=True, cwd=HERE.parent, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     collected = [line.partition('::')[0] for line in done.stdout.splitlines() if '::' in line]
