@@ -106,8 +106,7 @@ def preferences(losses: Array, places: Array, chosen: int) -> Array:
 def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> list[Pose]:
     """Bring rivals to the minima of their basins, on some of the matches."""
     some = problem.subset(thinned(len(problem.blur), _REFINED_ON))
-    refined = refine_all(some, rivals, loss, _STEPS)
-    return [refined.pose(number) for number in range(len(refined))]
+    return refine_all(some, rivals, loss, _STEPS).poses()
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
@@ -136,7 +135,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     rough = Loss('geman_mcclure', _STRAY * scale)
     found = refine_all(alone.subset(thinned(len(strays), _STRAYS)), starts, rough, _STEPS)
     tight = Loss('geman_mcclure', _MEMBER * scale)
-    seen = refine_all(alone, [found.pose(n) for n in range(len(found))], tight, 1)
+    seen = refine_all(alone, found.poses(), tight, 1)
     best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
     refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
     pose = _in_front(alone, refined.pose(0), np.abs(refined.r[0]) < _MEMBER * scale)

@@ -49,6 +49,10 @@ class Sketch:
         """Give one of the poses."""
         return Pose(self.R[number], self.t[number])
 
+    def poses(self) -> list[Pose]:
+        """Give all poses."""
+        return [self.pose(number) for number in range(len(self))]
+
     def scales(self) -> Array:
         """Give the robust standard deviations (S,) of the residuals."""
         return np.array([robust_scale(r) for r in self.r])

@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import direction_angle, rotation_angle
+from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array
 from djet_ros.lab.pairs import has_failed
 from djet_ros.lab.scenes import make_scene, Scene
@@ -24,10 +24,9 @@ from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
-from djet_ros.replay.pair_errors import has_direction
+from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 # Metres that are none.
 _NOWHERE = 1e-9
@@ -186,11 +185,11 @@ class _Run:
     def _moment(self, index: int, result: OdometryResult, previous: int) -> Moment:
         true_motion = np.linalg.inv(self._poses[previous]) @ self._poses[index]
         tracked = result.status in TRACKED
-        rotation = direction = float('nan')
-        if tracked:
-            rotation = np.degrees(rotation_angle(true_motion[:3, :3], result.motion[:3, :3]))
-        if tracked and result.motion[:3, 3].any() and has_direction(true_motion):
-            direction = np.degrees(direction_angle(true_motion[:3, 3], result.motion[:3, 3]))
+        rotation, direction = angles_off(result.motion, true_motion)
+        if not tracked:
+            rotation = float('nan')
+        if not tracked or not result.motion[:3, 3].any():
+            direction = float('nan')
         black = TRIALS[self._chunk.trial].dark
         dark = index in black or previous in black
         off, surprise = self._off_since_light(index, result) if dark else (float('nan'),) * 2
@@ -202,8 +201,8 @@ class _Run:
         return Moment(
             self._chunk.trial, self._chunk.seed, self._aid, index, result.status.value,
             dark, tracked, result.stationary,
-            invented or has_failed(rotation, direction, true_motion), float(rotation),
-            float(direction), off, surprise, self._bias_off())
+            invented or has_failed(rotation, direction, true_motion), rotation, direction, off,
+            surprise, self._bias_off())
 
     def _off_since_light(self, index: int, result: OdometryResult) -> tuple[float, float]:
         """Give the error in degrees of the turn since it was light, and its surprise."""
@@ -212,7 +211,7 @@ class _Run:
         true = self._poses[index][:3, :3] @ self._poses[before][:3, :3].T
         # Both along the axes of the first camera, as the covariances are.
         start = light.pose[:3, :3] @ self._poses[before][:3, :3].T
-        off = Rotation.from_matrix(start @ true @ start.T @ told.T).as_rotvec()
+        off = rotation_log(start @ true @ start.T @ told.T)
         covariance = (result.pose_covariance - light.pose_covariance)[3:, 3:]
         return (float(np.degrees(np.linalg.norm(off))),
                 float(off @ np.linalg.solve(covariance, off)))

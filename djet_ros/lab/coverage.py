@@ -16,15 +16,14 @@ from pathlib import Path
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import direction_angle, rotation_angle, sphere_tangents, unit
+from djet_ros.core.geometry import rotation_log, sphere_tangents, unit
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.sequences import opened, plain_name
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED, VisualOdometry
-from djet_ros.replay.pair_errors import has_direction
+from djet_ros.replay.pair_errors import angles_off
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import beta, chi2
 
 # Probabilities whose ellipsoids are looked at.
@@ -144,12 +143,11 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
     true_motion = np.linalg.inv(poses[previous]) @ poses[current]
     if not np.isfinite(true_motion).all():
         return
-    motion, has_pose = camera_motion(pose), len(pose.x) > 0
-    rotation = direction = float('nan')
-    if has_pose:
-        rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
-    if pose.t.any() and has_direction(true_motion):
-        direction = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
+    rotation, direction = angles_off(camera_motion(pose), true_motion)
+    if not len(pose.x):
+        rotation = float('nan')
+    if not pose.t.any():
+        direction = float('nan')
     claims = np.degrees(np.sqrt([np.trace(pose.covariance_5[:3, :3]),
                                  np.trace(pose.covariance_5[3:, 3:])]))
     yield Coverage(
@@ -168,7 +166,7 @@ def normalised_square(pose: RelativePose, true_motion: Array) -> float:
     """
     R = true_motion[:3, :3].T
     t = unit(-R @ true_motion[:3, 3])
-    error = np.concatenate([Rotation.from_matrix(R @ pose.R.T).as_rotvec(),
+    error = np.concatenate([rotation_log(R @ pose.R.T),
                             sphere_tangents(pose.t).T @ (t - pose.t)])
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 

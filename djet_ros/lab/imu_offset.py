@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 import numpy as np
@@ -35,8 +36,7 @@ class VisualTurns:
     def rates(self) -> Array:
         """Tell how fast it turned on average: (N, 3) in rad/s, along the camera's axes."""
         seconds = (self.end_ns - self.start_ns) * 1e-9
-        return np.asarray(Rotation.from_matrix(self.R.transpose(0, 2, 1)).as_rotvec()
-                          / seconds[:, None])
+        return np.asarray(rotation_log(self.R.transpose(0, 2, 1)) / seconds[:, None])
 
 
 @dataclass(frozen=True)

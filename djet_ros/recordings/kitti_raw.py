@@ -11,6 +11,7 @@ from __future__ import annotations
 from datetime import datetime, UTC
 from pathlib import Path
 
+from djet_ros.core.geometry import nearest_rotation
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.interpolation import poses_at
@@ -164,8 +165,7 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
     turn[:3, :3] = rectifying
     # The files have too few digits for a rotation.
     pose = turn @ pose
-    U, _, Vt = np.linalg.svd(pose[:3, :3])
-    pose[:3, :3] = U @ Vt
+    pose[:3, :3] = nearest_rotation(pose[:3, :3])
     return pose
 
 

@@ -44,12 +44,21 @@ class PairErrors:
 
 def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[float, float]:
     """Errors of the rotation and of the direction of one motion (4, 4), in degrees, or NaN."""
-    rotation = translation = float('nan')
-    if status in (Status.OK, Status.NO_PARALLAX):
-        rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
-    if status is Status.OK and has_direction(true_motion):
-        translation = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
-    return rotation, translation
+    if status not in (Status.OK, Status.NO_PARALLAX):
+        return float('nan'), float('nan')
+    rotation, direction = angles_off(motion, true_motion)
+    return rotation, direction if status is Status.OK else float('nan')
+
+
+def angles_off(motion: Array, true_motion: Array) -> tuple[float, float]:
+    """
+    By what angles, in degrees, the rotation and the direction of a motion (4, 4) are off.
+
+    The latter is NaN where the true motion has no direction.
+    """
+    rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
+    direction = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
+    return rotation, direction if has_direction(true_motion) else float('nan')
 
 
 def has_direction(true_motion: Array) -> bool:
