@@ -76,7 +76,7 @@ def test_the_command_runs_each_trial_with_all_aids_and_takes_up_where_it_ended(
 
 @pytest.mark.parametrize(('arguments', 'said'), [
     (('--trials', 'moon'), "'moon'"), (('--frames', '2'), '--frames is 2'),
-    (('--workers', '0'), '--workers 0')])
+    (('--workers', '0'), 'workers is 0')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
         said: str) -> None:

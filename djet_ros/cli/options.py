@@ -54,6 +54,18 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
                         help='frame after the last one (default: all)')
 
 
+def add_workers(parser: argparse._ActionsContainer) -> None:
+    """Add --workers."""
+    parser.add_argument('--workers', type=int, metavar='N',
+                        help='processes on this machine (default: one for each core)')
+
+
+def check_workers(args: argparse.Namespace) -> None:
+    """Raise DjetError where --workers is none."""
+    if args.workers is not None and args.workers < 1:
+        raise DjetError(f'workers is {args.workers}; at least one is needed')
+
+
 def add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add --image-topic and the like."""
     for name in names:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -55,6 +56,14 @@ def new_table(title: str, *headings: str) -> Table:
     table = Table(title=title, show_header=bool(headings))
     for index, heading in enumerate(headings or ('', '')):
         table.add_column(heading, justify='right' if index else 'left')
+    return table
+
+
+def compact_table(*headings: str, names: int = 1, title: str | None = None) -> Table:
+    """Give a table of many columns without lines between; names: columns that hold no figures."""
+    table = Table(title=title, title_justify='left', box=SIMPLE_HEAD, padding=0)
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify='right' if index >= names else 'left', no_wrap=True)
     return table
 
 

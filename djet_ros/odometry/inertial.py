@@ -10,24 +10,22 @@ What an image calls t is t + offset to the IMU, as Kalibr's timeshift_cam_imu ha
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
 from itertools import pairwise
 
 from djet_ros.core.fusion import Turn
 from djet_ros.core.types import Array
+from djet_ros.odometry.stamped import Stamped
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 # Samples that are kept: a minute and more of the fastest IMUs.
-_KEPT = 100_000
+_KEPT = 200_000
 
 # A hole between two samples beyond which nobody knows what happened in it.
 _LONGEST_HOLE_NS = 250_000_000
-
-# Stamps that go back by more belong to another time, as when a bag begins again.
-_BACK_NS = 500_000_000
 
 # rad/s that no gyro measures, and from which on equal values in a row are the end of its range.
 _FASTEST, _FAST = 200.0, 3.0
@@ -98,8 +96,7 @@ class Gyro:
 
     def reset(self) -> None:
         """Forget all samples; the bias is the device's, and stays known."""
-        self._stamps: list[int] = []
-        self._rates: dict[int, Array] = {}
+        self._rates = Stamped(_KEPT)
         self._saturated: list[int] = []
         self._equal = 0
         self._latest: tuple[tuple[object, ...], _Integral | None] | None = None
@@ -112,14 +109,14 @@ class Gyro:
     @property
     def newest_ns(self) -> int | None:
         """Give the stamp of the newest sample, by the clock of the images."""
-        return self._stamps[-1] - self.offset_ns if self._stamps else None
+        return self._rates.stamps[-1] - self.offset_ns if self._rates else None
 
     def add(self, stamp_ns: int, rate: Array) -> None:
         """Take a rate (3,) in rad/s; what is of no use is counted in ``refused``."""
         if not (np.abs(rate) < _FASTEST).all():
             self.refused['not a rate'] += 1
             return
-        if self._stamps and stamp_ns < self._stamps[-1] - _BACK_NS:
+        if self._rates.goes_back(stamp_ns):
             refused = self.refused
             self.reset()
             self.refused = refused + Counter({'stamps went back': 1})
@@ -127,22 +124,17 @@ class Gyro:
             self.refused['equal stamp'] += 1
             return
         self._note_saturation(stamp_ns, rate)
-        if self._stamps and stamp_ns < self._stamps[-1]:
+        if self._rates and stamp_ns < self._rates.stamps[-1]:
             self.refused['out of order'] += 1  # and of use all the same
-        insort(self._stamps, stamp_ns)
-        self._rates[stamp_ns] = rate
-        if len(self._stamps) > 2 * _KEPT:
-            self._drop(_KEPT)
+        self._rates.add(stamp_ns, rate)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Let go of what was before an image that no other will be related to."""
-        first = bisect_right(self._stamps, stamp_ns + self.offset_ns) - 1
-        if first > 0:
-            self._drop(first)
+        self._rates.forget_before(stamp_ns + self.offset_ns)
 
     def covers(self, stamp_ns: int) -> bool:
         """Tell whether there is a sample at the stamp of an image, or after it."""
-        return self.newest_ns is not None and self.newest_ns >= stamp_ns
+        return self._rates.covers(stamp_ns + self.offset_ns)
 
     def turn(self, start_ns: int, end_ns: int) -> Turn | None:
         """Tell how the camera turned between two images; None where that was not measured."""
@@ -210,7 +202,7 @@ class Gyro:
 
     def _integral(self, start_ns: int, end_ns: int) -> _Integral | None:
         """Give the integral of the rates, which several ask for in turn."""
-        asked = start_ns, end_ns, self.offset_ns, self.bias.tobytes(), len(self._stamps)
+        asked = start_ns, end_ns, self.offset_ns, self.bias.tobytes(), len(self._rates)
         if self._latest is None or self._latest[0] != asked:
             self._latest = asked, self._integrated(start_ns, end_ns)
         return self._latest[1]
@@ -218,10 +210,11 @@ class Gyro:
     def _integrated(self, start_ns: int, end_ns: int) -> _Integral | None:
         """Integrate the rates; None where samples are missing, or at the end of their range."""
         start, end = start_ns + self.offset_ns, end_ns + self.offset_ns
-        first, last = bisect_right(self._stamps, start) - 1, bisect_left(self._stamps, end)
-        if first < 0 or last >= len(self._stamps) or end <= start:
+        known = self._rates.stamps
+        first, last = bisect_right(known, start) - 1, bisect_left(known, end)
+        if first < 0 or last >= len(known) or end <= start:
             return None
-        stamps = self._stamps[first:last + 1]
+        stamps = known[first:last + 1]
         if max(b - a for a, b in pairwise(stamps)) > _LONGEST_HOLE_NS \
                 or self._is_saturated(stamps[0], stamps[-1]):
             return None
@@ -235,23 +228,17 @@ class Gyro:
 
     def _note_saturation(self, stamp_ns: int, rate: Array) -> None:
         """Take values that stay the same at a high rate for the end of the gyro's range."""
-        before = self._rates[self._stamps[-1]] if self._stamps else np.zeros(3)
+        before = self._rates[self._rates.stamps[-1]] if self._rates else np.zeros(3)
         same = bool(((rate == before) & (np.abs(rate) > _FAST)).any())
         self._equal = self._equal + 1 if same else 0
         if self._equal + 1 >= _EQUAL_IN_A_ROW:
             self.refused['end of its range'] += 1
+            del self._saturated[:bisect_left(self._saturated, self._rates.stamps[0])]
             self._saturated.append(stamp_ns)
 
     def _is_saturated(self, start: int, end: int) -> bool:
         place = bisect_left(self._saturated, start)
         return place < len(self._saturated) and self._saturated[place] <= end
-
-    def _drop(self, number: int) -> None:
-        """Drop the oldest samples."""
-        for stamp in self._stamps[:number]:
-            del self._rates[stamp]
-        del self._stamps[:number]
-        del self._saturated[:bisect_left(self._saturated, self._stamps[0])]
 
 
 def _integrate(times: Array, knots: Array, rates: Array) -> _Integral:

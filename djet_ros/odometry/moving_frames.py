@@ -9,7 +9,7 @@ from djet_ros.core.types import Array
 from djet_ros.odometry.interpolation import Stamps
 from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.pose_track import PoseTrack
-from djet_ros.odometry.static_frames import MOST, StaticFrames
+from djet_ros.odometry.static_frames import MOST, StaticFrames, upwards
 import numpy as np
 
 TOPIC = '/tf'
@@ -74,13 +74,8 @@ class MovingFrames:
 
     def _upwards(self, frame: str, stamps_ns: Stamps) -> Iterator[tuple[str, Array]]:
         """Yield a frame and those it stands on, each with the first one in it (N, 4, 4)."""
-        frame = frame.lstrip('/')
-        poses, seen = np.tile(np.eye(4), (len(stamps_ns), 1, 1)), set[str]()
-        # Who publishes nonsense may close a circle.
-        while frame not in seen:
-            yield frame, poses
-            seen.add(frame)
-            if (link := self._moving.get(frame)) is not None:
-                frame, poses = link.parent, link.poses.at(stamps_ns) @ poses
-            elif (still := self._static.above(frame)) is not None:
-                frame, poses = still[0], still[1] @ poses
+        def above(frame: str) -> tuple[str, Array] | None:
+            link = self._moving.get(frame)
+            return (link.parent, link.poses.at(stamps_ns)) if link else self._static.above(frame)
+
+        return upwards(frame, above, np.tile(np.eye(4), (len(stamps_ns), 1, 1)))

@@ -37,8 +37,8 @@ class StaticFrames:
 
     def transform(self, parent: str, child: str) -> Array | None:
         """Give a frame in another (4, 4), or None where they are not of one tree."""
-        above = dict(self._upwards(parent.lstrip('/')))
-        for frame, pose in self._upwards(child.lstrip('/')):
+        above = dict(upwards(parent, self.above, np.eye(4)))
+        for frame, pose in upwards(child, self.above, np.eye(4)):
             if frame in above:
                 return np.asarray(np.linalg.inv(above[frame]) @ pose)
         return None
@@ -47,13 +47,19 @@ class StaticFrames:
         """Give what a frame stands on, and itself in that (4, 4)."""
         return self._parents.get(frame)
 
-    def _upwards(self, frame: str) -> Iterator[tuple[str, Array]]:
-        """Yield a frame and those it stands on, each with the first one in it (4, 4)."""
-        pose, seen = np.eye(4), set[str]()
-        # Who publishes nonsense may close a circle.
-        while frame not in seen:
-            yield frame, pose
-            seen.add(frame)
-            if frame in self._parents:
-                frame, step = self._parents[frame]
-                pose = step @ pose
+
+def upwards(frame: str, above: Callable[[str], tuple[str, Array] | None], itself: Array
+            ) -> Iterator[tuple[str, Array]]:
+    """
+    Yield a frame and those it stands on, each with the first one in it.
+
+    above: gives what a frame stands on, and itself in that (4, 4) or, at several times,
+    (N, 4, 4); itself: the first frame in itself, of that shape.
+    """
+    frame, pose, seen = frame.lstrip('/'), itself, set[str]()
+    # Who publishes nonsense may close a circle.
+    while frame not in seen:
+        yield frame, pose
+        seen.add(frame)
+        if (step := above(frame)) is not None:
+            frame, pose = step[0], step[1] @ pose

@@ -303,16 +303,15 @@ class VisualOdometry:
               length: Length) -> OdometryResult:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
-        undecided = relative.status in UNDECIDED
-        given_up = undecided or self._bad_pairs >= self._config.max_lost
+        given_up = self._bad_pairs >= self._config.max_lost
         motion, covariance = self._carried(frame)
         result = self._result(frame, relative.status, relative, length, motion, covariance)
-        if given_up:
+        if given_up or relative.status in UNDECIDED:
             self._refer_to(frame, view)
             self._one_scale.begin(view)
             self._pose, self._pose_covariance = result.pose, result.pose_covariance
-            if self._bad_pairs >= self._config.max_lost:
-                self._prior = None
+        if given_up:
+            self._prior = None
         return result
 
     def _refer_to(self, frame: Frame, view: View) -> None:

@@ -124,7 +124,7 @@ def _files(path: Path) -> list[Path]:
         return _listed(path)
     if not path.is_file():
         state = 'is no regular file' if path.exists() else 'does not exist'
-        raise DjetError(f'{path} {state}; give a bag')
+        raise DjetError(f'{path} {state}; give a bag, or a folder of images')
     return [path]
 
 

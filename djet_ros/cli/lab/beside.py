@@ -8,8 +8,8 @@ from dataclasses import asdict
 from functools import partial
 import json
 
-from djet_ros.cli.options import add_output, add_seeds, split
-from djet_ros.cli.terminal import progress_bar
+from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers, split
+from djet_ros.cli.terminal import compact_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -28,7 +28,6 @@ from djet_ros.lab.runner import local_workers, run as run_chunks
 from djet_ros.lab.store import RecordStore
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -52,8 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--frames', type=int, default=1000, metavar='N',
                         help='of each trial at most (default: all, up to 301)')
     add_output(parser, 'folder of the results')
-    parser.add_argument('--workers', type=int, metavar='N',
-                        help='processes on this machine (default: one for each core)')
+    add_workers(parser)
     add_flags(parser, ('estimator.max_features',))
 
 
@@ -62,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
     trials = split(args.trials)
     if unknown := [name for name in trials if name not in TRIALS]:
         raise DjetError(f"--trials has '{unknown[0]}'; choose of {', '.join(TRIALS)}")
-    if args.frames < 3 or (args.workers is not None and args.workers < 1):
-        raise DjetError(f'--frames is {args.frames} and --workers {args.workers}; at least three '
-                        'frames and one worker are needed')
+    check_workers(args)
+    if args.frames < 3:
+        raise DjetError(f'--frames is {args.frames}; at least three are needed')
     args.output.mkdir(parents=True, exist_ok=True)
     moments = _moments(args, [TrialChunk(name, seed, args.frames)
                               for name in trials for seed in args.seeds])
@@ -102,8 +100,8 @@ def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:
 
 
 def _pairs(rows: Sequence[Row]) -> Table:
-    table = _table('', 'with', 'pairs', 'failed', 'wrong', 'stood', 'turn', 'worst', 'ratio',
-                   'way', 'worst')
+    table = compact_table('', 'with', 'pairs', 'failed', 'wrong', 'stood', 'turn', 'worst',
+                          'ratio', 'way', 'worst', names=2)
     alone = {row.trial: row.rotation_deg[0] for row in rows if row.aid == NOTHING}
     for row in rows:
         ratio = row.rotation_deg[0] / max(alone.get(row.trial, float('nan')), 1e-9)
@@ -115,7 +113,7 @@ def _pairs(rows: Sequence[Row]) -> Table:
 
 
 def _beyond(rows: Sequence[Row]) -> Table:
-    table = _table('', 'with', 'dark: off deg', 'square', 'bias: off %, by seed')
+    table = compact_table('', 'with', 'dark: off deg', 'square', 'bias: off %, by seed', names=2)
     for row in rows:
         if np.isfinite(row.dark_off_deg) or row.bias_off:
             table.add_row(row.trial, row.aid, _figure(row.dark_off_deg, 3),
@@ -125,19 +123,13 @@ def _beyond(rows: Sequence[Row]) -> Table:
 
 
 def _list_of(wrong: Sequence[Moment]) -> Table:
-    table = _table('wrong', 'seed', 'with', 'frame', 'status', 'rotation deg', 'direction deg')
+    table = compact_table('wrong', 'seed', 'with', 'frame', 'status', 'rotation deg',
+                          'direction deg', names=2)
     for one in wrong[:_LISTED]:
         table.add_row(one.trial, str(one.seed), one.aid, str(one.frame), one.status,
                       _figure(one.rotation_error_deg, 2), _figure(one.direction_error_deg, 1))
     if len(wrong) > _LISTED:
         table.add_row(f'and {len(wrong) - _LISTED} more')
-    return table
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=0)
-    for index, heading in enumerate(headings):
-        table.add_column(heading, justify='right' if index > 1 else 'left', no_wrap=True)
     return table
 
 

@@ -14,8 +14,15 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from djet_ros.cli.options import add_frames, add_output, add_seeds, split
-from djet_ros.cli.terminal import new_table, progress_bar
+from djet_ros.cli.options import (
+    add_frames,
+    add_output,
+    add_seeds,
+    add_workers,
+    check_workers,
+    split,
+)
+from djet_ros.cli.terminal import compact_table, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -36,7 +43,6 @@ from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import RecordStore
 from djet_ros.recordings.outputs import write_whole
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -59,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='frames of each rendered scene (default: %(default)s)')
     add_output(parser, 'folder of the results')
     add_frames(parser)
-    parser.add_argument('--workers', type=int, metavar='N',
-                        help='processes on this machine (default: one for each core)')
+    add_workers(parser)
     add_flags(parser, ('estimator.method',))
 
 
@@ -69,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
     scenes = list(SCENES) if args.scenes == 'all' else split(args.scenes)
     if unknown := [name for name in scenes if name not in SCENES]:
         raise DjetError(f"--scenes has '{unknown[0]}'; choose of {', '.join(SCENES)}, or all")
-    if (args.workers is not None and args.workers < 1) or args.frames < 2:
-        raise DjetError(f'--workers is {args.workers} and --frames {args.frames}; at least one '
-                        'worker and two frames are needed')
+    check_workers(args)
+    if args.frames < 2:
+        raise DjetError(f'--frames is {args.frames}; at least two are needed')
     if not scenes and not args.sources:
         raise DjetError('there is nothing to measure; name a SOURCE or --scenes')
     args.output.mkdir(parents=True, exist_ok=True)
@@ -153,10 +158,8 @@ def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
 
 
 def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
-    table = Table(title=title, title_justify='left', box=SIMPLE_HEAD, padding=0)
-    for heading in ('', 'pairs', 'OK', 'given up', 'right', 'failed', 'sure', 'median',
-                    *(f'{100 * level:g} %' for level in LEVELS)):
-        table.add_column(heading, justify='right' if heading else 'left', no_wrap=True)
+    table = compact_table('', 'pairs', 'OK', 'given up', 'right', 'failed', 'sure', 'median',
+                          *(f'{100 * level:g} %' for level in LEVELS), title=title)
     for row in rows:
         table.add_row(row.scene, *map(str, (
             row.pairs, row.told, row.given_up, row.needlessly, row.failed, row.wrong_and_sure)),

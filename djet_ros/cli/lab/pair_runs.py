@@ -12,10 +12,9 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from djet_ros.cli.options import add_frames, add_output
+from djet_ros.cli.options import add_frames, add_output, add_workers, check_workers
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags, flag_values
-from djet_ros.errors import DjetError
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairRecord
 from djet_ros.lab.runner import chunks_of, dask_workers, local_workers, run
@@ -44,8 +43,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--stride', type=int, default=1, metavar='N',
                         help='frames from one to the other of a pair (default: %(default)s)')
     workers = parser.add_mutually_exclusive_group()
-    workers.add_argument('--workers', type=int, metavar='N',
-                         help='processes on this machine (default: one for each core)')
+    add_workers(workers)
     workers.add_argument('--scheduler', metavar='ADDRESS',
                          help='Dask scheduler that spreads the work instead, such as '
                          'tcp://host:8786')
@@ -61,8 +59,7 @@ def shared_values(args: argparse.Namespace) -> dict[str, Any]:
 def evaluated(args: argparse.Namespace, competing: Sequence[Method]
               ) -> Iterator[tuple[list[Dataset], list[PairRecord]]]:
     """Run all pairs with a progress bar; datasets and records are good within the context."""
-    if args.workers is not None and args.workers < 1:
-        raise DjetError(f'workers is {args.workers}; at least one is needed')
+    check_workers(args)
     selection = Selection(args.start, args.end, args.stride)
     # Frames of bags are kept beside the results, where workers on other machines see them too.
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()

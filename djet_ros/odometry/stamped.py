@@ -1,0 +1,56 @@
+"""What others measure, by its stamps: in order or not, twice, or from another time."""
+
+from __future__ import annotations
+
+from bisect import bisect_right, insort
+
+from djet_ros.core.types import Array
+
+# Stamps that go back by more belong to another time, as when a bag begins again.
+_BACK_NS = 500_000_000
+
+
+class Stamped:
+    """Values by their stamps in ns, sorted; kept: how many of the newest."""
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.stamps: list[int] = []
+        self._values: dict[int, Array] = {}
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        return stamp_ns in self._values
+
+    def __getitem__(self, stamp_ns: int) -> Array:
+        return self._values[stamp_ns]
+
+    def goes_back(self, stamp_ns: int) -> bool:
+        """Tell whether time begins again with a stamp."""
+        return bool(self.stamps) and stamp_ns < self.stamps[-1] - _BACK_NS
+
+    def add(self, stamp_ns: int, value: Array) -> None:
+        """Take a value of a stamp that has none yet."""
+        insort(self.stamps, stamp_ns)
+        self._values[stamp_ns] = value
+        if len(self.stamps) > self._kept:
+            self._drop(1)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Tell whether there is a value at a stamp, or after it."""
+        return bool(self.stamps) and self.stamps[-1] >= stamp_ns
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Let go of what is not needed from a stamp on; the last value up to it is."""
+        self._drop(bisect_right(self.stamps, stamp_ns) - 1)
+
+    def _drop(self, number: int) -> None:
+        for stamp in self.stamps[:max(number, 0)]:
+            del self._values[stamp]
+        del self.stamps[:max(number, 0)]
