@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
+from djet_ros.core.features import detect_orb, match_close, match_everywhere, match_nearby
 from djet_ros.core.types import Features
 import numpy as np
 import pytest
@@ -67,18 +67,20 @@ def scores(previous, current, radius):
     return np.where(octaves <= 1, apart, np.inf), ways
 
 
+@pytest.mark.parametrize('match', [match_nearby, match_close])
 @pytest.mark.parametrize('radius', [0.5, 15.0, 60.0, 400.0])
-def test_nearby_matches_are_mutual_best_within_the_search_radius(pair, radius):
+def test_nearby_matches_are_mutual_best_within_the_search_radius(pair, radius, match):
     score, ways = scores(*pair, radius)
-    rows, columns = match_nearby(*pair, radius).T
+    rows, columns = match(*pair, radius).T
     assert (ways[rows, columns] <= radius).all()
     near = np.where(ways <= radius, score, np.inf)
     assert (near[rows, columns] <= near[rows].min(1) + 1e-3).all()
     assert (near[rows, columns] <= near[:, columns].min(0) + 1e-3).all()
 
 
+@pytest.mark.parametrize('match', [match_nearby, match_close])
 @pytest.mark.parametrize('radius', [15.0, 60.0, 400.0])
-def test_no_mutual_best_match_is_missing(pair, radius):
+def test_no_mutual_best_match_is_missing(pair, radius, match):
     score, ways = scores(*pair, radius)
     best, back = score.argmin(1), score.argmin(0)
     second = np.partition(score, 1, axis=1)[:, 1], np.partition(score, 1, axis=0)[1]
@@ -87,7 +89,16 @@ def test_no_mutual_best_match_is_missing(pair, radius):
                 # rounding may decide where two are equally good
                 and second[0][i] > score[i, j] + 1e-3 and second[1][j] > score[i, j] + 1e-3}
     assert len(expected) > 50
-    assert expected <= {(i, j) for i, j in match_nearby(*pair, radius).tolist()}
+    assert expected <= {(i, j) for i, j in match(*pair, radius).tolist()}
+
+
+def test_close_matches_differ_in_no_more_bits_than_they_may(pair):
+    every, sure = match_close(*pair, 60.0), match_close(*pair, 60.0, 40)
+    bits = distances(*pair)
+    assert bits[tuple(every.T)].max() > 40 >= bits[tuple(sure.T)].max()
+    # What may be matched at all comes first: nothing that is left out keeps others from it.
+    assert {tuple(m) for m in every[bits[tuple(every.T)] <= 40].tolist()} <= {
+        tuple(m) for m in sure.tolist()}
 
 
 def test_of_two_that_look_alike_the_nearer_is_taken(pair):
@@ -99,17 +110,19 @@ def test_of_two_that_look_alike_the_nearer_is_taken(pair):
     assert (columns < len(wall)).mean() > 0.95
 
 
-def test_twins_do_not_both_match_the_same_feature(pair):
+@pytest.mark.parametrize('match', [match_nearby, match_close])
+def test_twins_do_not_both_match_the_same_feature(pair, match):
     one = some(pair[0], slice(0, 1))
     twins = some(pair[0], [0, 0, 0])
-    assert len(match_nearby(twins, one, 60.0)) == 1
+    assert len(match(twins, one, 60.0)) == len(match(one, twins, 60.0)) == 1
 
 
-def test_matches_are_one_to_one_and_the_most_similar_come_first(pair):
-    rows, columns = match_nearby(*pair, search_radius=50.0).T
+@pytest.mark.parametrize('match', [match_nearby, match_close])
+def test_matches_are_one_to_one_and_the_most_similar_come_first(pair, match):
+    rows, columns = match(*pair, 50.0).T
     score, _ = scores(*pair, 50.0)
     assert (np.diff(score[rows, columns]) > -1e-3).all()
-    assert len(set(columns.tolist())) == len(columns) > 100
+    assert len(set(rows.tolist())) == len(set(columns.tolist())) == len(columns) > 100
 
 
 def test_every_feature_finds_itself(pair):
@@ -123,6 +136,7 @@ def test_every_feature_finds_itself(pair):
 def test_few_or_no_features_give_few_or_no_matches(pair, ours, theirs):
     previous, current = some(pair[0], ours), some(pair[1], theirs)
     assert len(match_nearby(previous, current, 1e4)) <= min(len(previous), len(current))
+    assert len(match_close(previous, current, 30.0)) <= min(len(previous), len(current))
     matches = match_everywhere(previous, current)
     assert matches.shape[1:] == (2,)
     assert len(matches) <= min(len(previous), len(current))

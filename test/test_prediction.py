@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import cv2
 from djet_ros.core.corners import detect_corners
-from djet_ros.core.geometry import rotation_angle, rotation_exp
-from djet_ros.core.prediction import likely_rotation, predict
+from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
+from djet_ros.core.prediction import foresee, likely_rotation, predict
+from djet_ros.core.types import RelativePose, Status
 import numpy as np
 import pytest
 from two_view import textured
@@ -50,3 +51,46 @@ def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
                    octaves=previous.octaves[:0])
     behind = predict(previous, none, K, [rotation_exp(np.array([0.0, 3.0, 0.0]))], 30.0)
     assert np.isfinite(behind).all()
+
+
+def driven_through(depths):
+    """Give features of the second of three views, the motion of each step, and the third."""
+    rng = np.random.default_rng(5)
+    n = len(depths)
+    places = np.stack([rng.uniform(-0.4, 0.4, n), rng.uniform(-0.3, 0.3, n), np.ones(n)]).T
+    places *= depths[:, None]
+    R, t = rotation_exp(np.array([0.01, -0.03, 0.005])), unit(np.array([0.2, 0.1, -1.0]))
+    seen = []
+    for _ in range(3):
+        image = places @ K.T
+        seen.append(image[:, :2] / image[:, 2:])
+        places = places @ R.T + t
+    before = RelativePose(Status.OK, R, t, x=seen[0], y=seen[1], y_opt=seen[1],
+                          inliers=np.ones(n, bool))
+    none = detect_corners(np.zeros((300, 400), np.uint8), 100, 1.0)
+    return replace(none, points=seen[1]), before, seen[2]
+
+
+def test_a_camera_that_goes_on_as_before_sees_what_is_foreseen():
+    features, before, truth = driven_through(np.random.default_rng(6).uniform(5, 50, 200))
+    foreseen = foresee(features, K, before.R, before)
+    assert np.abs(foreseen - truth).max() < 1e-6
+    # By the turn alone they are seen elsewhere.
+    turned = predict(features, features, K, [before.R], 30.0, sure=True)
+    assert np.median(np.linalg.norm(turned - truth, axis=1)) > 3
+
+
+def test_what_was_not_seen_before_moves_as_what_is_beside_it():
+    features, before, truth = driven_through(np.full(200, 20.0))
+    known = np.arange(200) % 4 > 0
+    foreseen = foresee(features, K, before.R, replace(before, inliers=known))
+    assert np.abs(foreseen - truth)[known].max() < 1e-6
+    assert 1e-6 < np.linalg.norm(foreseen - truth, axis=1)[~known].max() < 2
+
+
+def test_after_a_mere_turn_the_next_one_is_foreseen():
+    features, before, _ = driven_through(np.full(50, 1e9))
+    still = replace(before, t=np.zeros(3))
+    turned = predict(features, features, K, [before.R], 30.0, sure=True)
+    assert np.allclose(foresee(features, K, before.R, still), turned)
+    assert np.abs(foresee(features, K, before.R, before) - turned).max() < 1e-3

@@ -10,6 +10,7 @@ from djet_ros.core.parallel import both, each
 from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 # Features of the previous image that are compared at once; bounds the memory of a comparison.
 _STRIP = 64
@@ -19,6 +20,10 @@ _OCTAVES = 1
 
 # Bits that a feature at the search radius has to agree in beyond one that has not moved.
 _DISTANCE_BITS = 32
+
+# How many bits are set in each number of 16.
+_BITS = np.unpackbits(np.arange(2**16, dtype=np.uint16).view(np.uint8).reshape(-1, 2),
+                      axis=1).sum(1, dtype=np.uint8)
 
 
 def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20,
@@ -89,6 +94,41 @@ def match_nearby(previous: Features, current: Features,
     matches = np.stack([rows[best], columns[claim[best]]], axis=1)
     _, first = np.unique(matches[:, 1], return_index=True)  # twins claim the same feature
     return matches[np.sort(first)]
+
+
+def match_close(previous: Features, current: Features, reach: float,
+                most_bits: int = 256) -> NDArray[np.int64]:
+    """
+    Match as `match_nearby` does, pair by pair: for a reach of few pixels, which leaves few pairs.
+
+    most_bits: in which descriptors may differ at most. Gives (M, 2) indices, likewise.
+    """
+    near = cKDTree(previous.points).sparse_distance_matrix(
+        cKDTree(current.points), reach, output_type='ndarray')
+    rows, columns, apart = near['i'], near['j'], near['v']
+    differing = _differing(previous.descriptors, rows, current.descriptors, columns)
+    like = (np.abs(previous.octaves[rows] - current.octaves[columns]) <= _OCTAVES) & (
+        differing <= most_bits)
+    rows, columns, apart, differing = rows[like], columns[like], apart[like], differing[like]
+    badness = differing + _DISTANCE_BITS * (apart / reach)**2
+    least_there, least_here = np.full(len(previous), np.inf), np.full(len(current), np.inf)
+    np.minimum.at(least_there, rows, badness)
+    np.minimum.at(least_here, columns, badness)
+    mutual = (badness == least_there[rows]) & (badness == least_here[columns])
+    matches = np.stack([rows, columns], axis=1)[mutual]
+    matches = matches[np.argsort(badness[mutual], kind='stable')]
+    for side in (0, 1):  # twins match the same feature
+        _, first = np.unique(matches[:, side], return_index=True)
+        matches = matches[np.sort(first)]
+    return np.asarray(matches)
+
+
+def _differing(there: NDArray[np.uint8], rows: NDArray[np.int64], here: NDArray[np.uint8],
+               columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count the bits (M,) in which descriptors (N, 32) of two images differ, pair by pair."""
+    words = (np.ascontiguousarray(descriptors).view(np.uint16) for descriptors in (there, here))
+    apart = next(words).take(rows, 0) ^ next(words).take(columns, 0)
+    return np.asarray(_BITS.take(apart).sum(1, dtype=np.int64))
 
 
 def _compare(left: NDArray[np.float32], right: NDArray[np.float32],

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from djet_ros.core.features import factor
-from djet_ros.core.geometry import rays, unit
+from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.types import Array, Features, RelativePose
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 # Features of the largest size that are compared with all of their size, wherever they are.
 _COMPARED = 250
@@ -18,6 +19,9 @@ _SAMPLES = 300
 
 # The few that moved farthest are near, or false.
 _NEARLY_ALL = 0.98
+
+# Inverse depth, in units of the motion before, of what is as near as can be seen again.
+_NEAREST = 0.5
 
 # Pixels by which the predicted turn may be off.
 _ROOM = 20.0
@@ -33,9 +37,33 @@ def predict(previous: Features, current: Features, K: Array, known: Sequence[Arr
     known rotations has been measured, so that none has to be found.
     """
     R = known[0] if sure else likely_rotation(previous, current, K, known, reach)
-    turned = rays(K, previous.points) @ (K @ R).T
-    # What is turned to behind the camera is far out of the image.
-    return np.asarray(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3))
+    return _seen(K, rays(K, previous.points) @ R.T)
+
+
+def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Array:
+    """
+    Tell where the previous features will be seen if the camera goes on as it did before.
+
+    Gives pixels (N, 2). R: (3, 3) its next turn; before: its motion up to the previous image. A
+    feature moves beyond the turn as the nearest inlier of that motion will.
+    """
+    x, y = before.x[before.inliers], before.y_opt[before.inliers]
+    turned = rays(K, previous.points) @ R.T
+    if not before.t.any() or not len(x):
+        return _seen(K, turned)
+    rho = inverse_depths(before.R, before.t, rays(K, x), rays(K, y))[0].clip(0, _NEAREST)
+    step = rho[:, None] * before.t
+    # With z = 1 of x: of the same length as rho, whatever the depth.
+    there = (rays(K, x) @ before.R.T + step) @ R.T
+    shift = _seen(K, there + step) - _seen(K, there)
+    _, nearest = cKDTree(y).query(previous.points)
+    return np.asarray(_seen(K, turned) + shift[nearest])
+
+
+def _seen(K: Array, places: Array) -> Array:
+    """Pixels (N, 2) of places (N, 3); what is behind the camera is far out of the image."""
+    image = places @ K.T
+    return np.asarray(image[:, :2] / np.maximum(image[:, 2:], 1e-3))
 
 
 def reach_of(motion: RelativePose, K: Array) -> float:
