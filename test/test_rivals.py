@@ -20,16 +20,18 @@ from two_view import FORWARD, K, project, SIZE, two_views, TwoViews, uniform_vie
 NOISE = 0.2
 # How a body may move, as the camera sees it: across, or against it along the camera's own way.
 BODIES = {'across': (0.3, 0.05, 0.4), 'against': (0.0, -0.016, 0.8)}
+FLAT, DEEP = (3, 4), (4, 40)
 
 
 def scene_with_body(still: int, moving: int, motion: str, box: tuple[float, float],
+                    depths: tuple[float, float] = (5, 8)
                     ) -> tuple[TwoViews, np.ndarray, np.ndarray, Pose]:
     """Give matches of the world and of a body between two columns, and how that moves."""
     rng = np.random.default_rng(3)
     seen = two_views(rng, count=still, t=FORWARD, turn=(0.0, 0.004, 0.0))
     pixels = rng.uniform((box[0], 60), (box[1], SIZE[1]), (moving, 2))
     points = (np.column_stack([pixels, np.ones(moving)]) @ np.linalg.inv(K).T
-              * rng.uniform(5, 8, (moving, 1)))
+              * rng.uniform(*depths, (moving, 1)))
     R, t = rotation_exp(np.array([0.0, -0.01, 0.003])), np.array(BODIES[motion])
     x = np.concatenate([seen.x, pixels])
     y = np.concatenate([seen.y, project(K, points @ R.T + t)[0]])
@@ -43,8 +45,25 @@ def estimate(x: np.ndarray, y: np.ndarray, before: Pose | None = None) -> Relati
 
 
 @pytest.mark.parametrize('motion', BODIES)
-def test_of_two_bodies_none_is_taken_for_the_world_for_sure(motion: str) -> None:
-    _, x, y, _ = scene_with_body(200, 300, motion, (300, 1000))
+def test_of_two_bodies_equally_deep_none_is_taken_for_the_world_for_sure(motion: str) -> None:
+    _, x, y, _ = scene_with_body(200, 300, motion, (300, 1000), DEEP)
+    assert estimate(x, y).status is Status.TWO_MOTIONS
+
+
+@pytest.mark.parametrize('motion', BODIES)
+def test_the_world_is_what_reaches_far_though_most_matches_follow_a_flat_body(
+        motion: str) -> None:
+    seen, x, y, _ = scene_with_body(200, 300, motion, (300, 1000), FLAT)
+    result = estimate(x, y)
+    assert result.status is Status.OK
+    assert rotation_angle(result.R, seen.R) < 2e-3
+    assert direction_angle(result.t, seen.t) < 0.02
+
+
+def test_a_body_that_shows_no_depth_for_want_of_parallax_may_be_the_world(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BODIES, 'beside', (0.0, 0.0, 1e-9))
+    _, x, y, _ = scene_with_body(200, 300, 'beside', (300, 1000), FLAT)
     assert estimate(x, y).status is Status.TWO_MOTIONS
 
 

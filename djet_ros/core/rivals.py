@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from djet_ros.core.covariance import summed_by_cell
-from djet_ros.core.geometry import facing
+from djet_ros.core.geometry import facing, inverse_depths
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_at, losses_in_front, refine_all
 from djet_ros.core.starts import all_round, FORWARD, thinned
@@ -43,6 +43,12 @@ _DIRECTIONS = 10
 # A second motion is looked for among so many strays at most.
 _STRAYS = 150
 
+# Shares of a body's points before its far and its near end; chosen: some are not of it.
+_FAR_END, _NEAR_END = 0.1, 0.95
+
+# chosen: noise of an inverse depth over that of the near end; more would make a plane look deep.
+_BLURRED = 0.1
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -59,13 +65,15 @@ class SecondMotion:
 
     first: the one that most matches follow; pose: the other one; members: (N,) bool mask of the
     matches that agree with that; width: the area that those are spread over which follow it
-    alone, over that of those which follow the first alone.
+    alone, over that of those which follow the first alone; flatness: of the first and the other,
+    distance of the near end over that of the far one, NaN where noise hides it.
     """
 
     first: Pose
     pose: Pose
     members: NDArray[np.bool_]
     width: float
+    flatness: tuple[float, float]
 
 
 def change(one: Pose, other: Pose) -> float:
@@ -146,7 +154,9 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     only_first = (off < _MEMBER * scale) & ~members
     only_second = members & (off > _STRAY * scale)
     return SecondMotion(first, pose, members,
-                        _area(places[only_second]) / max(_area(places[only_first]), 1e-9))
+                        _area(places[only_second]) / max(_area(places[only_first]), 1e-9),
+                        (_flatness(problem.subset(only_first), first),
+                         _flatness(problem.subset(only_second), pose)))
 
 
 def false_alarms(agreeing: int, matches: int, chance: float) -> float:
@@ -179,6 +189,19 @@ def _in_front(problem: JetProblem, pose: Pose, agreeing: NDArray[np.bool_]) -> P
     """Give t the sign that brings more of the points to the front of both cameras."""
     rays_x, rays_y = problem.rays_x[:, agreeing].T, problem.rays_y[:, agreeing].T
     return Pose(pose.R, facing(pose.R, pose.t, rays_x, rays_y) * pose.t)
+
+
+def _flatness(problem: JetProblem, pose: Pose) -> float:
+    """Distance of a body's near end over that of its far one, NaN where noise hides it."""
+    if not len(problem.blur):
+        return float('nan')
+    noise = robust_scale(refine_all(problem, [pose], Loss(), 0).r[0])
+    rho, sigma = inverse_depths(pose.R, pose.t, problem.rays_x.T, problem.rays_y.T)
+    # One unit of the residuals, in those of rays, for a match of typical sharpness.
+    pixel = np.sqrt(np.median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
+    far, near = np.quantile(rho, (_FAR_END, _NEAR_END))
+    blurred = near <= 0 or noise * pixel * np.median(sigma) > _BLURRED * near
+    return float('nan') if blurred else float(max(far / near, 0.0))
 
 
 def _area(places: Array) -> float:

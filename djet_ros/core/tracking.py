@@ -48,6 +48,10 @@ class TrackTuning:
     # chosen: a body spread over less than this share of the area of the world's matches is not
     # mistaken for it
     small_body: float = 0.3
+    # near end over far end: chosen, a body is about as deep as it is wide, and stands no nearer
+    # than that; the world reaches from the ground before the camera to the horizon
+    flat: float = 0.5
+    deep: float = 0.25
     # robust standard deviations; the usual three, within which a match agrees with a pose
     inlier: float = 3.0
 
@@ -220,23 +224,36 @@ def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
     """
     Tell the camera's motion from that of another body, and whether that is a guess.
 
-    It is the one that turns as was measured, or that goes on like the motion before. Else it is
-    the wider one, for the world surrounds what moves in it: for sure where the other one is far
-    smaller.
+    Where nothing tells, it is the wider one, for the world surrounds what moves in it.
     """
-    if turn is not None:
-        for one, other in ((second.first, second.pose), (second.pose, second.first)):
-            if turn.prefers(one.R, other.R):
-                return one, other, False
-    if prior is not None:
-        for one, other in ((second.first, second.pose), (second.pose, second.first)):
-            if goes_on(prior, one, other):
-                return one, other, False
+    both = second.first, second.pose
+    told = _told_apart(second, both, prior, turn)
+    taken = int(second.width > 1) if told is None else told
+    return both[taken], both[1 - taken], told is None
+
+
+def _told_apart(second: SecondMotion, both: tuple[Pose, Pose], prior: Pose | None,
+                turn: Turn | None) -> int | None:
+    """
+    Tell which of two motions, 0 or 1, is the camera's; None where that would be a guess.
+
+    It is the one that turns as was measured, or that goes on like the motion before; the one that
+    many more places of the image follow; or the one whose points reach from near to far, if those
+    of the other do not.
+    """
+    orders = (0, 1), (1, 0)
+    for one, other in orders:
+        if turn is not None and turn.prefers(both[one].R, both[other].R):
+            return one
+    for one, other in orders:
+        if prior is not None and goes_on(prior, both[one], both[other]):
+            return one
     if second.width < TUNING.small_body:
-        return second.first, second.pose, False
-    if second.width > 1:
-        return second.pose, second.first, True
-    return second.first, second.pose, True
+        return 0
+    for one, other in orders:
+        if second.flatness[one] < TUNING.deep and second.flatness[other] > TUNING.flat:
+            return one
+    return None
 
 
 def _scale(residuals: Array) -> float:
