@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from djet_ros.core.covariance import difference, spanning, squared_distance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -15,7 +17,17 @@ from djet_ros.core.types import Pose, RelativePose, Status
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_view import FORWARD, K, project, SIZE, two_views, TwoViews, uniform_view
+from two_view import (
+    FORWARD,
+    K,
+    moved_pose,
+    project,
+    SIDEWAYS,
+    SIZE,
+    two_views,
+    TwoViews,
+    uniform_view,
+)
 
 NOISE = 0.2
 # How a body may move, as the camera sees it: across, or against it along the camera's own way.
@@ -110,6 +122,45 @@ def test_the_motion_before_decides_between_them() -> None:
     x, y = plane_of_two_motions()
     guess = estimate(x, y)
     assert estimate(x, y, Pose(guess.R, guess.t)).status is Status.OK
+
+
+def going_on(x: np.ndarray, y: np.ndarray, before: Pose) -> RelativePose:
+    """Estimate from matches that were found where a motion before foresaw them."""
+    residuals = np.random.default_rng(7).normal(0, NOISE, len(x))
+    prior = RelativePose(Status.OK, before.R, before.t, residuals=residuals)
+    return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
+        uniform_view(), uniform_view(), x, y, prior, goes_on=True)
+
+
+@pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
+@pytest.mark.parametrize('off', [0.0, 0.02, 0.1])
+def test_going_on_ends_where_all_starts_end(t: Sequence[float], off: float) -> None:
+    rng = np.random.default_rng(8)
+    seen = two_views(rng, count=600, t=t)
+    y = seen.y + rng.normal(0, NOISE, seen.y.shape)
+    y[::5] += rng.uniform(-24, 24, y[::5].shape)  # false ones, as near as they are sought
+    one = going_on(seen.x, y, Pose(*moved_pose(seen.R, seen.t, off, rng)))
+    other = estimate(seen.x, y)
+    assert one.status is other.status is Status.OK
+    assert rotation_angle(one.R, other.R) < 1e-4
+    assert direction_angle(one.t, other.t) < 1e-3
+
+
+def test_going_on_with_a_wrong_motion_finds_the_right_one_nevertheless() -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        seen = two_views(rng, count=600, t=FORWARD)
+        wrong = Pose(seen.R, unit(np.asarray(SIDEWAYS)))
+        result = going_on(seen.x, seen.y + rng.normal(0, NOISE, seen.y.shape), wrong)
+        assert result.status is Status.OK
+        assert direction_angle(result.t, seen.t) < 0.02
+
+
+def test_going_on_does_not_decide_between_motions_that_are_both_far_from_the_one_before() -> None:
+    x, y = plane_of_two_motions()
+    guess = estimate(x, y)
+    assert going_on(x, y, Pose(guess.R, -unit(np.cross(guess.t, (0.3, 0.8, 0.1))))).status \
+        is Status.AMBIGUOUS
 
 
 def test_points_in_space_leave_no_choice() -> None:

@@ -17,7 +17,7 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
 from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
-from djet_ros.core.starts import all_round, thinned
+from djet_ros.core.starts import all_round, FORWARD, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,9 @@ class BasinTuning:
     # robust standard deviations on
     core_rounds: int = 8
     core: float = 2.5
+    # standard deviations by which matches prefer the basin ahead to all others: one wrong of three
+    # millions
+    clear: float = 5.0
 
 
 TUNING = BasinTuning()
@@ -112,6 +115,34 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     scale = (min(map(_core_scale, refined.r)) if others_move
              else robust_scale(epipolar_residuals(problem, best.R, best.t).r))
     return Basin(best, max(scale, TUNING.least_scale), others_move, tuple(basins))
+
+
+def basin_ahead(problem: JetProblem, places: Array, before: Pose,
+                config: EstimatorConfig) -> Basin:
+    """
+    Choose among the basins around the motion before: its own, and of directions all round.
+
+    A few hundred matches lead to them, and all choose. What they are clearly against is no rival.
+    """
+    some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
+    tight, onward = Loss(), before
+    for steps in (0, TUNING.steps_to_sketch):
+        found = refine_all(some, [before], tight, steps)
+        tight = Loss(config.loss, min(config.loss_scale, TUNING.tight)
+                     * max(found.scales()[0], TUNING.least_scale))
+        onward = found.pose(0)
+    starts = [onward, Pose(before.R, FORWARD), *all_round(before.R, TUNING.directions)]
+    near = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
+                      TUNING.refined_starts)
+    basins = _promising(some, refine_all(some, near, tight, TUNING.steps_to_sketch), tight,
+                        TUNING.refined_starts)
+    losses = losses_at(problem, basins, tight)
+    number = _likeliest(losses, places, basins, before)
+    preferred = preferences(losses, places, number)
+    best = basins[number]
+    scale = robust_scale(epipolar_residuals(problem, best.R, best.t).r)
+    return Basin(best, max(scale, TUNING.least_scale), rivals=tuple(
+        pose for pose, z in zip(basins, preferred) if pose is not best and z < TUNING.clear))
 
 
 def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],
@@ -179,10 +210,12 @@ def _held(turn: Turn | None, scale: float) -> Held | None:
 def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
                possible: NDArray[np.bool_] | None = None) -> list[Pose]:
     """Choose the cheapest poses that lie in different basins, up to a number of them."""
-    chosen: list[Pose] = []
+    chosen: list[int] = []
+    R = sketch.R.reshape(-1, 9)
+    # Squares of what `apart` gives, of all at once.
+    off = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T)
     for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
-        pose = sketch.pose(number)
-        if (possible is None or possible[number]) and all(
-                apart(other, pose) > TUNING.same_basin for other in chosen):
-            chosen.append(pose)
-    return chosen[:most]
+        if (possible is None or possible[number]) and (
+                off[number, chosen] > TUNING.same_basin**2).all():
+            chosen.append(number)
+    return [sketch.pose(number) for number in chosen[:most]]

@@ -20,6 +20,7 @@ from djet_ros.core.geometry import (
     rays,
 )
 from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.parallel import both
 from djet_ros.core.prediction import foresee, predict, reach_of
@@ -51,6 +52,10 @@ _FORESEEN, _SURE_BITS = 24.0, 64
 
 # chosen: fewer matches than these leave a choice of motions, so that all are sought widely.
 _MANY = 400
+
+# chosen: by as much the distances of matches from their epipolar lines may grow from one pair to
+# the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
+_NOISIER, _LEAST_NOISE = 1.5, 0.1
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -104,23 +109,29 @@ class TwoViewEstimator:
         """
         timings: dict[str, float] = {}
         with _timed(timings, 'matching'):
-            x, y = self.match(previous, current, prior, known)
+            x, y, goes_on = self._match(previous, current, prior, known or Known())
         return replace(
-            self.estimate_matched(previous, current, x, y, prior, timings, known=known),
-            timings=timings)
+            self.estimate_matched(previous, current, x, y, prior, timings, known=known,
+                                  goes_on=goes_on), timings=timings)
 
     def match(self, previous: View, current: View, prior: RelativePose | None = None,
               known: Known | None = None) -> tuple[Array, Array]:
         """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
-        there, here, known = previous.features, current.features, known or Known()
-        matches: NDArray[np.int64] | None
+        x, y, _ = self._match(previous, current, prior, known or Known())
+        return x, y
+
+    def _match(self, previous: View, current: View, prior: RelativePose | None,
+               known: Known) -> tuple[Array, Array, bool]:
+        """Match, and tell whether features were where the motion before foresees them."""
+        there, here = previous.features, current.features
+        foreseen = None
         if self.config.search_radius >= 1:
             matches = match_everywhere(there, here)
+        elif (foreseen := self._match_foreseen(previous, current, prior, known)) is not None:
+            matches = foreseen
         else:
-            matches = self._match_foreseen(previous, current, prior, known)
-            if matches is None:
-                matches = self._match_turned(previous, current, prior, known)
-        return there.points[matches[:, 0]], here.points[matches[:, 1]]
+            matches = self._match_turned(previous, current, prior, known)
+        return there.points[matches[:, 0]], here.points[matches[:, 1]], foreseen is not None
 
     def _match_foreseen(self, previous: View, current: View, prior: RelativePose | None,
                         known: Known) -> NDArray[np.int64] | None:
@@ -152,12 +163,13 @@ class TwoViewEstimator:
                          prior: RelativePose | None = None,
                          timings: dict[str, float] | None = None,
                          observe: Observer | None = None,
-                         known: Known | None = None) -> RelativePose:
+                         known: Known | None = None, goes_on: bool = False) -> RelativePose:
         """
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
         timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1;
-        known: as for ``estimate``.
+        known: as for ``estimate``; goes_on: whether matches were found where the motion before
+        foresees them, so that its basin will do as a start where none other comes near.
         """
         known = known or Known()
         timings = {} if timings is None else timings
@@ -166,22 +178,20 @@ class TwoViewEstimator:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
         before = _pose(prior)
+        starts: list[Pose] = []
         if config.starts == 'several' and config.method != 'five_point':
-            # Starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
-            # The first surfaces need no pose, and are sampled meanwhile.
-            began = perf_counter()
-            starts, surface = both(
-                lambda: self._starts(K, x, y, before, known),
-                lambda: self._surface(previous, current, x, y, timings))
-            # What was done beside the surfaces took no time: stages add up to all of it.
-            timings['starts'] = perf_counter() - began - timings['jet']
+            goes_on = goes_on and before is not None and known.turn is None
+            if goes_on:  # starts are looked for around the motion before
+                surface = self._surface(previous, current, x, y, timings)
+            else:
+                starts, surface = self._started(previous, current, x, y, before, known, timings)
         else:
             # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
             with _timed(timings, 'starts'):
                 found = five_point(K, x, y, config.ransac_threshold, robust=False)
             if found is None:
                 return RelativePose(Status.DEGENERATE, x=x, y=y)
-            starts, x, y = [found[0]], x[found[1]], y[found[1]]
+            starts, x, y, goes_on = [found[0]], x[found[1]], y[found[1]], False
             surface = self._surface(previous, current, x, y, timings)
 
         # Joint epipolar tracking on the residual surfaces.
@@ -190,14 +200,30 @@ class TwoViewEstimator:
                      else track_jointly(surface, K, y, starts, config, before, observe,
                                         known.turn))
         if track is None:
-            return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
-        with _timed(timings, 'result'):
-            return self._result(previous, current, surface, y, track, before)
+            result = RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+        else:
+            with _timed(timings, 'result'):
+                result = self._result(previous, current, surface, y, track, before)
+        if goes_on and prior is not None and not _as_good(result, prior):
+            return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
+        return result
 
-    def _starts(self, K: Array, x: Array, y: Array, before: Pose | None,
-                known: Known) -> list[Pose]:
-        found = starting_poses(K, x, y, self.config.ransac_threshold, before)
-        return [*found, *known_starts(K, x, y, known)]
+    def _started(self, previous: View, current: View, x: Array, y: Array, before: Pose | None,
+                 known: Known, timings: dict[str, float]
+                 ) -> tuple[list[Pose], ResidualSurface]:
+        """
+        Collect starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
+
+        The first surfaces need no pose, and are sampled meanwhile.
+        """
+        began, jet = perf_counter(), timings.get('jet', 0.0)
+        starts, surface = both(
+            lambda: [*starting_poses(current.K, x, y, self.config.ransac_threshold, before),
+                     *known_starts(current.K, x, y, known)],
+            lambda: self._surface(previous, current, x, y, timings))
+        # What was done beside the surfaces took no time: stages add up to all of it.
+        timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
+        return starts, surface
 
     def _surface(self, previous: View, current: View, x: Array, y: Array,
                  timings: dict[str, float]) -> ResidualSurface:
@@ -255,6 +281,13 @@ class TwoViewEstimator:
         radius = min(self.config.search_radius, 0.5) * max(shape)
         chance = 4 * TUNING.inlier * track.scale() / (np.pi * radius)
         return false_alarms(agreeing, len(track.voting), chance) > 0
+
+
+def _as_good(result: RelativePose, prior: RelativePose) -> bool:
+    """Tell whether a pair is sure, and its matches fit it no worse than those before theirs."""
+    noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
+    return result.status in (Status.OK, Status.NO_PARALLAX) and (
+        robust_scale(result.residuals) < _NOISIER * noise)
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,

@@ -25,8 +25,10 @@ def skew(v: Array) -> Array:
 
 
 def rotation_exp(omega: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
-    return np.asarray(cv2.Rodrigues(omega)[0])
+    """Rotation matrices (…, 3, 3) of rotation vectors, (3,) or (N, 3), in radians."""
+    if omega.ndim == 1:  # Rodrigues' formula
+        return np.asarray(cv2.Rodrigues(omega)[0])
+    return np.asarray(Rotation.from_rotvec(omega).as_matrix())
 
 
 def rotation_log(R: Array) -> Array:
@@ -42,15 +44,16 @@ def unit(v: Array) -> Array:
 
 def sphere_tangents(t: Array) -> Array:
     """
-    Give two orthonormal directions (3, 2) perpendicular to the unit vector t (3,).
+    Give two orthonormal directions (…, 3, 2) perpendicular to unit vectors t, (3,) or (N, 3).
 
     Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017): no division by zero.
     """
-    x, y, z = t.tolist()
-    sign = 1.0 if z >= 0 else -1.0
+    x, y, z = t.T
+    sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a],
+                     [-sign * x, -y]]).transpose(*range(2, t.ndim + 1), 0, 1)
 
 
 def homogeneous(points: Array) -> Array:
@@ -120,8 +123,10 @@ def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.boo
 
 def facing(R: Array, t: Array, rays_x: Array, rays_y: Array) -> float:
     """Sign, 1 or -1, with which t brings more of the points to the front of both cameras."""
-    ahead, behind = (in_front(R, sign * t, rays_x, rays_y).sum() for sign in (1, -1))
-    return 1.0 if ahead >= behind else -1.0
+    # The other sign of t has all depths the other way round.
+    depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
+    ahead, behind = ((depth_x > 0) & (depth_y > 0), (depth_x < 0) & (depth_y < 0))
+    return 1.0 if ahead.sum() >= behind.sum() else -1.0
 
 
 def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
@@ -173,7 +178,9 @@ def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
     """Depths (N,) in A and in B, both times the same positive number for a point."""
     m = rays_x @ R.T
     normal = np.cross(m, rays_y)
-    return -(np.cross(t, rays_y) * normal).sum(1), -(np.cross(t, m) * normal).sum(1)
+    # (t x v) . n = v . (n x t)
+    plane = np.cross(t, normal)
+    return (rays_y * plane).sum(1), (m * plane).sum(1)
 
 
 def rotation_angle(Ra: Array, Rb: Array) -> float:

@@ -10,7 +10,7 @@ which costs it little on the way to a basin; ``jet.minimise`` goes on exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from djet_ros.core.geometry import (
     GENERATORS,
@@ -59,15 +59,18 @@ class Sketch:
 
 
 @dataclass(frozen=True)
-class _Expansion:
-    """Second-order expansions of S losses: costs (S,), H (S, 5, 5), gradients (S, 5)."""
+class _Look:
+    """
+    Matches as S poses leave them: costs (S,), and r, sign, weights (S, N) as they have them.
+
+    roots: (S, N) of the variances of the residuals.
+    """
 
     costs: Array
-    H: Array
-    gradient: Array
-    tangents: Array
     r: Array
     sign: Array
+    weights: Array
+    roots: Array
 
 
 @dataclass(frozen=True)
@@ -88,11 +91,12 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     """
     R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
     products = _products(problem)
-    here = _held(_expand(problem, products, R, t, loss), R, held)
+    here = _look(problem, products, R, t, loss, held)
     damping = np.full(len(R), _DAMPING_AT_FIRST)
     for _ in range(steps):
-        R_new, t_new = _moved(R, t, here.tangents, _damped_steps(here, damping))
-        there = _held(_expand(problem, products, R_new, t_new, loss), R_new, held)
+        tangents, H, gradient = _slopes(products, R, t, here, held)
+        R_new, t_new = _moved(R, t, tangents, _damped_steps(H, gradient, damping))
+        there = _look(problem, products, R_new, t_new, loss, held)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
         R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
@@ -139,61 +143,64 @@ def _products(problem: JetProblem) -> Array:
     return np.asarray((problem.rays_y[:, None] * problem.rays_x[None]).reshape(9, -1))
 
 
-def _expand(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss) -> _Expansion:
-    """Expand the losses at all poses, with the variances of their residuals held."""
-    tangents = np.array([sphere_tangents(one) for one in t])
-    across = skew(t)
-    E = across @ R
-    by_rotation = across[:, None] @ (GENERATORS @ R[:, None])
-    by_direction = skew(tangents.transpose(0, 2, 1)) @ R[:, None]
-    stack = np.concatenate([E[:, None], by_rotation, by_direction], axis=1)
-    values = (stack.reshape(-1, 9) @ products).reshape(len(R), 6, -1)
-    e, J = values[:, 0], values[:, 1:]
+def _look(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss,
+          held: Held | None) -> _Look:
+    """Take the residuals at all poses, and what they cost."""
+    E = skew(t) @ R
+    e = E.reshape(-1, 9) @ products
     l1, l2 = (E[:, :2].transpose(1, 0, 2).reshape(-1, 3) @ problem.rays_x).reshape(2, len(R), -1)
     s11, s12, s22 = problem.spread
     variance = (s11 * l1 + 2 * s12 * l2) * l1 + s22 * l2 * l2
     sign = np.where(variance < 0, -1.0, 1.0)
-    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
-    squared = e * e / size
-    losses, weights = loss(squared)
-    weights = weights / size
-    weighted = J * weights[:, None]
-    return _Expansion((sign * losses).sum(1), weighted @ J.transpose(0, 2, 1),
-                      (weighted @ (sign * e)[..., None])[..., 0], tangents,
-                      e / np.sqrt(size), sign)
+    roots = np.sqrt(np.maximum(np.abs(variance) + problem.blur, 1e-24))
+    r = e / roots
+    losses, weights = loss(r * r)
+    costs = (sign * losses).sum(1)
+    if held is not None:
+        off = rotation_log(R @ held.R.T)
+        costs += (off @ held.weight * off).sum(1)
+    return _Look(costs, r, sign, weights, roots)
 
 
-def _held(expansion: _Expansion, R: Array, held: Held | None) -> _Expansion:
-    """Add what the rotations (S, 3, 3) cost for not being the one that is held."""
-    if held is None:
-        return expansion
-    off = rotation_log(R @ held.R.T)
-    pull = off @ held.weight
-    H, gradient = expansion.H.copy(), expansion.gradient.copy()
-    H[:, :3, :3] += held.weight
-    gradient[:, :3] += pull
-    return replace(expansion, costs=expansion.costs + (pull * off).sum(1), H=H, gradient=gradient)
+def _slopes(products: Array, R: Array, t: Array, here: _Look,
+            held: Held | None) -> tuple[Array, Array, Array]:
+    """
+    Tangents (S, 3, 2) in which t moves, H (S, 5, 5) and gradients (S, 5) of the costs.
+
+    The variances of the residuals are held.
+    """
+    tangents = sphere_tangents(t)
+    by_rotation = skew(t)[:, None] @ (GENERATORS @ R[:, None])
+    by_direction = skew(tangents.transpose(0, 2, 1)) @ R[:, None]
+    slopes = np.concatenate([by_rotation, by_direction], axis=1).reshape(-1, 9)
+    J = (slopes @ products).reshape(len(R), 5, -1) / here.roots[:, None]
+    weighted = J * here.weights[:, None]
+    H = weighted @ J.transpose(0, 2, 1)
+    gradient = (weighted @ (here.sign * here.r)[..., None])[..., 0]
+    if held is not None:
+        H[:, :3, :3] += held.weight
+        gradient[:, :3] += rotation_log(R @ held.R.T) @ held.weight
+    return tangents, H, gradient
 
 
-def _damped_steps(here: _Expansion, damping: Array) -> Array:
+def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
     """Damped Gauss-Newton steps (S, 5); none where a start has nothing to go by."""
-    diagonal = here.H.diagonal(axis1=1, axis2=2)
-    usable = np.asarray(np.isfinite(here.H).all((1, 2)) & diagonal.any(1))
+    diagonal = H.diagonal(axis1=1, axis2=2)
+    usable = np.asarray(np.isfinite(H).all((1, 2)) & diagonal.any(1))
     ridge = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True)
-    H = np.where(usable[:, None, None], here.H + ridge[:, :, None] * np.eye(5), np.eye(5))
-    gradient = np.where(usable[:, None], here.gradient, 0.0)
+    H = np.where(usable[:, None, None], H + ridge[:, :, None] * np.eye(5), np.eye(5))
+    gradient = np.where(usable[:, None], gradient, 0.0)
     return np.asarray(-np.linalg.solve(H, gradient[..., None])[..., 0])
 
 
 def _moved(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
     """Move poses by steps (S, 5), as ``jet.moved`` does one."""
-    turned = np.array([rotation_exp(step[:3]) for step in steps]) @ R
-    return turned, unit(t + (tangents @ steps[:, 3:, None])[..., 0])
+    return rotation_exp(steps[:, :3]) @ R, unit(t + (tangents @ steps[:, 3:, None])[..., 0])
 
 
-def _chosen(better: NDArray[np.bool_], there: _Expansion, here: _Expansion) -> _Expansion:
-    return _Expansion(*(_where(better, getattr(there, name), getattr(here, name))
-                        for name in ('costs', 'H', 'gradient', 'tangents', 'r', 'sign')))
+def _chosen(better: NDArray[np.bool_], there: _Look, here: _Look) -> _Look:
+    return _Look(*(_where(better, getattr(there, name), getattr(here, name))
+                   for name in ('costs', 'r', 'sign', 'weights', 'roots')))
 
 
 def _where(better: NDArray[np.bool_], there: Array, here: Array) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from djet_ros.core.basins import Basin, judged, right_basin
+from djet_ros.core.basins import Basin, basin_ahead, judged, right_basin
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
@@ -123,9 +123,10 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
     on; of those that the matches do not decide between, the one next to the prior, the previous
-    motion. Where two bodies move, it is the camera's motion, as far as that can be told. None
-    where too few matches have a usable surface. observe: is called at the end of each round; turn:
-    a rotation that was measured, which tells basins and bodies apart.
+    motion. Without any starts they are looked for around the prior. Where two bodies move, it is
+    the camera's motion, as far as that can be told. None where too few matches have a usable
+    surface. observe: is called at the end of each round; turn: a rotation that was measured, which
+    tells basins and bodies apart.
     """
     found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool))
     if found is None:
@@ -159,7 +160,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            turn: Turn | None, alive: NDArray[np.bool_]) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
-    poses, warp, begun, basin = starts, None, None, Basin(starts[0], 1.0)
+    poses, warp, begun = starts, None, None
+    rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
@@ -177,18 +179,15 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         problem = jet_problem(K, places, _take(paraboloids, voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
         begun = begun or _Begun(problem, places, voting)
-        if len(poses) > 1:
-            basin = right_basin(problem, places, poses, config, prior, turn)
-        else:
-            scale = _scale(epipolar_residuals(problem, poses[0].R, poses[0].t).r)
-            basin = replace(basin, pose=poses[0], scale=scale, others_move=False)
+        basin = _basin(problem, places, poses, config, prior, turn)
+        rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
-        if last and basin.rivals:
+        if last and rival_poses:
             # Judge again between the basins, on the last surfaces.
-            solution, rivals = judged(problem, places, solution, basin.rivals, loss, prior)
+            solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
         pose = solution.pose
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
@@ -217,6 +216,16 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
     return Track(pose, Loss(), residuals, voting, paraboloids.minima(), optimum,
                  paraboloids.values(optimum), 0, 0)
+
+
+def _basin(problem: JetProblem, places: Array, poses: list[Pose], config: EstimatorConfig,
+           prior: Pose | None, turn: Turn | None) -> Basin:
+    """Take the right basin of several poses, of those around the prior, or of the only one."""
+    if len(poses) > 1:
+        return right_basin(problem, places, poses, config, prior, turn)
+    if not poses and prior is not None:
+        return basin_ahead(problem, places, prior, config)
+    return Basin(poses[0], _scale(epipolar_residuals(problem, poses[0].R, poses[0].t).r))
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
