@@ -7,13 +7,18 @@ each sees it at a minimum y* with curvature A', and the residual has two numbers
 to the projection of the landmark, whitened by A'. Inverse depths are eliminated by the Schur
 complement, so that what is solved is as small as the poses are few.
 
+What is told of a landmark was told by its patch in the frame that saw it first, its anchor, and
+the noise of that patch is in all of its observations. So the place where it was found is an
+observation too: its ray there is free, held by a residual like the others. With the ray fixed the
+depth would have to make up for that noise, and steps would come out ever shorter.
+
 Poses are world to camera, ``X_camera = R X_world + t``, moved from the left: a step (omega,
 upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from djet_ros.core.geometry import rays, rotation_exp, rotation_log, skew
@@ -118,12 +123,16 @@ class Landmarks:
     """
     N landmarks, and what F frames saw of them.
 
-    anchors: (N,) frames that saw them first; points: (N, 2) pixels there; rho: (N,) inverse
-    depths there; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
-    ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
+    anchors: (N,) frames that saw them first; found: (N, 2) pixels there, around which their
+    patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
+    where they are taken to be; rho: (N,) inverse depths there; minima: (N, F, 2) pixels y*; roots:
+    (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F) where the
+    last two mean anything.
     """
 
     anchors: NDArray[np.int64]
+    found: Array
+    held: Array
     points: Array
     rho: Array
     minima: Array
@@ -137,13 +146,13 @@ class Landmarks:
     def at(cls, points: Array, rho: Array, anchor: int, frames: int) -> Landmarks:
         """Make landmarks that no other frame has seen yet."""
         n = len(rho)
-        return cls(np.full(n, anchor, np.int64), points, rho, np.zeros((n, frames, 2)),
-                   np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
+        return cls(np.full(n, anchor, np.int64), points, np.zeros((n, 2, 2)), points, rho,
+                   np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),
+                   np.zeros((n, frames), bool))
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
         """Give some of the landmarks."""
-        return Landmarks(self.anchors[chosen], self.points[chosen], self.rho[chosen],
-                         self.minima[chosen], self.roots[chosen], self.seen[chosen])
+        return Landmarks(*(array[chosen] for array in vars(self).values()))
 
     def joined(self, other: Landmarks) -> Landmarks:
         """Give these landmarks and others of the same frames."""
@@ -152,15 +161,22 @@ class Landmarks:
 
     def with_frame(self) -> Landmarks:
         """Give the same with room for what one more frame sees."""
-        return Landmarks(self.anchors, self.points, self.rho, *(
+        return Landmarks(*self._by_anchor(), *(
             np.concatenate([array, np.zeros_like(array[:, :1])], axis=1)
             for array in self._by_frame()))
 
     def without_frame(self, frame: int) -> Landmarks:
         """Give those that are anchored elsewhere, without what a frame saw."""
         left = self.of(self.anchors != frame)
-        return Landmarks(left.anchors - (left.anchors > frame), left.points, left.rho,
+        return Landmarks(left.anchors - (left.anchors > frame), *left._by_anchor()[1:],
                          *(np.delete(array, frame, axis=1) for array in left._by_frame()))
+
+    def moved(self, step: Array) -> Landmarks:
+        """Give the landmarks moved by a step (N, 3) of their inverse depths and points."""
+        return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
+
+    def _by_anchor(self) -> tuple[Any, ...]:
+        return self.anchors, self.found, self.held, self.points, self.rho
 
     def _by_frame(self) -> tuple[Any, ...]:
         return self.minima, self.roots, self.seen
@@ -183,10 +199,11 @@ def projected(K: Array, places: Array) -> Array:
 @dataclass(frozen=True)
 class Linearised:
     """
-    M observations and how they change: see ``linearise``.
+    M observations of N landmarks and how they change: see ``linearise``.
 
     landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); by_frame, by_anchor:
-    (M, 2, 6) over the steps of the two poses; by_rho: (M, 2).
+    (M, 2, 6) over the steps of the two poses; by_own: (M, 2, 3) over those of the landmark's
+    inverse depth and point; off: (N, 2) residuals of the points, held: (N, 2, 2) how they change.
     """
 
     landmark: NDArray[np.int64]
@@ -195,7 +212,9 @@ class Linearised:
     residuals: Array
     by_frame: Array
     by_anchor: Array
-    by_rho: Array
+    by_own: Array
+    off: Array
+    held: Array
 
 
 def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
@@ -215,19 +234,23 @@ def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
     by_place = root @ (K[:2, :2] @ shift / z[:, None, None])
     by_turned = by_place @ R
     weight = rho[:, None, None]
+    by_rho = np.einsum('nij,nj->ni', by_place, t)
+    by_point = by_turned @ np.linalg.inv(K)[:, :2]
     return Linearised(
         landmark, frame, anchor, np.einsum('nij,nj->ni', root, off),
         np.concatenate([-by_place @ skew(place), by_place * weight], axis=2),
         np.concatenate([by_turned @ skew(ray), -by_turned * weight], axis=2),
-        np.einsum('nij,nj->ni', by_place, t))
+        np.concatenate([by_rho[:, :, None], by_point], axis=2),
+        np.einsum('nij,nj->ni', landmarks.held, landmarks.points - landmarks.found),
+        landmarks.held)
 
 
 @dataclass(frozen=True)
 class Reduced:
     """
-    Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), depths eliminated.
+    Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
 
-    depth_change gives what becomes of the inverse depths with a step of the poses.
+    change gives what becomes of the landmarks with a step of the poses.
     """
 
     H: Array
@@ -236,13 +259,18 @@ class Reduced:
     _variances: Array
     _slopes: Array
 
-    def depth_change(self, step: Array) -> Array:
-        """Give steps (N,) of the inverse depths that go with a step (6 F,) of the poses."""
-        return np.asarray(-self._variances * (self._slopes + self._coupling @ step))
+    def change(self, step: Array) -> Array:
+        """Give the steps (N, 3) of landmarks that go with a step (6 F,) of the poses."""
+        return np.asarray(-np.einsum('nij,nj->ni', self._variances,
+                                     self._slopes + self._coupling @ step))
 
 
-def eliminate(linear: Linearised, weights: Array, frames: int, landmarks: int) -> Reduced:
-    """Sum up observations with weights (M,), and eliminate the inverse depths."""
+def eliminate(linear: Linearised, weights: Array, weight: float, frames: int) -> Reduced:
+    """
+    Sum up observations, and eliminate the landmarks.
+
+    weights: (M,) of the observations; weight: that of where the landmarks were found.
+    """
     count, rows = len(weights), np.arange(len(weights))[:, None]
     J = np.zeros((count, 6 * frames, 2))
     block = np.arange(6)
@@ -250,15 +278,22 @@ def eliminate(linear: Linearised, weights: Array, frames: int, landmarks: int) -
     J[rows, 6 * linear.anchor[:, None] + block] += linear.by_anchor.transpose(0, 2, 1)
     root = np.sqrt(weights)[:, None]
     J *= root[:, None]
-    e, J_rho = linear.residuals * root, linear.by_rho * root
+    e, own = linear.residuals * root, linear.by_own * root[:, None]
     flat = J.transpose(0, 2, 1).reshape(-1, 6 * frames)
     H, g = flat.T @ flat, flat.T @ e.ravel()
     seen, first = np.unique(linear.landmark, return_index=True)
-    variances = np.zeros(landmarks)
-    slopes, coupling = np.zeros(landmarks), np.zeros((landmarks, 6 * frames))
+    n = len(linear.off)
+    information = np.tile(np.eye(3) * _TRACE, (n, 1, 1))
+    slopes, coupling = np.zeros((n, 3)), np.zeros((n, 3, 6 * frames))
+    transposed = linear.held.transpose(0, 2, 1) * weight
+    information[:, 1:, 1:] += transposed @ linear.held
+    slopes[:, 1:] = np.einsum('nij,nj->ni', transposed, linear.off)
     if count:
-        variances[seen] = 1 / (np.add.reduceat((J_rho**2).sum(1), first) + _TRACE)
-        slopes[seen] = np.add.reduceat((J_rho * e).sum(1), first)
-        coupling[seen] = np.add.reduceat((J * J_rho[:, None]).sum(2), first, axis=0)
-    return Reduced(H - (coupling.T * variances) @ coupling,
-                   g - coupling.T @ (variances * slopes), coupling, variances, slopes)
+        back = own.transpose(0, 2, 1)
+        information[seen] += np.add.reduceat(back @ own, first)
+        slopes[seen] += np.add.reduceat(np.einsum('nij,nj->ni', back, e), first)
+        coupling[seen] = np.add.reduceat(back @ J.transpose(0, 2, 1), first)
+    variances = np.linalg.inv(information)
+    gain = (variances @ coupling).reshape(-1, 6 * frames).T
+    return Reduced(H - gain @ coupling.reshape(-1, 6 * frames), g - gain @ slopes.ravel(),
+                   coupling, variances, slopes)

@@ -322,7 +322,7 @@ class Window:
     def _surfaces(self, anchor: int, mine: NDArray[np.int64], warp: Array, expected: Array,
                   radius: int) -> Paraboloids:
         """Paraboloids around expected places in the newest frame, for landmarks of an anchor."""
-        points = self._landmarks.points[mine]
+        points = self._landmarks.found[mine]
         contrast = self._distances.contrast(
             self._images[anchor], np.rint(points).astype(np.int64),
             self._images[-1], np.rint(expected).astype(np.int64))
@@ -352,7 +352,7 @@ class Window:
             H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
             self._poses = self._poses.moved(step)
-            self._landmarks.rho += reduced.depth_change(step)
+            self._landmarks = self._landmarks.moved(reduced.change(step))
         linear = self._linearised()
         false = np.linalg.norm(linear.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[linear.landmark[false], linear.frame[false]] = False
@@ -367,6 +367,9 @@ class Window:
         if len(roots):
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
             self._landmarks.roots[seen, -1] = roots / np.median(sizes)
+            # The patch where a landmark was found has as much noise as the first that shows it.
+            anew = seen & ~self._landmarks.held.any((1, 2))
+            self._landmarks.held[anew] = self._landmarks.roots[anew, -1]
 
     def _linearised(self) -> Linearised:
         """All observations; their scale is told anew."""
@@ -380,8 +383,8 @@ class Window:
         """Weigh observations robustly, and eliminate the depths."""
         _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
             (linear.residuals**2).sum(1))
-        return eliminate(linear, weights / (self._scale**2 * self._tuning.inflation),
-                         len(self._images), len(self._landmarks))
+        weight = 1 / (self._scale**2 * self._tuning.inflation)
+        return eliminate(linear, weights * weight, weight, len(self._images))
 
     def _addition(self, H: Array) -> Addition:
         """Read the newest motion off the window, and how sure its length is."""
