@@ -293,7 +293,7 @@ def eliminate(linear: Linearised, weights: Array, weight: float, frames: int) ->
         information[seen] += np.add.reduceat(back @ own, first)
         slopes[seen] += np.add.reduceat(np.einsum('nij,nj->ni', back, e), first)
         coupling[seen] = np.add.reduceat(back @ J.transpose(0, 2, 1), first)
-    variances = np.linalg.inv(information)
+    variances = np.asarray(np.linalg.inv(information), float)
     gain = (variances @ coupling).reshape(-1, 6 * frames).T
     return Reduced(H - gain @ coupling.reshape(-1, 6 * frames), g - gain @ slopes.ravel(),
                    coupling, variances, slopes)
