@@ -6,6 +6,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
+from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import twist
 from djet_ros.odometry.scale import (
@@ -80,6 +81,20 @@ def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
     # … and what was between them is unknown from then on.
     assert (np.diag(results[2].pose_covariance) >= np.diag(results[1].pose_covariance)).all()
     assert results[3].pose_covariance[0, 0] > 1e5
+
+
+def test_a_compromise_between_two_bodies_is_not_carried_on():
+    scene = make_scene('moving_object', size=(620, 188))
+    poses = scene.trajectory(6)
+    vo = VisualOdometry()
+    results = [vo.process(Frame(scene.render(pose, i), scene.K, (i + 1) * 10**8))
+               for i, pose in enumerate(poses)]
+    # Nobody tells the first pair's from a motion that fits; all after it are right, or unsure.
+    for i, result in enumerate(results[2:], 2):
+        if result.status is Status.OK:
+            truth = np.linalg.inv(poses[i - 1]) @ poses[i]
+            assert np.degrees(direction_angle(result.motion[:3, 3], truth[:3, 3])) < 2
+    assert results[-1].status is Status.OK
 
 
 def test_without_a_scale_a_translation_has_length_one_and_says_that_it_is_no_metre(cards):

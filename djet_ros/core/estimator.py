@@ -8,7 +8,13 @@ from dataclasses import replace
 from time import perf_counter
 
 from djet_ros.core.corners import detect_corners
-from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
+from djet_ros.core.covariance import (
+    design_effect,
+    difference,
+    pose_covariance,
+    spanning,
+    squared_distance,
+)
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_close, match_everywhere, match_nearby
 from djet_ros.core.geometry import (
@@ -56,6 +62,9 @@ _MANY = 400
 # chosen: by as much the distances of matches from their epipolar lines may grow from one pair to
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
+
+# chosen: twice the usual design effect of residuals.
+_TOGETHER = 3.5
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -204,7 +213,8 @@ class TwoViewEstimator:
         else:
             with _timed(timings, 'result'):
                 result = self._result(previous, current, surface, y, track, before)
-        if goes_on and prior is not None and not _as_good(result, prior):
+        if goes_on and prior is not None and (
+                track is None or not _as_good(result, track, prior)):
             return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
         return result
 
@@ -283,11 +293,18 @@ class TwoViewEstimator:
         return false_alarms(agreeing, len(track.voting), chance) > 0
 
 
-def _as_good(result: RelativePose, prior: RelativePose) -> bool:
-    """Tell whether a pair is sure, and its matches fit it no worse than those before theirs."""
+def _as_good(result: RelativePose, track: Track, prior: RelativePose) -> bool:
+    """
+    Tell whether a pair is sure, and its matches fit it no worse than those before theirs.
+
+    Nor may they be off together: then the motion before may have been a compromise already.
+    """
     noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
-    return result.status in (Status.OK, Status.NO_PARALLAX) and (
-        robust_scale(result.residuals) < _NOISIER * noise)
+    agree = track.inliers()
+    return (result.status in (Status.OK, Status.NO_PARALLAX)
+            and robust_scale(result.residuals) < _NOISIER * noise
+            and design_effect(result.x[agree], track.residuals.r[agree[track.voting]])
+            < _TOGETHER)
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
