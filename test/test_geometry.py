@@ -11,6 +11,7 @@ from djet_ros.core.geometry import (
     growth,
     homogeneous,
     in_front,
+    inverses,
     line_distances,
     patch_warp,
     rays,
@@ -54,6 +55,18 @@ def test_a_rotation_is_the_matrix_exponential_of_its_vector(omega):
 def test_the_tangents_of_the_sphere_are_orthonormal_everywhere(t):
     basis = np.column_stack([sphere_tangents(t), t])
     assert np.allclose(basis.T @ basis, np.eye(3), atol=1e-14)
+
+
+def test_of_many_vectors_each_gets_what_it_gets_alone():
+    v = np.random.default_rng(2).normal(size=(7, 3))
+    assert np.allclose(rotation_exp(v), [rotation_exp(one) for one in v], atol=1e-14)
+    assert (sphere_tangents(unit(v)) == [sphere_tangents(unit(one)) for one in v]).all()
+
+
+@given(arrays(float, (5, 2, 2), elements=st.floats(-3, 3)))
+def test_a_matrix_times_its_inverse_is_one(A):
+    A = A[np.abs(np.linalg.det(A)) > 1e-3]
+    assert np.allclose(inverses(A) @ A, np.eye(2), atol=1e-9)
 
 
 def test_unit_vectors_have_length_one_and_nothing_becomes_of_zero():

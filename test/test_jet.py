@@ -7,12 +7,14 @@ from djet_ros.core.jet import (
     epipolar_residuals,
     jet_problem,
     Loss,
+    median,
     minimise,
     moved,
     robust_scale,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from hypothesis import given, settings, strategies as st
+from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
@@ -258,6 +260,11 @@ def test_a_third_of_gross_errors_does_not_move_a_robust_loss_and_ruins_the_plain
               for name in LOSSES}
     assert errors['geman_mcclure'] < 1e-4 and errors['cauchy'] < 1e-3
     assert errors['none'] > 1e-2
+
+
+@given(arrays(float, st.integers(1, 9), elements=st.floats(-10, 10)))
+def test_the_median_is_that_of_numpy(values):
+    assert np.isclose(median(values), np.median(values), atol=1e-12)
 
 
 def test_the_robust_scale_is_the_standard_deviation_of_the_inliers():

@@ -125,17 +125,14 @@ def basin_ahead(problem: JetProblem, places: Array, before: Pose,
     A few hundred matches lead to them, and all choose. What they are clearly against is no rival.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
-    tight, onward = Loss(), before
-    for steps in (0, TUNING.steps_to_sketch):
-        found = refine_all(some, [before], tight, steps)
-        tight = Loss(config.loss, min(config.loss_scale, TUNING.tight)
-                     * max(found.scales()[0], TUNING.least_scale))
-        onward = found.pose(0)
-    starts = [onward, Pose(before.R, FORWARD), *all_round(before.R, TUNING.directions)]
-    near = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
-                      TUNING.refined_starts)
-    basins = _promising(some, refine_all(some, near, tight, TUNING.steps_to_sketch), tight,
-                        TUNING.refined_starts)
+    tight = Loss()
+    basins = [before, Pose(before.R, FORWARD), *all_round(before.R, TUNING.directions)]
+    for steps in (0, TUNING.steps_to_sketch, TUNING.steps_to_sketch):
+        found = refine_all(some, basins, tight, steps)
+        scale = max(found.scales().min(), TUNING.least_scale)
+        tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+        if steps:
+            basins = _promising(some, found, tight, TUNING.refined_starts)
     losses = losses_at(problem, basins, tight)
     number = _likeliest(losses, places, basins, before)
     preferred = preferences(losses, places, number)

@@ -20,7 +20,12 @@ def rank_in_cells(cells: NDArray[np.int64], worse: NDArray[Any]) -> NDArray[np.i
     cells: (N,) numbers of their cells; worse: (N,) larger for those that come later.
     """
     order = np.lexsort((worse, cells))
-    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    first = beginnings(cells[order])
     rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order)) - np.repeat(first, count)
+    rank[order] = np.arange(len(order)) - np.repeat(first, np.diff(first, append=len(order)))
     return rank
+
+
+def beginnings(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Give the indices at which another number begins among ordered ones (N,)."""
+    return np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1))

@@ -72,7 +72,12 @@ def corner_slopes(image: Image) -> NDArray[np.float32]:
                   for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     trace = xx + yy
     # Not by cv2.magnitude: its last bit depends on where in memory the arrays lie.
-    spread = np.sqrt((xx - yy)**2 + 4 * xy**2)
+    xx -= yy
+    xx *= xx
+    xy *= xy
+    xy *= 4
+    xx += xy
+    spread = np.sqrt(xx, out=xx)
     least, most = trace - spread, trace + spread
     least *= least >= np.float32(_LEAST_RATIO) * most
     least *= np.float32(0.5 / _SOBEL**2)

@@ -36,7 +36,7 @@ class Paraboloids:
 
     def minima(self) -> Array:
         """Places y* = centre - A'^-1 b (N, 2) where the gradient vanishes."""
-        return np.asarray(self.centres - (inverse_2x2(self.A) @ self.b[:, :, None])[:, :, 0])
+        return np.asarray(self.centres - np.einsum('nij,nj->ni', inverse_2x2(self.A), self.b))
 
     def values(self, y: Array) -> Array:
         """Values (N,) of the paraboloids at pixels y (N, 2)."""
@@ -117,7 +117,7 @@ def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
     normal = g / norm[:, None]
     along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
     foot = normal * (h / norm)[:, None]
-    slope = (along * ((A @ foot[:, :, None])[:, :, 0] + b)).sum(1)
+    slope = (along * (np.einsum('nij,nj->ni', A, foot) + b)).sum(1)
     curvature = np.einsum('ni,nij,nj->n', along, A, along)
     # A surface that is flat along its line gives no reason to move along it.
     flat = np.abs(curvature) < 1e-12

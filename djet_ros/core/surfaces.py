@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import stretches
+from djet_ros.core.geometry import inverses, stretches
 from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import (
     describable,
@@ -206,8 +206,8 @@ class DescriptorDistances:
         there a paraboloid fits without a bias. warp: (N, 2, 2) how they are seen at y.
         """
         centres = np.rint(y).astype(np.int64)
-        back = np.linalg.inv(warp) @ (y - centres)[:, :, None]
-        references = self.reference(there, x - back[:, :, 0], contrast, warp)
+        back = np.einsum('nij,nj->ni', inverses(warp), y - centres)
+        references = self.reference(there, x - back, contrast, warp)
         return fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma)
 
 
@@ -251,7 +251,7 @@ class PhotometricSurface:
 
         Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
         """
-        offsets = self._offsets.T if warp is None else np.linalg.inv(warp) @ self._offsets.T
+        offsets = self._offsets.T if warp is None else inverses(warp) @ self._offsets.T
         places = np.moveaxis(points[:, :, None] + offsets, 1, 0)
         return np.asarray(map_coordinates(image, places[::-1], order=1, mode='nearest'))
 
