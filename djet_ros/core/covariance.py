@@ -91,16 +91,15 @@ def squared_distance(covariance: Array, apart: Array) -> float:
     return float(((axes.T @ apart)**2 / np.maximum(variances, _LEAST_VARIANCE)).sum())
 
 
-def spanning(covariance: Array, t: Array, apart: Array, sigmas: float) -> tuple[Array, Array]:
+def spanning(covariance: Array, t: Array, apart: Array, probability: float
+             ) -> tuple[Array, Array]:
     """
-    Widen a covariance (5, 5) so that a pose apart (5,) lies no more than some sigmas off.
+    Widen a covariance (5, 5) by a pose apart (5,) that is the true one with a probability.
 
-    Gives it with that over (rotation vector, t), (6, 6). To C comes a a^T (1/s^2 - 1/m^2), with m
-    the Mahalanobis distance that a had; by Sherman and Morrison's formula it is s then.
+    Gives it with that over (rotation vector, t), (6, 6): C + p a a^T, the expected square of the
+    error of the pose at hand.
     """
-    distance = squared_distance(covariance, apart)
-    if distance > sigmas**2:
-        covariance = covariance + np.outer(apart, apart) * (1 / sigmas**2 - 1 / distance)
+    covariance = covariance + probability * np.outer(apart, apart)
     basis = lift(sphere_tangents(t))
     return covariance, basis @ covariance @ basis.T
 

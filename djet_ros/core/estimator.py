@@ -43,6 +43,7 @@ from djet_ros.core.tracking import hold, Observer, Track, track_jointly, TUNING
 from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 # Bits that differ between the descriptors of matches beyond which they are no better than chance:
 # 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
@@ -72,6 +73,9 @@ _OUT_OF_NOISE = 3.0
 
 # Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
 _SURPRISING = 20.5
+
+# chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
+_TRUSTED = 0.5
 
 # rad; chosen: no ellipsoid spans two motions that are further from one another, as the sphere of
 # directions is bent.
@@ -312,10 +316,8 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
     """
     Tell whether rivals leave a pose unsure, and widen its covariances to span them.
 
-    Those that the covariance allows of are spanned by it already. In a basin that is a paraboloid,
-    matches prefer its minimum by half the Mahalanobis distance m to whatever pose lies m off:
-    costs grow by m^2, and their noise by 2 m. So any other rival belongs twice as many standard
-    deviations off as the matches prefer the pose to it.
+    Those that the covariance allows of are spanned by it already. Any other is the true motion
+    with the probability that the preference comes from noise.
     """
     status = Status.TWO_MOTIONS if track.guess else Status.OK
     for rival in track.rivals:
@@ -325,7 +327,8 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
         undecided = rival.preference < DECIDED and not _goes_on(before, pose, rival.pose)
         if undecided and np.linalg.norm(off) > _FAR and not track.guess:
             status = Status.AMBIGUOUS
-        covariances = spanning(covariances[0], pose.t, off, max(2 * rival.preference, 1.0))
+        covariances = spanning(covariances[0], pose.t, off,
+                               float(ndtr(-_TRUSTED * rival.preference)))
     return status, covariances
 
 
