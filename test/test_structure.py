@@ -1,11 +1,15 @@
 """One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
 
+from dataclasses import replace
+
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Pose
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
+from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.visual_odometry import TRACKED, VisualOdometry
 import numpy as np
 import pytest
@@ -69,6 +73,30 @@ def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards)
     ratios = np.array(lengths_of) / WAYS[1:]
     off = ratios / np.average(ratios, weights=np.array(sigmas)**-2) - 1
     assert np.all(np.abs(off) < 3.5 * np.array(sigmas))
+
+
+def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_has_them(cards):
+    estimator, ways, here = TwoViewEstimator(ESTIMATOR), [*[0.32] * 6, 0.46, 0.46, 0.32], np.eye(4)
+    views, scale = [], OneScale()
+    for number, way in enumerate([0, *ways]):
+        here = here @ pose(x=way)
+        frame = cards.frame(0.0, here, noise=number)
+        views.append(estimator.view(frame.gray, frame.K))
+    pairs = [estimator.estimate(*views[n:n + 2]) for n in range(len(ways))]
+    doubtful = pairs[-2]
+    wrong = replace(doubtful, y_opt=doubtful.x + np.random.default_rng(1).permutation(
+        doubtful.y_opt - doubtful.x))
+    found = []
+    for pair in doubtful, wrong:
+        scale.configure(ESTIMATOR, Unmeasured(), 0.05)
+        scale.reset()
+        scale.begin(views[0])
+        for n, known in enumerate(pairs[:-2]):
+            scale.of_step((n * 10**8, (n + 1) * 10**8), views[n + 1], known)
+        scale.bridge((7 * 10**8, 8 * 10**8), views[8], pair)
+        found.append(scale.of_step((8 * 10**8, 9 * 10**8), views[9], pairs[-1]).value)
+    assert found[0] == pytest.approx(1, abs=0.04)
+    assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # torn: the last speed goes on
 
 
 def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):

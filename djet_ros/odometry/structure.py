@@ -86,11 +86,7 @@ class OneScale:
         addition = self._added(current, relative, guess)
         if addition is None:
             return measured if measured.known else unknown(guess * float(np.exp(self._log)))
-        own = min(addition.sigma / addition.length, 1.0)
-        if relative.t.any():  # without parallax, only a turn is sure
-            self._speed = addition.length / seconds
-        self._variance += (_WANDERING * own)**2
-        self._metric = bool(self._metric and self._variance < _LOST**2)
+        own = self._wandered(addition, relative, seconds)
         if measured.known and self._source.exact:
             self._set(measured, addition.length)
             return measured
@@ -101,6 +97,20 @@ class OneScale:
         common = np.hypot(np.sqrt(self._variance), self._share) if self._metric else 0.0
         return Length(value, value * float(np.hypot(own, common)), True, self._metric,
                       measured.known)
+
+    def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> None:
+        """
+        Go on at a frame whose motion is in doubt, from the newest frame of the track on.
+
+        Where the best guess of it gives landmarks their depths, they are seen on; the track tells
+        no motion then, but does not lose its scale. Otherwise it begins anew.
+        """
+        seconds = (span_ns[1] - span_ns[0]) * 1e-9
+        if self._speed is None or not relative.t.any() or not self.agrees(
+                Pose(relative.R, relative.t), relative.x, relative.y_opt):
+            self.begin(current)
+        elif (addition := self._added(current, relative, self._speed * seconds)) is not None:
+            self._wandered(addition, relative, seconds)
 
     def of_rest(self, span_ns: tuple[int, int]) -> Length:
         """Length that a step would have had where the camera stands, or the motion is unknown."""
@@ -147,6 +157,15 @@ class OneScale:
                 return addition
         self.begin(view)
         return None
+
+    def _wandered(self, addition: Addition, relative: RelativePose, seconds: float) -> float:
+        """Take note of what a step was, and give how sure its length is, as a share of it."""
+        own = min(addition.sigma / addition.length, 1.0)
+        if relative.t.any():  # without parallax, only a turn is sure
+            self._speed = addition.length / seconds
+        self._variance += (_WANDERING * own)**2
+        self._metric = bool(self._metric and self._variance < _LOST**2)
+        return own
 
     def _observe(self, measured: Length, length: float, own: float) -> None:
         """Take a length in metres as an observation of the logarithm of the factor."""

@@ -307,8 +307,11 @@ class VisualOdometry:
         motion, covariance = self._carried(frame)
         result = self._result(frame, relative.status, relative, length, motion, covariance)
         if given_up or relative.status in UNDECIDED:
+            if given_up:
+                self._one_scale.begin(view)
+            else:
+                self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative)
             self._refer_to(frame, view)
-            self._one_scale.begin(view)
             self._pose, self._pose_covariance = result.pose, result.pose_covariance
         if given_up:
             self._prior = None
