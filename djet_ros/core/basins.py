@@ -118,11 +118,11 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
 
 
 def basin_ahead(problem: JetProblem, places: Array, before: Pose,
-                config: EstimatorConfig) -> Basin:
+                config: EstimatorConfig) -> Basin | None:
     """
     Choose among the basins around the motion before: its own, and of directions all round.
 
-    A few hundred matches lead to them, and all choose. What they are clearly against is no rival.
+    A few hundred matches lead to them, and all choose; None where they are not clearly for one.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
     tight = Loss()
@@ -133,13 +133,11 @@ def basin_ahead(problem: JetProblem, places: Array, before: Pose,
         tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
         if steps:
             basins = _promising(some, found, tight, TUNING.refined_starts)
-    losses = losses_at(problem, basins, tight)
-    number = _likeliest(losses, places, basins, before)
-    preferred = preferences(losses, places, number)
-    best = basins[number]
+    if (preferences(losses_at(problem, basins, tight), places, 0)[1:] < TUNING.clear).any():
+        return None
+    best = basins[0]
     scale = robust_scale(epipolar_residuals(problem, best.R, best.t).r)
-    return Basin(best, max(scale, TUNING.least_scale), rivals=tuple(
-        pose for pose, z in zip(basins, preferred) if pose is not best and z < TUNING.clear))
+    return Basin(best, max(scale, TUNING.least_scale))
 
 
 def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],

@@ -15,6 +15,7 @@ from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import at, Mask
 from djet_ros.core.orb_pattern import REACH
+from djet_ros.core.parallel import each
 from djet_ros.core.types import Features
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +49,10 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
     in the image made smaller. Octaves number the sizes. mask: (H, W) bool, where no point may be.
     """
-    found = [_of_size(gray, octave, scale, round(share * max_features), contrast, mask)
+    sizes = [(octave, scale, round(share * max_features))
              for octave, (scale, share) in enumerate(_SIZES)
              if min(gray.shape) > 2 * scale * (REACH + 1)]
+    found = each(lambda size: _of_size(gray, *size, contrast, mask), sizes)
     if not found:
         none = np.empty(0, np.float32)
         return Features(np.empty((0, 2)), np.empty(0, np.int32), none, none,
@@ -111,7 +113,8 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
     slopes = corner_slopes(image)
     lonely, peaks = (slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8))
                      for side in (2 * _APART + 1, 2 * _AT_LEAST_APART + 1))
-    rows, columns = np.nonzero(peaks & (slopes > contrast**2))
+    # Of a flat array, five times as fast.
+    rows, columns = np.divmod(np.flatnonzero(peaks & (slopes > contrast**2)), slopes.shape[1])
     points = _exact_peaks(slopes, rows, columns)
     zoom = np.array(gray.shape[::-1]) / (width, height)
     inside = describable(_pixels(points), image.shape) & ~at(mask, (points + 0.5) * zoom - 0.5)

@@ -58,7 +58,7 @@ _ENOUGH = 0.8
 _FORESEEN, _SURE_BITS = 24.0, 64
 
 # chosen: fewer matches than these leave a choice of motions, so that all are sought widely.
-_MANY = 400
+_MANY = 200
 
 # chosen: by as much the distances of matches from their epipolar lines may grow from one pair to
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
@@ -197,7 +197,13 @@ class TwoViewEstimator:
             if goes_on:  # starts are looked for around the motion before
                 surface = self._surface(previous, current, x, y, timings)
             else:
-                starts, surface = self._started(previous, current, x, y, before, known, timings)
+                # The first surfaces need no pose, and are sampled meanwhile.
+                began, jet = perf_counter(), timings.get('jet', 0.0)
+                starts, surface = both(
+                    lambda: self._starts(K, x, y, before, known),
+                    lambda: self._surface(previous, current, x, y, timings))
+                # What was done beside the surfaces took no time: stages add up to all of it.
+                timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
         else:
             # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
             with _timed(timings, 'starts'):
@@ -222,22 +228,11 @@ class TwoViewEstimator:
             return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
         return result
 
-    def _started(self, previous: View, current: View, x: Array, y: Array, before: Pose | None,
-                 known: Known, timings: dict[str, float]
-                 ) -> tuple[list[Pose], ResidualSurface]:
-        """
-        Collect starting poses: the 5-point algorithm, and others that its RANSAC may have missed.
-
-        The first surfaces need no pose, and are sampled meanwhile.
-        """
-        began, jet = perf_counter(), timings.get('jet', 0.0)
-        starts, surface = both(
-            lambda: [*starting_poses(current.K, x, y, self.config.ransac_threshold, before),
-                     *known_starts(current.K, x, y, known)],
-            lambda: self._surface(previous, current, x, y, timings))
-        # What was done beside the surfaces took no time: stages add up to all of it.
-        timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
-        return starts, surface
+    def _starts(self, K: Array, x: Array, y: Array, before: Pose | None,
+                known: Known) -> list[Pose]:
+        """Collect starting poses: the 5-point algorithm, and what its RANSAC may have missed."""
+        return [*starting_poses(K, x, y, self.config.ransac_threshold, before),
+                *known_starts(K, x, y, known)]
 
     def _surface(self, previous: View, current: View, x: Array, y: Array,
                  timings: dict[str, float]) -> ResidualSurface:

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 from djet_ros.core.geometry import inverses
 from djet_ros.core.orb_pattern import reach, TESTS
+from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -87,12 +88,15 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
     ends = np.concatenate([tests[:, :2], tests[:, 2:]]).astype(np.float32)
     count = len(tests)
     values = np.empty((2 * count, len(points)), smoothed.dtype)
-    for start in range(0, len(points), _WARPED_BLOCK):
+
+    def look(start: int) -> None:
         block = slice(start, start + _WARPED_BLOCK)
         x, y = (points[block, axis].astype(np.float32) + ends @ inverse[block, axis].T
                 for axis in (0, 1))
         values[:, block] = cv2.remap(smoothed, x, y, cv2.INTER_LINEAR,
                                      borderMode=cv2.BORDER_REPLICATE)
+
+    each(look, range(0, len(points), _WARPED_BLOCK))
     return values[:count], values[count:]
 
 

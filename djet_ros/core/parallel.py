@@ -31,6 +31,9 @@ def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[Firs
 
 def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
     """Do the same with each of many small tasks, in two shares; results in their order."""
+    if len(tasks) < 2:
+        return [work(task) for task in tasks]
+
     def share(first: int) -> list[Result]:
         return [work(task) for task in tasks[first::2]]
 

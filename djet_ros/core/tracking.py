@@ -123,10 +123,10 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
     on; of those that the matches do not decide between, the one next to the prior, the previous
-    motion. Without any starts they are looked for around the prior. Where two bodies move, it is
-    the camera's motion, as far as that can be told. None where too few matches have a usable
-    surface. observe: is called at the end of each round; turn: a rotation that was measured, which
-    tells basins and bodies apart.
+    motion. Without any starts they are looked for around the prior: None unless one is clearly the
+    right one. Where two bodies move, it is the camera's motion, as far as that can be told. None
+    where too few matches have a usable surface. observe: is called at the end of each round; turn:
+    a rotation that was measured, which tells basins and bodies apart.
     """
     found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool))
     if found is None:
@@ -180,6 +180,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                               config.weigh_by_fit)
         begun = begun or _Begun(problem, places, voting)
         basin = _basin(problem, places, poses, config, prior, turn)
+        if basin is None:
+            return None
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
@@ -219,7 +221,7 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 
 
 def _basin(problem: JetProblem, places: Array, poses: list[Pose], config: EstimatorConfig,
-           prior: Pose | None, turn: Turn | None) -> Basin:
+           prior: Pose | None, turn: Turn | None) -> Basin | None:
     """Take the right basin of several poses, of those around the prior, or of the only one."""
     if len(poses) > 1:
         return right_basin(problem, places, poses, config, prior, turn)
