@@ -218,13 +218,19 @@ class TwoViewEstimator:
             track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
                      else track_jointly(surface, K, y, starts, config, before, observe,
                                         known.turn))
+        if goes_on and track is None:  # another basin comes near: all starts, on the same surfaces
+            goes_on = False
+            with _timed(timings, 'starts'):
+                starts = self._starts(K, x, y, before, known)
+            with _timed(timings, 'jet'):
+                track = track_jointly(surface, K, y, starts, config, before, observe)
         if track is None:
             result = RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
         else:
             with _timed(timings, 'result'):
                 result = self._result(previous, current, surface, y, track, before)
-        if goes_on and prior is not None and (
-                track is None or not _as_good(result, track, prior)):
+        if goes_on and prior is not None and track is not None and not _as_good(
+                result, track, prior):
             return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
         return result
 
