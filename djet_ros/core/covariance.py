@@ -33,6 +33,9 @@ UNKNOWN = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.
 _LEAST_SUPPORT = 1e-6
 
+# chosen: share of a cell, summed over the five directions, from which on it is looked at closely.
+_WEIGHTY = 0.9
+
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
                     flipped: bool, gain: float = 1.0) -> tuple[Array, Array]:
@@ -66,7 +69,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
                                 for side in (CELL, max(large, CELL)))
     if small_cells is None or large_cells is None:
         return UNKNOWN
-    correlated = max(1.0, np.trace(np.linalg.solve(small_cells, large_cells)) / 5)
+    # Exact matches leave no noise at all.
+    noise = small_cells + _LEAST_VARIANCE * np.eye(5)
+    correlated = max(1.0, np.trace(np.linalg.solve(noise, large_cells)) / 5)
     pull, = summed_by_cell(places, J * weights, side=max(large, CELL))
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
     covariance = correlated / (gain * flattening)**2 * small_cells + shifts @ shifts.T
@@ -124,8 +129,8 @@ def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
     cells = len(gradients)
     if cells <= 5:  # so many are gone with the pose's own freedom
         return None
-    # The traces bound the shares, and hardly any cell comes near to all.
-    weighty = H_cells[np.einsum('ij,cij->c', np.linalg.inv(H), H_cells) > 1 - _LEAST_SUPPORT]
+    # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
+    weighty = H_cells[np.einsum('ij,cij->c', np.linalg.inv(H), H_cells) > _WEIGHTY]
     whitening = np.linalg.inv(np.linalg.cholesky(H))
     if (np.linalg.eigvalsh(whitening @ weighty @ whitening.T) > 1 - _LEAST_SUPPORT).any():
         return None
