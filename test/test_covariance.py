@@ -32,6 +32,16 @@ def normalised_squared_error(name: str, first: int) -> float:
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
+def test_exact_matches_are_surer_than_any_camera_and_leave_a_covariance_nevertheless():
+    rng = np.random.default_rng(9)
+    t = unit(np.array([0.1, 0.2, -1.0]))
+    exact = Residuals(np.zeros(100), np.ones(100), 700 * rng.normal(size=(5, 100)),
+                      sphere_tangents(t))
+    covariance, _ = pose_covariance(exact, Loss(), rng.uniform(0, 400, (100, 2)), t, False)
+    variances = np.linalg.eigvalsh(covariance)
+    assert np.isfinite(variances).all() and (variances < 1e-8).all()
+
+
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says():
     # Pairs far from one another, so that their errors are independent. True within a factor of
