@@ -32,6 +32,7 @@ LAB = {
     'closure': 'how well the rotations of three frames agree: no ground truth needed',
     'coverage': 'are poses as sure as they say? errors against covariances, scene by scene',
     'beside': 'what a gyro and masks are good for, on rendered scenes, with and without them',
+    'lengths': 'how far do lengths drift, and are they as sure as they say? on rendered streets',
     'bench': 'measure the speed, as ratios against OpenCV from one run',
     'soak': 'run many frames through the odometry: does memory or latency grow?',
     'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",

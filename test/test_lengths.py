@@ -1,0 +1,94 @@
+"""Whether lengths are as sure as they say is measured right, and the command tells it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+import json
+from pathlib import Path
+
+from djet_ros.cli.main import main
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.types import Status
+from djet_ros.lab.lengths import go, step_squares, Way, way_of, WayChunk
+from djet_ros.lab.store import RecordStore
+from djet_ros.odometry.visual_odometry import OdometryResult
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy.stats import chi2
+
+Poses = NDArray[np.float64]
+
+
+def straight(ways: NDArray[np.float64]) -> Poses:
+    poses = np.tile(np.eye(4), (len(ways) + 1, 1, 1))
+    poses[1:, 2, 3] = np.cumsum(ways)
+    return poses
+
+
+def results_of(ways: NDArray[np.float64], sigmas: NDArray[np.float64]) -> list[OdometryResult]:
+    """Go straight ahead by these ways, each that sure of its length, and 0.1 mrad of all else."""
+    poses, results = straight(ways), []
+    for index, pose in enumerate(poses):
+        motion, covariance = np.eye(4), np.eye(6) * 1e-8
+        if index:
+            motion[2, 3], covariance[2, 2] = ways[index - 1], sigmas[index - 1]**2
+        results.append(OdometryResult(
+            index, 'camera', Status.OK if index else Status.FIRST_FRAME, index - 1, None, motion,
+            pose, covariance, np.eye(6), float(ways[index - 1]) if index else 0.0, True))
+    return results
+
+
+def test_lengths_that_err_as_they_say_have_the_squares_of_chance() -> None:
+    rng = np.random.default_rng(0)
+    true = rng.uniform(0.5, 2, 4000)
+    drifting = true * np.exp(np.cumsum(rng.normal(0, 1e-4, 4000)))  # which is no step's error
+    for claimed in (1.0, 0.5):
+        sigmas = 0.01 * drifting
+        told = drifting * (1 + rng.normal(0, 0.01, 4000))
+        squares = step_squares(straight(true), results_of(told, claimed * sigmas))
+        assert np.median(squares) / chi2.median(1) == pytest.approx(1 / claimed**2, rel=0.1)
+
+
+def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
+    true, chunk = np.full(300, 1.0), WayChunk('road', 0, None, 301, 100)
+    told = np.where(np.arange(300) < 150, 5.0, 5.5)
+    metric = true * np.where((np.arange(300) >= 60) & (np.arange(300) < 160), 0.98, 1.0)
+    way = way_of(chunk, straight(true), results_of(told, 0.01 * told),
+                 results_of(metric, 0.01 * metric))
+    assert way.tracked == 300
+    assert way.scale_change == pytest.approx(1.1)
+    assert way.hidden_length == pytest.approx(0.98)
+    assert way.rotation_deg_per_100m == pytest.approx(0, abs=1e-6)
+    assert way.turn_square < 1e-6
+    # After 100 m of 1 % each, a hundred steps claim 0.1 m; the unit is off by 5 % here and there.
+    assert way.pose_square == pytest.approx((5 / 0.105)**2 / chi2.median(6), rel=0.15)
+    lost = [replace(one, status=Status.AMBIGUOUS) for one in results_of(told, told)]
+    assert way_of(chunk, straight(true), lost, lost).tracked == 0
+
+
+def test_the_command_tells_what_became_of_a_way(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, chunk = EstimatorConfig(), WayChunk('road', 0, (620, 188), 3, 0)
+    ways = go(chunk, config)
+    assert ways[0].tracked == 2
+    assert ways[0].scale_change == pytest.approx(1, abs=0.05)
+    settings = {'frames': 3, 'hidden': 0, 'half': True, 'estimator': asdict(config)}
+    with RecordStore(tmp_path, Way, settings) as store:
+        store.add(chunk.name, ways)
+    assert main(['lab', 'lengths', '--seeds', '0', '--frames', '3', '--hidden', '0', '--half',
+                 '--workers', '1', '--output', str(tmp_path)]) == 0
+    assert 'road 0' in capsys.readouterr().out
+    told, = json.loads((tmp_path / 'lengths.json').read_text())
+    assert told['scale_change'] == ways[0].scale_change
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (('--frames', '2'), '--frames is 2'), (('--hidden', '-1'), '--hidden is -1'),
+    (('--workers', '0'), 'workers is 0')])
+def test_what_can_be_mended_is_one_line_and_exit_code_2(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
+        said: str) -> None:
+    assert main(['lab', 'lengths', *arguments, '--output', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count('\n') == 1
