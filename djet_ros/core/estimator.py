@@ -186,53 +186,56 @@ class TwoViewEstimator:
         """
         known = known or Known()
         timings = {} if timings is None else timings
-        config, K = self.config, current.K
-        if len(x) < config.min_matches:
+        if len(x) < self.config.min_matches:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
+        # Starting poses; none where those around the motion before will do.
         before = _pose(prior)
-        starts: list[Pose] = []
-        if config.starts == 'several' and config.method != 'five_point':
-            goes_on = goes_on and before is not None and known.turn is None
-            if goes_on:  # starts are looked for around the motion before
-                surface = self._surface(previous, current, x, y, timings)
-            else:
-                # The first surfaces need no pose, and are sampled meanwhile.
-                began, jet = perf_counter(), timings.get('jet', 0.0)
-                starts, surface = both(
-                    lambda: self._starts(K, x, y, before, known),
-                    lambda: self._surface(previous, current, x, y, timings))
-                # What was done beside the surfaces took no time: stages add up to all of it.
-                timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
-        else:
-            # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
-            with _timed(timings, 'starts'):
-                found = five_point(K, x, y, config.ransac_threshold, robust=False)
-            if found is None:
-                return RelativePose(Status.DEGENERATE, x=x, y=y)
-            starts, x, y, goes_on = [found[0]], x[found[1]], y[found[1]], False
-            surface = self._surface(previous, current, x, y, timings)
+        goes_on = goes_on and before is not None and known.turn is None
+        begun = self._begin(previous, current, x, y, before, known, goes_on, timings)
+        if begun is None:
+            return RelativePose(Status.DEGENERATE, x=x, y=y)
+        starts, surface, y = begun
 
         # Joint epipolar tracking on the residual surfaces.
-        with _timed(timings, 'jet'):
-            track = (hold(surface, K, y, starts[0]) if config.method == 'five_point'
-                     else track_jointly(surface, K, y, starts, config, before, observe,
-                                        known.turn))
-        if goes_on and track is None:  # another basin comes near: all starts, on the same surfaces
-            goes_on = False
+        K, x = current.K, surface.x
+        track = self._track(surface, K, y, starts, before, observe, known, timings)
+        if track is None and not starts:  # another basin comes near: all starts, same surfaces
             with _timed(timings, 'starts'):
                 starts = self._starts(K, x, y, before, known)
-            with _timed(timings, 'jet'):
-                track = track_jointly(surface, K, y, starts, config, before, observe)
+            track = self._track(surface, K, y, starts, before, observe, known, timings)
         if track is None:
-            result = RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
-        else:
-            with _timed(timings, 'result'):
-                result = self._result(previous, current, surface, y, track, before)
-        if goes_on and prior is not None and track is not None and not _as_good(
-                result, track, prior):
+            return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
+
+        # What is to be believed of it.
+        with _timed(timings, 'result'):
+            result = self._result(previous, current, surface, y, track, before)
+        if not starts and prior is not None and not _as_good(result, track, prior):
             return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
         return result
+
+    def _begin(self, previous: View, current: View, x: Array, y: Array, before: Pose | None,
+               known: Known, goes_on: bool, timings: dict[str, float]
+               ) -> tuple[list[Pose], ResidualSurface, Array] | None:
+        """Give starting poses, the surfaces, and the keypoints y that these are around."""
+        config = self.config
+        if config.starts != 'several' or config.method == 'five_point':
+            # The starting pose of the paper: the 5-point algorithm, and only what it agrees with.
+            with _timed(timings, 'starts'):
+                found = five_point(current.K, x, y, config.ransac_threshold, robust=False)
+            if found is None:
+                return None
+            x, y = x[found[1]], y[found[1]]
+            return [found[0]], self._surface(previous, current, x, y, timings), y
+        if goes_on:
+            return [], self._surface(previous, current, x, y, timings), y
+        # The first surfaces need no pose, and are sampled beside the search for starts.
+        began, jet = perf_counter(), timings.get('jet', 0.0)
+        starts, surface = both(lambda: self._starts(current.K, x, y, before, known),
+                               lambda: self._surface(previous, current, x, y, timings))
+        # What was done beside the surfaces took no time: stages add up to all of it.
+        timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
+        return starts, surface, y
 
     def _starts(self, K: Array, x: Array, y: Array, before: Pose | None,
                 known: Known) -> list[Pose]:
@@ -250,6 +253,14 @@ class TwoViewEstimator:
             if self.config.method == 'pjet':
                 return PhotometricSurface(previous, current, x, self.config)
             return ReprojectionSurface(x, y)
+
+    def _track(self, surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
+               before: Pose | None, observe: Observer | None, known: Known,
+               timings: dict[str, float]) -> Track | None:
+        with _timed(timings, 'jet'):
+            if self.config.method == 'five_point':
+                return hold(surface, K, y, starts[0])
+            return track_jointly(surface, K, y, starts, self.config, before, observe, known.turn)
 
     def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
                 track: Track, before: Pose | None) -> RelativePose:
