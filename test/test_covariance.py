@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from djet_ros.core.covariance import design_effect, pose_covariance
+from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import sphere_tangents, unit
@@ -103,16 +103,6 @@ def test_a_pose_that_hangs_on_one_match_is_not_known():
     J[4, 7], r[7] = 1, 0  # the pose goes where the match wants it, and nothing is left to see
     residuals = Residuals(r, np.ones(300), J, sphere_tangents(t))
     assert np.isnan(pose_covariance(residuals, Loss(), places, t, False)[0]).all()
-
-
-def test_residuals_that_hang_together_have_a_design_effect():
-    rng = np.random.default_rng(4)
-    places, r = rng.uniform(0, 640, (2000, 2)), rng.normal(size=2000)
-    assert design_effect(places, r) == pytest.approx(1, abs=0.2)
-    # Half of the image is off to one side, the other half to the other: n per cell, that is 5.
-    off = np.where(places[:, 0] < 320, 1.0, -1.0)
-    assert design_effect(places, off) == pytest.approx(1 + 2000 / 20**2, rel=0.05)
-    assert 2 < design_effect(places, off + r) < 5
 
 
 def test_minima_follow_a_small_displacement_by_the_share_that_their_surface_says():

@@ -142,18 +142,6 @@ def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
     return np.asarray((1 - 1 / cells) * (seen + by_noise) / 2)
 
 
-def design_effect(places: Array, residuals: Array) -> float:
-    """
-    Tell how far residuals (N,) at places (N, 2) in pixels hang together: 1 where they do not.
-
-    Sum over cells of (sum r)^2, over the sum of r^2: the variance of sums in clusters over that of
-    independent residuals (Kish's design effect). Where a pose is right, it is below 3, as surfaces
-    of neighbours overlap; where a pose is a compromise between two, whole regions are off.
-    """
-    summed, = summed_by_cell(places, residuals)
-    return float((summed**2).sum() / max((residuals**2).sum(), 1e-300))
-
-
 def summed_by_cell(places: Array, *values: Array, side: float = CELL) -> list[Array]:
     """Sum values (..., N) over the C cells of the image that have matches; each (C, ...)."""
     cells: NDArray[np.int64] = (places // side).astype(np.int64)
