@@ -115,47 +115,47 @@ class TwoViewEstimator:
         images tell of this one. Never raises on image content: what can't be estimated comes back
         with a status that says why.
         """
-        timings: dict[str, float] = {}
+        known, timings = known or Known(), dict[str, float]()
         with _timed(timings, 'matching'):
-            x, y, goes_on = self._match(previous, current, prior, known or Known())
+            foreseen = self._match_foreseen(previous, current, prior, known)
+        if foreseen is not None and prior is not None:
+            result = self.estimate_matched(previous, current, *foreseen, prior, timings,
+                                           known=known, goes_on=True)
+            if _as_good(result, prior):
+                return replace(result, timings=timings)
+        with _timed(timings, 'matching'):
+            x, y = self._match_widely(previous, current, prior, known)
         return replace(
-            self.estimate_matched(previous, current, x, y, prior, timings, known=known,
-                                  goes_on=goes_on), timings=timings)
+            self.estimate_matched(previous, current, x, y, prior, timings, known=known),
+            timings=timings)
 
-    def match(self, previous: View, current: View, prior: RelativePose | None = None,
-              known: Known | None = None) -> tuple[Array, Array]:
+    def match(self, previous: View, current: View) -> tuple[Array, Array]:
         """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
-        x, y, _ = self._match(previous, current, prior, known or Known())
-        return x, y
-
-    def _match(self, previous: View, current: View, prior: RelativePose | None,
-               known: Known) -> tuple[Array, Array, bool]:
-        """Match, and tell whether features were where the motion before foresees them."""
-        there, here = previous.features, current.features
-        foreseen = None
-        if self.config.search_radius >= 1:
-            matches = match_everywhere(there, here)
-        elif (foreseen := self._match_foreseen(previous, current, prior, known)) is not None:
-            matches = foreseen
-        else:
-            matches = self._match_turned(previous, current, prior, known)
-        return there.points[matches[:, 0]], here.points[matches[:, 1]], foreseen is not None
+        return self._match_widely(previous, current, None, Known())
 
     def _match_foreseen(self, previous: View, current: View, prior: RelativePose | None,
-                        known: Known) -> NDArray[np.int64] | None:
+                        known: Known) -> tuple[Array, Array] | None:
         """Match features where the motion before foresees them; None where too few are there."""
-        if prior is None or prior.inliers.sum() < _MANY:
+        if prior is None or prior.inliers.sum() < _MANY or self.config.search_radius >= 1:
             return None
         there, R = previous.features, [*known.rotations(), prior.R][0]
         foreseen = replace(there, points=foresee(there, current.K, R, prior))
         reach = min(_FORESEEN, self.config.search_radius * max(current.gray.shape))
         matches = match_close(foreseen, current.features, reach, _SURE_BITS)
-        return matches if len(matches) >= max(_ENOUGH * prior.inliers.sum(), _MANY) else None
+        if len(matches) < max(_ENOUGH * prior.inliers.sum(), _MANY):
+            return None
+        return there.points[matches[:, 0]], current.features.points[matches[:, 1]]
 
-    def _match_turned(self, previous: View, current: View, prior: RelativePose | None,
-                      known: Known) -> NDArray[np.int64]:
-        """Match features that lie near where a turn alone would bring them."""
+    def _match_widely(self, previous: View, current: View, prior: RelativePose | None,
+                      known: Known) -> tuple[Array, Array]:
+        """Match features that lie near where a turn alone would bring them, or anywhere."""
         there, here = previous.features, current.features
+        matches = (match_everywhere(there, here) if self.config.search_radius >= 1
+                   else self._match_turned(there, here, current, prior, known))
+        return there.points[matches[:, 0]], here.points[matches[:, 1]]
+
+    def _match_turned(self, there: Features, here: Features, current: View,
+                      prior: RelativePose | None, known: Known) -> NDArray[np.int64]:
         radius = self.config.search_radius * max(current.gray.shape)
         rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
         turned = replace(there, points=predict(
@@ -204,10 +204,7 @@ class TwoViewEstimator:
 
         # What is to be believed of it.
         with _timed(timings, 'result'):
-            result = self._result(previous, current, surface, y, track, before)
-        if not starts and prior is not None and not _as_good(result, prior):
-            return self.estimate_matched(previous, current, x, y, prior, timings, observe, known)
-        return result
+            return self._result(previous, current, surface, y, track, before)
 
     def _begin(self, previous: View, current: View, x: Array, y: Array, before: Pose | None,
                known: Known, goes_on: bool, timings: dict[str, float]
