@@ -57,7 +57,8 @@ def test_what_remains_on_a_street_is_no_more_than_the_errors_themselves(road: Pa
     one = summary(closures(sequence, ['djet'], FRAMES)['djet'])
     assert one['triangles'] == FRAMES - 2 and one['without'] == 0
     assert 0 < one['error_median_deg'] < 0.1
-    assert 0 < one['median_deg'] < 3 * one['error_median_deg']
+    # The pair over two frames errs more than those of neighbours, whose error that is.
+    assert 0 < one['median_deg'] < 5 * one['error_median_deg']
 
 
 def test_the_command_writes_triangles_and_a_plot(road: Path, tmp_path: Path) -> None:

@@ -429,6 +429,15 @@ def test_stepping_keypoints_towards_their_optimum_lowers_their_descriptor_distan
     assert distances[2] < 0.95 * distances[0]
 
 
+def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_foreseen():
+    scene = make_scene('road', size=(620, 188))
+    estimator = TwoViewEstimator()
+    a, b, c = (estimator.view(scene.render(pose, i), scene.K)
+               for i, pose in enumerate(scene.trajectory(3)))
+    foreseen = estimator.estimate(a, c, estimator.estimate(a, b))
+    assert len(foreseen.x) > 0.9 * len(estimator.estimate(a, c).x)
+
+
 def test_a_prior_helps_or_does_no_harm(pair):
     previous, current, (R, t) = pair
     estimator = TwoViewEstimator()

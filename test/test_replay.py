@@ -324,7 +324,9 @@ def test_flags_and_file_make_the_configuration_that_is_written(bag, tmp_path):
     assert summary(tmp_path / 'r')['method'] == 'rpe'
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    assert np.allclose(lengths, np.linalg.norm(STEP[:3, 3]), atol=1e-6)
+    moved = lengths > 0  # while a pair is in doubt the pose is held
+    assert moved.sum() >= len(lengths) - 1
+    assert np.allclose(lengths[moved], np.linalg.norm(STEP[:3, 3]), atol=1e-6)
 
 
 def test_results_are_replaced_only_on_demand_and_nothing_else_is(bag, replayed, tmp_path):

@@ -51,6 +51,9 @@ _ENOUGH = 0.8
 # differ by some 100, the best of ten.
 _FORESEEN, _SURE_BITS = 24.0, 64
 
+# Share of the matches that have to be within half of that.
+_NEARLY_ALL = 0.9
+
 # chosen: fewer matches than these leave a choice of motions, so that all are sought widely.
 _MANY = 200
 
@@ -142,9 +145,13 @@ class TwoViewEstimator:
         foreseen = replace(there, points=foresee(there, current.K, R, prior))
         reach = min(_FORESEEN, self.config.search_radius * max(current.gray.shape))
         matches = match_close(foreseen, current.features, reach, _SURE_BITS)
-        if len(matches) < max(_ENOUGH * prior.inliers.sum(), _MANY):
+        y = current.features.points[matches[:, 1]]
+        off = np.linalg.norm(y - foreseen.points[matches[:, 0]], axis=1)
+        # Where many are far off, as after a step twice as long, others are farther than the reach.
+        if (len(matches) < max(_ENOUGH * prior.inliers.sum(), _MANY)
+                or np.quantile(off, _NEARLY_ALL) > reach / 2):
             return None
-        return there.points[matches[:, 0]], current.features.points[matches[:, 1]]
+        return there.points[matches[:, 0]], y
 
     def _match_widely(self, previous: View, current: View, prior: RelativePose | None,
                       known: Known) -> tuple[Array, Array]:
