@@ -215,7 +215,8 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     assert scale.agrees(aside, pair.x, pair.y_opt)
     assert scale.agrees(Pose(aside.R, -aside.t), pair.x, pair.y_opt)  # chirality is for others
-    wrong = pair.x + np.random.default_rng(6).permutation(pair.y_opt - pair.x)
+    nearer = np.random.default_rng(6).uniform(0.2, 3, len(pair.x))[:, None]
+    wrong = pair.x + nearer * (pair.y_opt - pair.x)
     assert scale.agrees(aside, pair.x, wrong) is False
     few = np.arange(4)
     assert scale.agrees(aside, pair.x[few], wrong[few]) is None
