@@ -61,9 +61,9 @@ _MANY = 200
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
 
-# chosen: share of the matches that agree in a rigid world, where their places are foreseen; three
-# quarters were the least seen, and less than six tenths before a lorry.
-_MOST = 0.7
+# chosen: share of the matches with a usable surface that agree in a rigid world, where they are
+# foreseen; .87 was the least seen.
+_MOST = 0.8
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -317,7 +317,7 @@ def _as_good(result: RelativePose, prior: RelativePose) -> bool:
     noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
     return (result.status in (Status.OK, Status.NO_PARALLAX)
             and robust_scale(result.residuals) < _NOISIER * noise
-            and result.inliers.mean() > _MOST)
+            and result.inliers.sum() > _MOST * (len(result.x) - result.culled))
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
