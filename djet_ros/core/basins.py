@@ -17,10 +17,13 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
 from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
-from djet_ros.core.starts import all_round, FORWARD, thinned
+from djet_ros.core.starts import all_round, around, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
+
+# pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
+LEAST_SCALE = 0.02
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,6 @@ class BasinTuning:
     same_basin: float = 0.02
     # chosen: steps on all matches before costs are compared
     steps_to_compare: int = 7
-    # pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
-    least_scale: float = 0.02
     # rad; chosen: what a rotation that was measured is not trusted with, and for how many matches'
     # worth of surprise it counts
     turn_slack: float = 2e-4
@@ -90,12 +91,12 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     do not; turn: a rotation that was measured, which all of them have to have.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
-    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), TUNING.least_scale)
+    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), LEAST_SCALE)
     tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
     if turn is not None:
         # Whatever moves as most matches do tells their noise, and what fits the turn fits it well.
         scale = max(refine_all(some, starts, tight, TUNING.steps_to_sketch).scales().min(),
-                    TUNING.least_scale)
+                    LEAST_SCALE)
         tight = replace(tight, scale=min(config.loss_scale, TUNING.tight) * scale)
         starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
                                              _held(turn, scale)), tight, TUNING.turned_starts)
@@ -114,7 +115,7 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     # All matches are placed equally well, whatever they move with.
     scale = (min(map(_core_scale, refined.r)) if others_move
              else robust_scale(epipolar_residuals(problem, best.R, best.t).r))
-    return Basin(best, max(scale, TUNING.least_scale), others_move, tuple(basins))
+    return Basin(best, max(scale, LEAST_SCALE), others_move, tuple(basins))
 
 
 def basin_ahead(problem: JetProblem, places: Array, before: Pose,
@@ -126,18 +127,22 @@ def basin_ahead(problem: JetProblem, places: Array, before: Pose,
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
     tight = Loss()
-    basins = [before, Pose(before.R, FORWARD), *all_round(before.R, TUNING.directions)]
+    basins = around(before, TUNING.directions)
     for steps in (0, TUNING.steps_to_sketch, TUNING.steps_to_sketch):
         found = refine_all(some, basins, tight, steps)
-        scale = max(found.scales().min(), TUNING.least_scale)
+        scale = max(found.scales().min(), LEAST_SCALE)
         tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
         if steps:
             basins = _promising(some, found, tight, TUNING.refined_starts)
     if (preferences(losses_at(problem, basins, tight), places, 0)[1:] < TUNING.clear).any():
         return None
-    best = basins[0]
-    scale = robust_scale(epipolar_residuals(problem, best.R, best.t).r)
-    return Basin(best, max(scale, TUNING.least_scale))
+    return basin_of(problem, basins[0])
+
+
+def basin_of(problem: JetProblem, pose: Pose) -> Basin:
+    """Give the basin of a pose that has no rival."""
+    scale = robust_scale(epipolar_residuals(problem, pose.R, pose.t).r)
+    return Basin(pose, max(scale, LEAST_SCALE))
 
 
 def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],

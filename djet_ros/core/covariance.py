@@ -130,14 +130,15 @@ def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
     if cells <= 5:  # so many are gone with the pose's own freedom
         return None
     # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
-    weighty = H_cells[np.einsum('ij,cij->c', np.linalg.inv(H), H_cells) > _WEIGHTY]
+    inverse = np.linalg.inv(H)
+    weighty = H_cells[np.einsum('ij,cij->c', inverse, H_cells) > _WEIGHTY]
     whitening = np.linalg.inv(np.linalg.cholesky(H))
     if (np.linalg.eigvalsh(whitening @ weighty @ whitening.T) > 1 - _LEAST_SUPPORT).any():
         return None
     without = np.linalg.inv(H - H_cells)
     moves = (without @ gradients[:, :, None])[:, :, 0]
     seen = moves.T @ moves
-    by_noise = (without - np.linalg.inv(H)).sum(0)
+    by_noise = (without - inverse).sum(0)
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
     return np.asarray((1 - 1 / cells) * (seen + by_noise) / 2)
 

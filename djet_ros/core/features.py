@@ -91,9 +91,7 @@ def match_nearby(previous: Features, current: Features,
     apart = np.linalg.norm(here[claim] - there, axis=1)
     mutual = np.isfinite(best_there) & (best_there == best_here[claim]) & (apart <= search_radius)
     best = np.flatnonzero(mutual)[np.argsort(-best_there[mutual], kind='stable')]
-    matches = np.stack([rows[best], columns[claim[best]]], axis=1)
-    _, first = np.unique(matches[:, 1], return_index=True)  # twins claim the same feature
-    return matches[np.sort(first)]
+    return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))
 
 
 def match_close(previous: Features, current: Features, reach: float,
@@ -116,11 +114,15 @@ def match_close(previous: Features, current: Features, reach: float,
     np.minimum.at(least_here, columns, badness)
     mutual = (badness == least_there[rows]) & (badness == least_here[columns])
     matches = np.stack([rows, columns], axis=1)[mutual]
-    matches = matches[np.argsort(badness[mutual], kind='stable')]
-    for side in (0, 1):  # twins match the same feature
+    return _one_to_one(matches[np.argsort(badness[mutual], kind='stable')])
+
+
+def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keep the first of matches (M, 2) that share a feature, as twins do."""
+    for side in (0, 1):
         _, first = np.unique(matches[:, side], return_index=True)
         matches = matches[np.sort(first)]
-    return np.asarray(matches)
+    return matches
 
 
 def _differing(there: NDArray[np.uint8], rows: NDArray[np.int64], here: NDArray[np.uint8],

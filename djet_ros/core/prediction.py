@@ -51,10 +51,11 @@ def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Arr
     turned = rays(K, previous.points) @ R.T
     if not before.t.any() or not len(x):
         return _seen(K, turned)
-    rho = inverse_depths(before.R, before.t, rays(K, x), rays(K, y))[0].clip(0, _NEAREST)
+    seen = rays(K, x)
+    rho = inverse_depths(before.R, before.t, seen, rays(K, y))[0].clip(0, _NEAREST)
     step = rho[:, None] * before.t
     # With z = 1 of x: of the same length as rho, whatever the depth.
-    there = (rays(K, x) @ before.R.T + step) @ R.T
+    there = (seen @ before.R.T + step) @ R.T
     shift = _seen(K, there + step) - _seen(K, there)
     _, nearest = cKDTree(y).query(previous.points)
     return np.asarray(_seen(K, turned) + shift[nearest])

@@ -14,7 +14,7 @@ from djet_ros.core.covariance import summed_by_cell
 from djet_ros.core.geometry import facing, inverse_depths
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_at, losses_in_front, refine_all
-from djet_ros.core.starts import all_round, FORWARD, thinned
+from djet_ros.core.starts import around, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,11 @@ class SecondMotion:
     members: NDArray[np.bool_]
     width: float
     flatness: tuple[float, float]
+
+    @property
+    def both(self) -> tuple[Pose, Pose]:
+        """Give both motions, the first one first."""
+        return self.first, self.pose
 
 
 def change(one: Pose, other: Pose) -> float:
@@ -139,7 +144,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     if len(strays) < least:
         return None
     alone = problem.subset(strays)
-    starts = [first, Pose(first.R, FORWARD), *all_round(first.R, _DIRECTIONS)]
+    starts = around(first, _DIRECTIONS)
     rough = Loss('geman_mcclure', _STRAY * scale)
     found = refine_all(alone.subset(thinned(len(strays), _STRAYS)), starts, rough, _STEPS)
     tight = Loss('geman_mcclure', _MEMBER * scale)

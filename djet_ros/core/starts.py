@@ -133,6 +133,11 @@ def all_round(R: Array, count: int) -> list[Pose]:
     return [Pose(R, t) for t in np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)]
 
 
+def around(pose: Pose, count: int) -> list[Pose]:
+    """Give a pose, and others of its rotation: straight ahead, and in directions all round."""
+    return [pose, Pose(pose.R, FORWARD), *all_round(pose.R, count)]
+
+
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     """
     Start from the motions of a plane that many matches may lie on (at most four).

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from djet_ros.core.basins import Basin, basin_ahead, judged, right_basin
+from djet_ros.core.basins import Basin, basin_ahead, basin_of, judged, LEAST_SCALE, right_basin
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
@@ -38,8 +38,6 @@ from numpy.typing import NDArray
 class TrackTuning:
     """Constants of the optimisation, each with where it comes from ("chosen" was not searched)."""
 
-    # pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
-    least_scale: float = 0.02
     # pixels; chosen, about a window: so near to the epipole the direction of a line is noise, and
     # a match that fits by chance would hold the epipole and make it look far surer than it is
     epipole_blur: float = 5.0
@@ -227,7 +225,7 @@ def _basin(problem: JetProblem, places: Array, poses: list[Pose], config: Estima
         return right_basin(problem, places, poses, config, prior, turn)
     if not poses and prior is not None:
         return basin_ahead(problem, places, prior, config)
-    return Basin(poses[0], _scale(epipolar_residuals(problem, poses[0].R, poses[0].t).r))
+    return basin_of(problem, poses[0])
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
@@ -237,14 +235,12 @@ def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
 
     Where nothing tells, it is the wider one, for the world surrounds what moves in it.
     """
-    both = second.first, second.pose
-    told = _told_apart(second, both, prior, turn)
+    told = _told_apart(second, prior, turn)
     taken = int(second.width > 1) if told is None else told
-    return both[taken], both[1 - taken], told is None
+    return second.both[taken], second.both[1 - taken], told is None
 
 
-def _told_apart(second: SecondMotion, both: tuple[Pose, Pose], prior: Pose | None,
-                turn: Turn | None) -> int | None:
+def _told_apart(second: SecondMotion, prior: Pose | None, turn: Turn | None) -> int | None:
     """
     Tell which of two motions, 0 or 1, is the camera's; None where that would be a guess.
 
@@ -252,7 +248,7 @@ def _told_apart(second: SecondMotion, both: tuple[Pose, Pose], prior: Pose | Non
     many more places of the image follow; or the one whose points reach from near to far, if those
     of the other do not.
     """
-    orders = (0, 1), (1, 0)
+    both, orders = second.both, ((0, 1), (1, 0))
     for one, other in orders:
         if turn is not None and turn.prefers(both[one].R, both[other].R):
             return one
@@ -268,7 +264,7 @@ def _told_apart(second: SecondMotion, both: tuple[Pose, Pose], prior: Pose | Non
 
 
 def _scale(residuals: Array) -> float:
-    return max(robust_scale(residuals), TUNING.least_scale)
+    return max(robust_scale(residuals), LEAST_SCALE)
 
 
 def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:

@@ -229,4 +229,4 @@ def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
                  ylim=(0, 1))
         right.set(xlabel='claimed probability of an error so large', xscale='log', yscale='log',
                   ylabel='share of poses', xlim=(1e-6, 1), ylim=(1e-4, 1))
-        right.legend(fontsize=7, ncols=2, loc='upper left')
+        right.legend(fontsize=7, loc='lower left')
