@@ -8,8 +8,9 @@ from dataclasses import asdict
 from functools import partial
 import json
 
+from djet_ros.cli.lab.pair_runs import recorded
 from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers, split
-from djet_ros.cli.terminal import compact_table, progress_bar
+from djet_ros.cli.terminal import compact_table
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -24,8 +25,6 @@ from djet_ros.lab.beside import (
     TRIALS,
 )
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.lab.runner import local_workers, run as run_chunks
-from djet_ros.lab.store import RecordStore
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
 from rich.console import Console
@@ -78,9 +77,7 @@ def run(args: argparse.Namespace) -> int:
 def _moments(args: argparse.Namespace, chunks: Sequence[TrialChunk]) -> list[Moment]:
     config = from_flat(flag_values(args)).estimator
     settings = {'frames': args.frames, 'estimator': asdict(config)}
-    with (RecordStore(args.output, Moment, settings, overwrite=args.overwrite) as store,
-          local_workers(args.workers) as executor, progress_bar('pairs') as progress):
-        return run_chunks(executor, chunks, partial(run_trial, config=config), store, progress)
+    return recorded(args, Moment, settings, chunks, partial(run_trial, config=config))
 
 
 def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:

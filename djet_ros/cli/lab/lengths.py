@@ -8,14 +8,13 @@ from dataclasses import asdict
 from functools import partial
 import json
 
+from djet_ros.cli.lab.pair_runs import recorded
 from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers
-from djet_ros.cli.terminal import compact_table, progress_bar
+from djet_ros.cli.terminal import compact_table
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
 from djet_ros.lab.lengths import go, Way, WayChunk
-from djet_ros.lab.runner import local_workers, run as run_chunks
-from djet_ros.lab.store import RecordStore
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
 from rich.console import Console
@@ -63,9 +62,7 @@ def _ways(args: argparse.Namespace, chunks: Sequence[WayChunk]) -> list[Way]:
     config = from_flat(flag_values(args)).estimator
     settings = {'frames': args.frames, 'hidden': args.hidden, 'half': args.half,
                 'estimator': asdict(config)}
-    with (RecordStore(args.output, Way, settings, overwrite=args.overwrite) as store,
-          local_workers(args.workers) as executor, progress_bar('pairs') as progress):
-        return run_chunks(executor, chunks, partial(go, config=config), store, progress)
+    return recorded(args, Way, settings, chunks, partial(go, config=config))
 
 
 def _show(ways: Sequence[Way]) -> None:

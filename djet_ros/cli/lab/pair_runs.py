@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import groupby
@@ -17,9 +17,9 @@ from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairRecord
-from djet_ros.lab.runner import chunks_of, dask_workers, local_workers, run
+from djet_ros.lab.runner import C, chunks_of, dask_workers, local_workers, run
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
-from djet_ros.lab.store import RecordStore
+from djet_ros.lab.store import R, RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -53,6 +53,14 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 def shared_values(args: argparse.Namespace) -> dict[str, Any]:
     """Give the estimator's parameters that stand on the command line, by their plain names."""
     return {name.rpartition('.')[2]: value for name, value in flag_values(args).items()}
+
+
+def recorded(args: argparse.Namespace, kind: Callable[..., R], settings: Mapping[str, Any],
+             chunks: Sequence[C], work: Callable[[C], list[R]]) -> list[R]:
+    """Do the work of all chunks on this machine, with a progress bar, and keep the records."""
+    with (RecordStore(args.output, kind, settings, overwrite=args.overwrite) as store,
+          local_workers(args.workers) as executor, progress_bar('pairs') as progress):
+        return run(executor, chunks, work, store, progress)
 
 
 @contextmanager
