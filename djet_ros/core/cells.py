@@ -13,19 +13,15 @@ def cells_of(points: NDArray[Any], side: float) -> NDArray[np.int64]:
     return np.asarray(np.floor(points / side).astype(np.int64) @ (1, 2**20))
 
 
-def rank_in_cells(cells: NDArray[np.int64], worse: NDArray[Any]) -> NDArray[np.int64]:
-    """
-    Tell of each of N points how many of its cell come before it.
-
-    cells: (N,) numbers of their cells; worse: (N,) larger for those that come later.
-    """
-    order = np.lexsort((worse, cells))
+def rank_in_cells(cells: NDArray[Any]) -> NDArray[np.int64]:
+    """Tell of each of N points how many of its cell come before it; cells: (N,) their numbers."""
+    order = np.argsort(cells, kind='stable')
     first = beginnings(cells[order])
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order)) - np.repeat(first, np.diff(first, append=len(order)))
     return rank
 
 
-def beginnings(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
+def beginnings(ordered: NDArray[Any]) -> NDArray[np.int64]:
     """Give the indices at which another number begins among ordered ones (N,)."""
     return np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
-from djet_ros.core.cells import cells_of, rank_in_cells
+from djet_ros.core.cells import rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import at, Mask
 from djet_ros.core.orb_pattern import REACH
@@ -100,8 +100,16 @@ def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int,
 
     first: (N,) bool mask of points that come before all others.
     """
-    rank = rank_in_cells(cells_of(points, _CELL) * 2 + ~first, -strengths)
-    return np.asarray(np.sort(np.lexsort((-strengths, rank, ~first))[:most]))
+    by_strength = np.argsort(-strengths, kind='stable')
+    (columns, rows), late = points[by_strength].T // _CELL, ~first[by_strength]
+    rank = rank_in_cells(_short((rows * (columns.max(initial=0) + 1) + columns) * 2 + late))
+    later = _short(rank + (rank.max(initial=0) + 1) * late)
+    return np.asarray(np.sort(by_strength[np.argsort(later, kind='stable')[:most]]))
+
+
+def _short(numbers: NDArray[np.int64]) -> NDArray[Any]:
+    """Give numbers from 0 on in as few bytes as hold them: sorted ten times as fast."""
+    return numbers.astype(np.min_scalar_type(numbers.max(initial=0)))
 
 
 def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
@@ -130,7 +138,7 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
 def _exact_peaks(slopes: NDArray[np.float32], rows: NDArray[np.int64],
                  columns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Pixels (N, 2) of the image at which parabolas through peaks of the slopes are highest."""
-    padded = np.pad(slopes, 1, mode='edge')
+    padded = cv2.copyMakeBorder(slopes, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     here, places = slopes[rows, columns], []
     for index, down, right in ((columns, 0, 1), (rows, 1, 0)):
         before = padded[rows + 1 - down, columns + 1 - right]

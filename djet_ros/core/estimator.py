@@ -233,7 +233,8 @@ class TwoViewEstimator:
             x, y = x[found[1]], y[found[1]]
             return [found[0]], self._surface(previous, current, x, y, timings), y
         if goes_on:
-            return [], self._surface(previous, current, x, y, timings), y
+            with _timed(timings, 'jet'):
+                return [], self._surface_of(previous, current, x, y), y
         # The first surfaces need no pose, and are sampled beside the search for starts.
         began, jet = perf_counter(), timings.get('jet', 0.0)
         starts, surface = both(lambda: self._starts(current.K, x, y, before, known),
@@ -251,13 +252,17 @@ class TwoViewEstimator:
     def _surface(self, previous: View, current: View, x: Array, y: Array,
                  timings: dict[str, float]) -> ResidualSurface:
         with _timed(timings, 'jet'):
+            surface = self._surface_of(previous, current, x, y)
             if self.config.method == 'djet':
-                surface = DescriptorSurface(previous, current, x, self.config)
                 surface.around(y)  # it keeps them: the first round of tracking finds them done
-                return surface
-            if self.config.method == 'pjet':
-                return PhotometricSurface(previous, current, x, self.config)
-            return ReprojectionSurface(x, y)
+            return surface
+
+    def _surface_of(self, previous: View, current: View, x: Array, y: Array) -> ResidualSurface:
+        if self.config.method == 'djet':
+            return DescriptorSurface(previous, current, x, self.config)
+        if self.config.method == 'pjet':
+            return PhotometricSurface(previous, current, x, self.config)
+        return ReprojectionSurface(x, y)
 
     def _track(self, surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                before: Pose | None, observe: Observer | None, known: Known,

@@ -10,7 +10,6 @@ from djet_ros.core.parallel import both, each
 from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 # Features of the previous image that are compared at once; bounds the memory of a comparison.
 _STRIP = 64
@@ -101,14 +100,14 @@ def match_close(previous: Features, current: Features, reach: float,
 
     most_bits: in which descriptors may differ at most. Gives (M, 2) indices, likewise.
     """
-    near = cKDTree(previous.points).sparse_distance_matrix(
-        cKDTree(current.points), reach, output_type='ndarray')
-    rows, columns, apart = near['i'], near['j'], near['v']
+    rows, columns = _within(previous.points, current.points, reach)
+    like = np.abs(previous.octaves[rows] - current.octaves[columns]) <= _OCTAVES
+    rows, columns = rows[like], columns[like]
     differing = _differing(previous.descriptors, rows, current.descriptors, columns)
-    like = (np.abs(previous.octaves[rows] - current.octaves[columns]) <= _OCTAVES) & (
-        differing <= most_bits)
-    rows, columns, apart, differing = rows[like], columns[like], apart[like], differing[like]
-    badness = differing + _DISTANCE_BITS * (apart / reach)**2
+    alike = np.flatnonzero(differing <= most_bits)
+    rows, columns = rows[alike], columns[alike]
+    apart = previous.points[rows] - current.points[columns]
+    badness = differing[alike] + _DISTANCE_BITS / reach**2 * (apart**2).sum(1)
     least_there, least_here = np.full(len(previous), np.inf), np.full(len(current), np.inf)
     np.minimum.at(least_there, rows, badness)
     np.minimum.at(least_here, columns, badness)
@@ -117,20 +116,49 @@ def match_close(previous: Features, current: Features, reach: float,
     return _one_to_one(matches[np.argsort(badness[mutual], kind='stable')])
 
 
+def _within(there: Array, here: Array, reach: float
+            ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """
+    Give the pairs of points (N, 2) and (M, 2), by their indices, that are at most a reach apart.
+
+    In rows as high as the reach, points come one after the other: those of three rows are near.
+    """
+    if not len(there) or not len(here):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    # Numbers that grow along one row after the other; all in a row are less than `after` apart.
+    after = 4 * (max(np.abs(there).max(), np.abs(here).max()) + reach)
+    along, others = (np.floor(points[:, 1] / reach) * after + points[:, 0]
+                     for points in (there, here))
+    orders = np.argsort(along), np.argsort(others)
+    along, others = along[orders[0]], others[orders[1]]
+    middles = np.concatenate([along + row * after for row in (-1, 0, 1)])
+    start = np.searchsorted(others, middles - reach)
+    counts = np.searchsorted(others, middles + reach, 'right') - start
+    rows = np.repeat(np.tile(orders[0], 3), counts)
+    columns = orders[1][np.arange(len(rows)) + np.repeat(start - np.cumsum(counts) + counts,
+                                                         counts)]
+    apart = there.take(rows, 0) - here.take(columns, 0)
+    near = np.flatnonzero(np.einsum('ij,ij->i', apart, apart) <= reach**2)
+    return rows[near], columns[near]
+
+
 def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
     """Keep the first of matches (M, 2) that share a feature, as twins do."""
     for side in (0, 1):
-        _, first = np.unique(matches[:, side], return_index=True)
-        matches = matches[np.sort(first)]
+        first = np.full(matches[:, side].max(initial=-1) + 1, len(matches))
+        np.minimum.at(first, matches[:, side], np.arange(len(matches)))
+        matches = matches[first[matches[:, side]] == np.arange(len(matches))]
     return matches
 
 
 def _differing(there: NDArray[np.uint8], rows: NDArray[np.int64], here: NDArray[np.uint8],
                columns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Count the bits (M,) in which descriptors (N, 32) of two images differ, pair by pair."""
-    words = (np.ascontiguousarray(descriptors).view(np.uint16) for descriptors in (there, here))
-    apart = next(words).take(rows, 0) ^ next(words).take(columns, 0)
-    return np.asarray(_BITS.take(apart).sum(1, dtype=np.int64))
+    words = [np.ascontiguousarray(descriptors).view(np.uint64) for descriptors in (there, here)]
+    apart = words[0].take(rows, 0) ^ words[1].take(columns, 0)
+    if hasattr(np, 'bitwise_count'):  # NumPy 2
+        return np.asarray(np.bitwise_count(apart).sum(1, dtype=np.int64))
+    return np.asarray(_BITS.take(apart.view(np.uint16)).sum(1, dtype=np.int64))
 
 
 def _compare(left: NDArray[np.float32], right: NDArray[np.float32],

@@ -63,7 +63,8 @@ def homogeneous(points: Array) -> Array:
 
 def rays(K: Array, points: Array) -> Array:
     """Take pixels (N, 2) to their viewing rays K^-1 x (N, 3), with z = 1."""
-    return np.asarray(homogeneous(points) @ np.linalg.inv(K).T)
+    K_inv = np.linalg.inv(K)
+    return np.asarray(points @ K_inv[:, :2].T + K_inv[:, 2])
 
 
 def essential(R: Array, t: Array) -> Array:
@@ -79,13 +80,18 @@ def fundamental(K: Array, R: Array, t: Array) -> Array:
 
 def epipolar_lines(F: Array, x: Array) -> Array:
     """Epipolar lines l = F x (N, 3) in image B, of pixels x (N, 2) of image A."""
-    return np.asarray(homogeneous(x) @ F.T)
+    return np.asarray(x @ F[:, :2].T + F[:, 2])
 
 
 def line_distances(lines: Array, y: Array) -> Array:
     """Signed distances (N,) in pixels of points y (N, 2) to lines (N, 3)."""
     norm = np.hypot(lines[:, 0], lines[:, 1])
-    return np.asarray((homogeneous(y) * lines).sum(1) / np.maximum(norm, 1e-12))
+    return np.asarray(values_on(lines, y) / np.maximum(norm, 1e-12))
+
+
+def values_on(lines: Array, y: Array) -> Array:
+    """Values (N,) of lines (N, 3) at points y (N, 2): 0 where they pass through them."""
+    return np.asarray(lines[:, 0] * y[:, 0] + lines[:, 1] * y[:, 1] + lines[:, 2])
 
 
 def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
@@ -184,11 +190,12 @@ def stretches(warp: Array) -> tuple[Array, Array]:
 
 def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
     """Depths (N,) in A and in B, both times the same positive number for a point."""
-    m = rays_x @ R.T
-    normal = np.cross(m, rays_y)
+    # Components first: a third of the time of np.cross.
+    (m1, m2, m3), (y1, y2, y3), (t1, t2, t3) = R @ rays_x.T, rays_y.T, t
+    n1, n2, n3 = m2 * y3 - m3 * y2, m3 * y1 - m1 * y3, m1 * y2 - m2 * y1
     # (t x v) . n = v . (n x t)
-    plane = np.cross(t, normal)
-    return (rays_y * plane).sum(1), (m * plane).sum(1)
+    p1, p2, p3 = t2 * n3 - t3 * n2, t3 * n1 - t1 * n3, t1 * n2 - t2 * n1
+    return y1 * p1 + y2 * p2 + y3 * p3, m1 * p1 + m2 * p2 + m3 * p3
 
 
 def rotation_angle(Ra: Array, Rb: Array) -> float:

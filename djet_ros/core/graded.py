@@ -9,6 +9,8 @@ graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all 
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 from djet_ros.core.hamming import Image, Pixels, sum_over_tests, Tests
 from djet_ros.core.orb_pattern import TESTS
@@ -27,17 +29,18 @@ def smooth_finely(gray: Image, scale: float = 1.0) -> Grades:
     return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _STEPS * kernel, kernel), np.int16)
 
 
-def grades(p: Grades, q: Grades, grading: float, contrast: float = 1.0) -> Grades:
+def grades(p: NDArray[Any], q: NDArray[Any], grading: float, contrast: float = 1.0) -> Grades:
     """
     Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level.
 
-    contrast: of the image that they are to be compared with, over that of their own.
+    contrast: of the image that they are to be compared with, over that of their own. Between
+    pixels p and q are float32.
     """
     reach = _reach(grading)
     differences = p - q
-    if contrast != 1:
-        differences = np.rint(differences * np.float32(contrast)).astype(np.int16)
-    return np.asarray(np.clip(differences, -reach, reach))
+    if contrast != 1 or differences.dtype != np.int16:
+        differences = np.rint(differences * np.float32(contrast))
+    return np.asarray(np.clip(differences, -reach, reach), np.int16)
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
-from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
+from djet_ros.core.paraboloid import inverse_2x2, median, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -208,15 +208,6 @@ def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Arra
 def robust_scale(residuals: Array) -> float:
     """Give the standard deviation of the inliers, from the median absolute residual."""
     return 1.4826 * median(np.abs(residuals)) if len(residuals) else 1.0
-
-
-def median(values: Array) -> float:
-    """Median of (N,) values, at a third of the price of ``np.median``."""
-    half = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, half)[half])
-    parts = np.partition(values, (half - 1, half))
-    return float(parts[half - 1] + parts[half]) / 2
 
 
 def _evaluate(problem: JetProblem, R: Array, t: Array,

@@ -86,7 +86,7 @@ class DescriptorSurface:
     Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET).
 
     H is the Hamming distance, or that of graded tests. References are first taken at the whole
-    pixels next to x; once it is known how they look around y, they are taken between pixels, so
+    pixels next to x; where it is known how they look around y, they are taken between pixels, so
     that the minimum falls on a whole pixel: there a paraboloid fits without a bias, and a smaller
     window will do ("inverse compositional", Baker and Matthews, IJCV 2004).
     """
@@ -103,7 +103,7 @@ class DescriptorSurface:
         # How the reference of each match was seen last, and how far x is from its pixel.
         self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
-        self._contrast = 1.0
+        self._contrast: float | None = None
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Fit paraboloids to the surfaces around the whole pixels next to y."""
@@ -116,8 +116,8 @@ class DescriptorSurface:
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         return self._kept(anew, usable, y, self._distances.between_pixels(
-            self._previous, self.x[anew], self._current, y[anew], warp[anew], self._contrast,
-            _CLOSE // 2))
+            self._previous, self.x[anew], self._current, y[anew], warp[anew],
+            self._contrast_around(y, usable), _CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit them with the references of whole pixels, as the paper does."""
@@ -125,14 +125,21 @@ class DescriptorSurface:
         centres = np.rint(y - self._offset).astype(np.int64)
         usable = self._usable(centres, radius)
         anew = usable & (centres + self._offset != self._latest.centres).any(1)
+        self._warp[anew] = np.eye(2)
         pixels = np.rint(self.x).astype(np.int64)
-        if np.isnan(self._latest.centres).all():
-            self._contrast = self._distances.contrast(
-                self._previous, pixels[usable], self._current, centres[usable])
-        references = self._distances.reference(self._previous, pixels[anew], self._contrast)
+        references = self._distances.reference(
+            self._previous, pixels[anew], self._contrast_around(centres, usable))
         surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
         return self._kept(anew, usable, y, fit_paraboloids(
             surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
+
+    def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
+        """Measure the contrast where matches are at first, and keep it."""
+        if self._contrast is None:
+            self._contrast = self._distances.contrast(
+                self._previous, np.rint(self.x[usable]).astype(np.int64), self._current,
+                np.rint(y[usable]).astype(np.int64))
+        return self._contrast
 
     def _kept(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
               fitted: Paraboloids) -> Paraboloids:

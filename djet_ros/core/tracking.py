@@ -13,9 +13,9 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,
     growth,
-    homogeneous,
     patch_warp,
     rays,
+    values_on,
 )
 from djet_ros.core.jet import (
     epipolar_residuals,
@@ -158,7 +158,10 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            turn: Turn | None, alive: NDArray[np.bool_]) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
-    poses, warp, begun = starts, None, None
+    poses, begun = starts, None
+    # Where the camera goes on as before, it is known at once how patches are seen.
+    warp = (None if starts or prior is None or not config.warp_reference
+            else _warps(prior, K, surface.x, y)[0])
     rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
@@ -276,7 +279,7 @@ def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArra
 def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
     """Places y + v_opt (N, 2) for the paraboloids around their centres."""
     lines = epipolar_lines(F, x)
-    h = -(homogeneous(paraboloids.centres) * lines).sum(1)
+    h = -values_on(lines, paraboloids.centres)
     v = constrained_minimum(paraboloids.A, paraboloids.b, lines[:, :2], h)
     return np.asarray(paraboloids.centres + v)
 

@@ -431,5 +431,5 @@ def _spread(chosen_from: Array, present: Array, side: float, room: int) -> NDArr
     Cells in which there are present ones come later.
     """
     cells, taken = (cells_of(points, side) for points in (chosen_from, present))
-    rank = rank_in_cells(cells, np.arange(len(cells))) + np.isin(cells, taken)
+    rank = rank_in_cells(cells) + np.isin(cells, taken)
     return np.asarray(np.argsort(rank, kind='stable')[:max(room, 0)])
