@@ -38,15 +38,15 @@ _WEIGHTY = 0.9
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
-                    flipped: bool, gain: float = 1.0) -> tuple[Array, Array]:
+                    flipped: bool) -> tuple[Array, Array]:
     """
     Covariance of (rotation vector in rad from the left, direction of t) at the minimum.
 
     places: (N, 2) pixels of the matches; t: (3,) the direction that was settled on, `flipped`
-    where it is the opposite of the optimiser's; gain: of the surfaces, by which residuals are
-    smaller than what the keypoints are off. Gives (5, 5) in the basis ``sphere_tangents(t)``,
-    and (6, 6) over (rotation vector, t), of rank 5 because t keeps its length. All NaN where the
-    matches do not determine the pose, only those of one cell do, or they lie in too few cells.
+    where it is the opposite of the optimiser's. Gives (5, 5) in the basis
+    ``sphere_tangents(t)``, and (6, 6) over (rotation vector, t), of rank 5 because t keeps its
+    length. All NaN where the matches do not determine the pose, only those of one cell do, or
+    they lie in too few cells.
 
     The noise is that of the residuals themselves, in whichever of the two images it arose: see
     `_jackknife`. Many small cells tell the shape of the covariance. A few large ones, which hold
@@ -74,7 +74,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     correlated = max(1.0, np.trace(np.linalg.solve(noise, large_cells)) / 5)
     pull, = summed_by_cell(places, J * weights, side=max(large, CELL))
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
-    covariance = correlated / (gain * flattening)**2 * small_cells + shifts @ shifts.T
+    covariance = correlated / flattening**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)

@@ -283,7 +283,7 @@ class TwoViewEstimator:
         t = sign * track.pose.t
 
         covariances = pose_covariance(
-            track.residuals, track.loss, x[track.voting], t, sign < 0, surface.gain)
+            track.residuals, track.loss, x[track.voting], t, sign < 0)
         hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
         status = Status.OK
         if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()

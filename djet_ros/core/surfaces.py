@@ -55,21 +55,20 @@ _MOST_CONTRAST = 8.0
 
 
 # Differences of tests grow by their absolute values, so that a surface is sharper at its minimum
-# than the paraboloid through it, which is drawn to the pixel that it is fitted around. A test
-# measures the share on rendered scenes.
-_GAIN = 0.75
+# than the paraboloid through it, which is drawn to the pixel that it is fitted around ("pixel
+# locking"): a small displacement is seen at 1 / 1.37 = 0.73 of its length, one of half a pixel as
+# it is. A test measures what is left of that on rendered scenes.
+_LOCKING = 0.37
 
 
 class ResidualSurface(Protocol):
     """
     What the joint optimiser asks of a match residual.
 
-    x: (N, 2) pixels of the reference points in the previous image; gain: by what share of a small
-    displacement the minimum of a paraboloid follows it.
+    x: (N, 2) pixels of the reference points in the previous image.
     """
 
     x: Array
-    gain: float
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """
@@ -98,7 +97,6 @@ class DescriptorSurface:
         self._has_reference = (self._distances.describable(x, self._previous.shape)
                                & ~at(previous.mask, x))
         self._mask = current.mask
-        self.gain = _GAIN if config.warp_reference else 1.0
         self._latest = _no_paraboloids(len(x))
         # How the reference of each match was seen last, and how far x is from its pixel.
         self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
@@ -215,7 +213,8 @@ class DescriptorDistances:
         centres = np.rint(y).astype(np.int64)
         back = np.einsum('nij,nj->ni', inverses(warp), y - centres)
         references = self.reference(there, x - back, contrast, warp)
-        return fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma)
+        return _unlocked(
+            fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))
 
 
 class PhotometricSurface:
@@ -235,7 +234,7 @@ class PhotometricSurface:
         self._reference = self._sample(self._previous, x)
         self._has_reference = self._inside(x, previous.smoothed.shape) & ~at(previous.mask, x)
         self._mask = current.mask
-        self.x, self.gain = x, 1.0
+        self.x = x
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
@@ -272,7 +271,7 @@ class ReprojectionSurface:
     """Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E)."""
 
     def __init__(self, x: Array, y: Array) -> None:
-        self.x, self.gain = x, 1.0
+        self.x = x
         self._y = y
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
@@ -307,6 +306,17 @@ def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.flo
     if sigma <= 0:
         return np.ones(len(offsets), np.float32)
     return np.asarray(np.exp(-(offsets**2).sum(1) / (2 * sigma**2)), np.float32)
+
+
+def _unlocked(fitted: Paraboloids) -> Paraboloids:
+    """
+    Move minima away from the pixel that paraboloids were fitted around, which draws them.
+
+    A first-order inverse of d - k sin(2 pi d) / (2 pi), by which minima lie a share of d off.
+    """
+    seen = fitted.minima() - fitted.centres
+    drawn = _LOCKING / (2 * np.pi) * np.sin(2 * np.pi * seen)
+    return replace(fitted, b=fitted.b - np.einsum('nij,nj->ni', fitted.A, drawn))
 
 
 def _no_paraboloids(n: int) -> Paraboloids:
