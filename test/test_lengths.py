@@ -9,8 +9,10 @@ from pathlib import Path
 from djet_ros.cli.main import main
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Status
-from djet_ros.lab.lengths import go, step_squares, Way, way_of, WayChunk
+from djet_ros.lab.lengths import go, step_squares, stretch_squares, Way, way_of, WayChunk
 from djet_ros.lab.store import RecordStore
+from djet_ros.odometry.scale import Common
+from djet_ros.odometry.uncertainty import _ALIKE, _PASSED_ON
 from djet_ros.odometry.visual_odometry import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +28,13 @@ def straight(ways: NDArray[np.float64]) -> Poses:
     return poses
 
 
-def results_of(ways: NDArray[np.float64], sigmas: NDArray[np.float64]) -> list[OdometryResult]:
-    """Go straight ahead by these ways, each that sure of its length, and 0.1 mrad of all else."""
+def results_of(ways: NDArray[np.float64], sigmas: NDArray[np.float64],
+               wandered: NDArray[np.float64] | None = None) -> list[OdometryResult]:
+    """
+    Go straight ahead by these ways, each that sure of its length, and 0.1 mrad of all else.
+
+    wandered: variances of their scale since the start.
+    """
     poses, results = straight(ways), []
     for index, pose in enumerate(poses):
         motion, covariance = np.eye(4), np.eye(6) * 1e-8
@@ -35,7 +42,9 @@ def results_of(ways: NDArray[np.float64], sigmas: NDArray[np.float64]) -> list[O
             motion[2, 3], covariance[2, 2] = ways[index - 1], sigmas[index - 1]**2
         results.append(OdometryResult(
             index, 'camera', Status.OK if index else Status.FIRST_FRAME, index - 1, None, motion,
-            pose, covariance, np.eye(6), float(ways[index - 1]) if index else 0.0, True))
+            pose, covariance, np.eye(6), float(ways[index - 1]) if index else 0.0, True,
+            common=None if wandered is None or not index else Common(
+                np.array([wandered[index - 1], 0.0]), np.ones(2))))
     return results
 
 
@@ -50,19 +59,39 @@ def test_lengths_that_err_as_they_say_have_the_squares_of_chance() -> None:
         assert np.median(squares) / chi2.median(1) == pytest.approx(1 / claimed**2, rel=0.1)
 
 
+@pytest.mark.parametrize('claimed', [1.0, 0.5])
+def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: float) -> None:
+    rng = np.random.default_rng(1)
+    walk = np.cumsum(rng.normal(0, 0.004, 3000))
+    own = np.full(len(walk), 1e-3)
+    told = 7 * np.exp(walk + rng.normal(0, own))
+    results = results_of(told, own * told, (claimed * 0.004)**2 * np.arange(1, len(walk) + 1))
+    turns, poses = stretch_squares(straight(np.ones(len(walk))), results, 20)
+    assert len(turns) == len(poses) == 298
+    assert np.median(turns) < 1e-6
+    # Nothing errs but the length.
+    assert np.median(poses) / chi2.median(1) == pytest.approx(1 / claimed**2, rel=0.2)
+
+
 def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
     true, chunk = np.full(300, 1.0), WayChunk('road', 0, None, 301, 100)
-    told = np.where(np.arange(300) < 150, 5.0, 5.5)
+    told = 5 * np.exp(1e-3 * np.arange(300))
     metric = true * np.where((np.arange(300) >= 60) & (np.arange(300) < 160), 0.98, 1.0)
-    way = way_of(chunk, straight(true), results_of(told, 0.01 * told),
+    way = way_of(chunk, straight(true), results_of(told, 0.01 * told, np.zeros(300)),
                  results_of(metric, 0.01 * metric))
     assert way.tracked == 300
-    assert way.scale_change == pytest.approx(1.1)
+    assert way.scale_change == pytest.approx(np.exp(0.27), rel=0.01)
     assert way.hidden_length == pytest.approx(0.98)
     assert way.rotation_deg_per_100m == pytest.approx(0, abs=1e-6)
-    assert way.turn_square < 1e-6
-    # After 100 m of 1 % each, a hundred steps claim 0.1 m; the unit is off by 5 % here and there.
-    assert way.pose_square == pytest.approx((5 / 0.105)**2 / chi2.median(6), rel=0.15)
+    assert way.turn_square_100 < 1e-6
+    # After n metres of 1 % each, steps claim a per cent of the root of n, and twice as much as
+    # they err alike; without a word of it, the unit wanders by 0.1 % a metre.
+    for metres, square in ((25, way.pose_square_25), (100, way.pose_square_100)):
+        alike = 1 + 2 * _ALIKE * sum((1 - lag / metres) * _PASSED_ON**lag
+                                     for lag in range(1, metres))
+        off = 1e-3 * metres * (metres / 2 + 5)
+        claimed = 0.01 * np.sqrt(metres * alike + metres**2 / 10)
+        assert square == pytest.approx((off / claimed)**2 / chi2.median(6), rel=0.15)
     lost = [replace(one, status=Status.AMBIGUOUS) for one in results_of(told, told)]
     assert way_of(chunk, straight(true), lost, lost).tracked == 0
 

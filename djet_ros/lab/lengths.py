@@ -20,7 +20,8 @@ from djet_ros.core.types import Array
 from djet_ros.lab.scenes import make_scene
 from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.uncertainty import compose
+from djet_ros.odometry.scale import Common
+from djet_ros.odometry.uncertainty import PathCovariance
 from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
 from djet_ros.replay.drift import drift, one_factor, scale_change
 import numpy as np
@@ -35,8 +36,8 @@ _HORIZON = 0.55
 # Frames before the ground goes out of sight, and after which the factor to metres is known.
 _LEAD = 60
 
-# Steps to either side that a step's length is held against, and metres of a stretch.
-_NEIGHBOURS, _STRETCH = 5, 100.0
+# Steps to either side that a step's length is held against, and metres of stretches.
+_NEIGHBOURS, STRETCHES = 5, (25, 50, 100)
 
 # A stretch begins with every so many frames.
 _EVERY = 10
@@ -71,9 +72,9 @@ class Way:
     tracked: pairs with a motion; scale_change: scale of its last tenth over that of its first;
     translation_percent, rotation_deg_per_100m: its drift, in its best unit; squares of errors over
     their covariances, in the median over what that is if these are true: of the length of a step
-    against its neighbours, of the turn after 100 m, of the pose there in the way's best unit;
-    hidden_length: length over the truth with the camera's height, where no ground was seen.
-    NaN where nothing is told.
+    against its neighbours, of the turn and the pose after 25, 50 and 100 m (see
+    ``stretch_squares``); hidden_length: length over the truth with the camera's height, where no
+    ground was seen. NaN where nothing is told.
     """
 
     scene: str
@@ -84,8 +85,12 @@ class Way:
     translation_percent: float
     rotation_deg_per_100m: float
     step_square: float
-    turn_square: float
-    pose_square: float
+    turn_square_25: float
+    turn_square_50: float
+    turn_square_100: float
+    pose_square_25: float
+    pose_square_50: float
+    pose_square_100: float
     hidden_length: float
 
 
@@ -118,13 +123,16 @@ def way_of(chunk: WayChunk, truth: Array, alone: Sequence[OdometryResult],
     hidden = slice(_LEAD, _LEAD + chunk.hidden)
     ways, true_ways = (np.linalg.norm(np.diff(way[:, :3, 3], axis=0), axis=1)[hidden]
                        for way in (np.array([result.pose for result in metric]), truth))
-    turns, stretches = _after_stretches(truth, alone, unit)
+    stretches = [stretch_squares(truth, alone, metres) for metres in STRETCHES]
+    turns, poses = ([_median(squares[which], degrees) for squares in stretches]
+                    for which, degrees in ((0, 3), (1, 6)))
     return Way(
         chunk.scene, chunk.seed, len(truth), sum(one.status in TRACKED for one in alone),
         scale_change(found[:, :3, 3], truth[:, :3, 3]),
         told.translation_percent if told else float('nan'),
         told.rotation_deg_per_100m if told else float('nan'),
-        _median(step_squares(truth, alone), 1), _median(turns, 3), _median(stretches, 6),
+        _median(step_squares(truth, alone), 1),
+        turns[0], turns[1], turns[2], poses[0], poses[1], poses[2],
         float(ways.sum() / true_ways.sum()) if chunk.hidden and true_ways.any() else float('nan'))
 
 
@@ -153,30 +161,77 @@ def step_squares(truth: Array, results: Sequence[OdometryResult]) -> Array:
     return np.asarray(off**2 / (variances[inner] + np.convolve(variances, kernel**2, 'valid')))
 
 
-def _after_stretches(truth: Array, results: Sequence[OdometryResult], unit: float
-                     ) -> tuple[Array, Array]:
-    """Normalised squares (M,) of turns, and of poses, after 100 m from every tenth frame on."""
+def stretch_squares(truth: Array, results: Sequence[OdometryResult], metres: float
+                    ) -> tuple[Array, Array]:
+    """
+    Squared errors of turns (M,) and poses (M,) over their covariances, after so many metres.
+
+    From every tenth frame on, in the unit of the steps before it: what the scale has drifted by
+    before is no error of a stretch, and how sure that unit is belongs to it.
+    """
     gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)))
-    scaled = np.diag([unit] * 3 + [1.0] * 3)
     squares = []
-    for first in range(0, len(truth), _EVERY):
-        last = int(np.searchsorted(gone, gone[first] + _STRETCH))
+    for first in range(_EVERY, len(truth), _EVERY):
+        last = int(np.searchsorted(gone, gone[first] + metres))
         if last >= len(truth):
             break
-        pose, covariance = np.eye(4), np.zeros((6, 6))
-        for result in results[first + 1:last + 1]:
-            motion = result.motion.copy()
-            motion[:3, 3] *= unit
-            covariance = compose(pose, covariance, motion,
-                                 scaled @ result.motion_covariance @ scaled)
-            pose = pose @ motion
+        pose, path = _integrated(results[first + 1:last + 1], *_unit_before(first, gone, results))
         true = np.linalg.inv(truth[first]) @ truth[last]
         off = np.concatenate([true[:3, 3] - pose[:3, 3],
                               rotation_log(true[:3, :3] @ pose[:3, :3].T)])
-        squares.append([off[3:] @ np.linalg.solve(covariance[3:, 3:], off[3:]),
-                        off @ np.linalg.solve(covariance, off)])
+        squares.append([off[3:] @ np.linalg.solve(path.pose[3:, 3:], off[3:]),
+                        off @ np.linalg.solve(path.pose, off)])
     turns, poses = np.array(squares).reshape(-1, 2).T
     return turns, poses
+
+
+def _unit_before(first: int, gone: Array, results: Sequence[OdometryResult]
+                 ) -> tuple[float, float, float]:
+    """Give the unit of the steps to a frame, its variance, and how far it has wandered there."""
+    before = [index for index in range(first - _EVERY + 1, first + 1)
+              if _length(results[index]) > 0 and gone[index] > gone[index - 1]]
+    if not before:
+        return 0.0, 0.0, 0.0
+    logs = [np.log((gone[index] - gone[index - 1]) / _length(results[index])) for index in before]
+    wandered = np.array([_wandered(results[index]) for index in before])
+    here = _wandered(results[first])
+    own = sum(_own_sigma(results[index])**2 for index in before) / len(before)**2
+    # The variance of a mean of random walks is two thirds of the mean of their variances.
+    return float(np.mean(logs)), own + 2 / 3 * float((here - wandered).mean()), here
+
+
+def _integrated(results: Sequence[OdometryResult], unit: float, variance: float, wandered: float
+                ) -> tuple[Array, PathCovariance]:
+    """Chain steps in a unit, given with its variance and how far the scale had wandered then."""
+    scaled = np.diag([np.exp(unit)] * 3 + [1.0] * 3)
+    pose, path = np.eye(4), PathCovariance()
+    for result in results:
+        motion = result.motion.copy()
+        motion[:3, 3] *= np.exp(unit)
+        common = result.common and Common(np.array(
+            [variance + max(_wandered(result) - wandered, 0.0), 0.0]), np.ones(2))
+        moved = path.moved_by_pair if _told(result) else path.moved
+        path = moved(pose, motion, scaled @ result.motion_covariance @ scaled, common)
+        pose = pose @ motion
+    return pose, path
+
+
+def _told(result: OdometryResult) -> bool:
+    return result.status in TRACKED and not result.stationary
+
+
+def _wandered(result: OdometryResult) -> float:
+    return 0.0 if result.common is None else float(result.common.variances[0])
+
+
+def _length(result: OdometryResult) -> float:
+    return float(np.linalg.norm(result.motion[:3, 3]))
+
+
+def _own_sigma(result: OdometryResult) -> float:
+    """Give the standard deviation of a length, as a share of it."""
+    along = result.motion[:3, 3] / _length(result)
+    return float(np.sqrt(along @ result.motion_covariance[:3, :3] @ along)) / _length(result)
 
 
 def _median(squares: NDArray[Any], degrees: int) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum, unique
 from typing import Protocol
 
@@ -59,12 +59,27 @@ class Scale(StrEnum):
 
 
 @dataclass(frozen=True)
+class Common:
+    """
+    Errors that a length has in common with the lengths before and after it, as shares of it.
+
+    variances: (2,) of that of the track's factor, as it has wandered by now, and of that which all
+    metric lengths have for good; kept: (2,) how much of either was in the length before.
+    """
+
+    variances: Array
+    kept: Array
+
+
+@dataclass(frozen=True)
 class Length:
     """
     How long a translation is.
 
     known: whether value and sigma mean anything, in metres if `metric`, otherwise in the unit
-    that all lengths of the track have in common; measured: whether its source measured it.
+    that all lengths of the track have in common; measured: whether its source measured it; common:
+    what of its error is in its neighbours too, None where that is not known. In sigma that is of
+    metres alone.
     """
 
     value: float
@@ -72,6 +87,15 @@ class Length:
     known: bool
     metric: bool = True
     measured: bool = True
+    common: Common | None = None
+
+    @property
+    def own(self) -> Length:
+        """Take what it has in common with its neighbours from its sigma."""
+        if not self.metric or self.common is None:
+            return self
+        variance = self.sigma**2 - self.value**2 * float(self.common.variances.sum())
+        return replace(self, sigma=float(np.sqrt(max(variance, 0.0))))
 
     @property
     def scale(self) -> Scale:

@@ -7,13 +7,19 @@ both along the axes of the frame in which the pose is given.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+
 from djet_ros.core.geometry import skew
 from djet_ros.core.types import Array, RelativePose
-from djet_ros.odometry.scale import Length, UNKNOWN_LENGTH_SIGMA
+from djet_ros.odometry.scale import Common, Length, UNKNOWN_LENGTH_SIGMA
 import numpy as np
 
 # A rotation about which nothing is known: standard deviation of half a turn.
 _UNKNOWN_ANGLE = np.pi
+
+# Share of a pair's variance that is of errors which the next pair has too, and how much of such an
+# error is left a pair later: by `djet lab lengths`, a metre a frame.
+_ALIKE, _PASSED_ON = 0.25, 0.9
 
 # Covariance (6, 6) of a motion about which nothing is known.
 UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
@@ -68,10 +74,71 @@ def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Arra
     First order: the motion's error is turned into the outer frame, and an error of the
     pose's rotation swings the motion like a lever.
     """
-    R = pose[:3, :3]
+    lever = _lever(pose, motion)
+    return _symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
+
+
+@dataclass(frozen=True)
+class PathCovariance:
+    """
+    How sure an integrated pose is, where its steps have errors in common.
+
+    pose: (6, 6) its covariance; with_common: (6, 2) that of the pose with the two errors of
+    `Common`, by which a step is too long as all steps before it were; with_pair: (6, 6) that of
+    the pose with the part of the last pair's error that the next pair has too, in units of what
+    pairs are unsure by.
+    """
+
+    pose: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    with_common: Array = field(default_factory=lambda: np.zeros((6, 2)))
+    with_pair: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def moved(self, pose: Array, motion: Array, covariance: Array,
+              common: Common | None = None) -> PathCovariance:
+        """
+        Give that of ``pose @ motion``, both (4, 4), for a motion that no pair of images tells.
+
+        covariance: (6, 6) of what errs in the motion alone; common: of its length, beside that.
+        """
+        lever = _lever(pose, motion)
+        moved = PathCovariance(compose(pose, self.pose, motion, covariance),
+                               lever @ self.with_common)
+        return moved if common is None else moved._stretched(pose, motion, common)
+
+    def moved_by_pair(self, pose: Array, motion: Array, covariance: Array,
+                      common: Common | None = None) -> PathCovariance:
+        """
+        Give that of ``pose @ motion``, both (4, 4), for a motion that a pair of images told.
+
+        Pairs that follow one another see the same things, and err alike.
+        """
+        moved = self.moved(pose, motion, covariance, common)
+        values, axes = np.linalg.eigh(rotated(pose[:3, :3], covariance))
+        turn = np.kron(np.eye(2), pose[:3, :3])
+        # Along the camera's own axes errors stay what they are.
+        root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T @ turn
+        before = _PASSED_ON * _lever(pose, motion) @ self.with_pair
+        both = before @ root.T
+        return replace(moved, pose=_symmetric(moved.pose + both + both.T),
+                       with_pair=before + _ALIKE * root)
+
+    def _stretched(self, pose: Array, motion: Array, common: Common) -> PathCovariance:
+        """Add what the errors do that lengths have in common."""
+        along = np.zeros(6)
+        along[:3] = pose[:3, :3] @ motion[:3, 3]
+        crossed = self.with_common * common.kept
+        both = np.outer(crossed.sum(1), along)
+        return PathCovariance(
+            _symmetric(self.pose + both + both.T
+                       + common.variances.sum() * np.outer(along, along)),
+            crossed + np.outer(along, common.variances))
+
+
+def _lever(pose: Array, motion: Array) -> Array:
+    """(6, 6) what an error of a pose (4, 4) becomes at the end of the next motion (4, 4)."""
     lever = np.eye(6)
-    lever[:3, 3:] = -skew(R @ motion[:3, 3])
-    return _symmetric(lever @ pose_covariance @ lever.T + rotated(R, covariance))
+    lever[:3, 3:] = -skew(pose[:3, :3] @ motion[:3, 3])
+    return lever
 
 
 def rotated(R: Array, covariance: Array) -> Array:

@@ -13,11 +13,11 @@ from djet_ros.core.types import Array, Pose, RelativePose, Status, View
 from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
-from djet_ros.odometry.scale import Length, Scale, scale_source, ScaleSource
+from djet_ros.odometry.scale import Common, Length, Scale, scale_source, ScaleSource
 from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.uncertainty import (
-    compose,
     motion_covariance,
+    PathCovariance,
     standstill_covariance,
     UNKNOWN_MOTION,
 )
@@ -63,6 +63,9 @@ class OdometryResult:
     since_ns: stamp of the newest frame that was where the reference frame is, which is later
     where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
     sure it is that this frame was there.
+
+    common: of the length, what of its error other steps have too. It is in pose_covariance, from
+    the first frame on: also by how much a relative scale may have wandered since.
     """
 
     stamp_ns: int
@@ -81,6 +84,7 @@ class OdometryResult:
     since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     metric: bool = True
     measured: bool = True
+    common: Common | None = None
 
     @property
     def scale_kind(self) -> Scale:
@@ -142,7 +146,7 @@ class VisualOdometry:
         self._prior: RelativePose | None = None
         self._bad_pairs = self._since_ns = self._known_ns = 0
         self._stood = True
-        self._pose, self._pose_covariance = np.eye(4), np.zeros((6, 6))
+        self._pose, self._path = np.eye(4), PathCovariance()
 
     def process(self, frame: Frame) -> OdometryResult:
         """Take the next frame; ValueError where its stamp is that of the last one."""
@@ -174,9 +178,11 @@ class VisualOdometry:
 
         # Integrate the motion and its uncertainty; this frame is the next reference.
         motion = camera_motion(relative, length.value)
-        covariance = motion_covariance(relative, length)
-        result = self._result(frame, relative.status, relative, length, motion, covariance)
-        self._pose, self._pose_covariance = result.pose, result.pose_covariance
+        path = self._path.moved_by_pair(
+            self._pose, motion, motion_covariance(relative, length.own), length.common)
+        result = self._result(frame, relative.status, relative, length, motion,
+                              motion_covariance(relative, length), path)
+        self._pose, self._path = result.pose, path
         self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs, self._stood = relative, 0, False
@@ -265,7 +271,7 @@ class VisualOdometry:
             self._last = frame
         elif status is not Status.FIRST_FRAME:
             motion, covariance = self._carried(frame)
-            self._pose_covariance = compose(self._pose, self._pose_covariance, motion, covariance)
+            self._path = self._path.moved(self._pose, motion, covariance)
             self._pose = self._pose @ motion
         if backwards or status is Status.FIRST_FRAME:
             self._known_ns = frame.stamp_ns
@@ -274,7 +280,7 @@ class VisualOdometry:
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
-            UNKNOWN_MOTION, self._pose_covariance, 0.0, False)
+            UNKNOWN_MOTION, self._path.pose, 0.0, False)
 
     def _carried(self, frame: Frame) -> tuple[Array, Array]:
         """Motion (4, 4) and covariance (6, 6) where the images tell none: the gyro's rotation."""
@@ -289,8 +295,9 @@ class VisualOdometry:
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
         self._bad_pairs, self._stood = 0, True
-        result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4),
-                              standstill_covariance(relative, length), stationary=True)
+        covariance = standstill_covariance(relative, length)
+        result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
+                              self._path.moved(self._pose, np.eye(4), covariance), stationary=True)
         if self._gyro is not None:
             self._gyro.learn(self._since_ns, frame.stamp_ns, np.eye(3),
                              np.eye(3) * _STILL_TO_WITHIN**2)
@@ -305,14 +312,15 @@ class VisualOdometry:
         self._bad_pairs += 1
         given_up = self._bad_pairs >= self._config.max_lost
         motion, covariance = self._carried(frame)
-        result = self._result(frame, relative.status, relative, length, motion, covariance)
+        path = self._path.moved(self._pose, motion, covariance)
+        result = self._result(frame, relative.status, relative, length, motion, covariance, path)
         if given_up or relative.status in UNDECIDED:
             if given_up:
                 self._one_scale.begin(view)
             else:
                 self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative)
             self._refer_to(frame, view)
-            self._pose, self._pose_covariance = result.pose, result.pose_covariance
+            self._pose, self._path = result.pose, path
         if given_up:
             self._prior = None
         return result
@@ -330,13 +338,12 @@ class VisualOdometry:
                 one.forget_before(self._since_ns)
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
-                motion: Array, covariance: Array, stationary: bool = False) -> OdometryResult:
+                motion: Array, covariance: Array, path: PathCovariance,
+                stationary: bool = False) -> OdometryResult:
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
-            self._pose @ motion, covariance,
-            compose(self._pose, self._pose_covariance, motion, covariance), length.value,
-            length.known, stationary, self._since_ns, self._since_covariance, length.metric,
-            length.measured)
+            self._pose @ motion, covariance, path.pose, length.value, length.known, stationary,
+            self._since_ns, self._since_covariance, length.metric, length.measured, length.common)
 
 
 def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:

@@ -14,7 +14,7 @@ from djet_ros.cli.terminal import compact_table
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
-from djet_ros.lab.lengths import go, Way, WayChunk
+from djet_ros.lab.lengths import go, STRETCHES, Way, WayChunk
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
 from rich.console import Console
@@ -66,16 +66,17 @@ def _ways(args: argparse.Namespace, chunks: Sequence[WayChunk]) -> list[Way]:
 
 
 def _show(ways: Sequence[Way]) -> None:
-    table = compact_table('', 'tracked', 'scale', 't_rel', 'r_rel', 'step', 'turn', 'pose',
-                          'no ground', names=1)
+    table = compact_table('', 'tracked', 'scale', 't_rel', 'r_rel', 'step', 'turn',
+                          *(f'pose {metres}' for metres in STRETCHES), 'no ground', names=1)
     for way in ways:
         table.add_row(f'{way.scene} {way.seed}', f'{way.tracked}/{way.frames - 1}', *(
             f'{value:.3f}' if np.isfinite(value) else '-' for value in (
                 way.scale_change, way.translation_percent, way.rotation_deg_per_100m,
-                way.step_square, way.turn_square, way.pose_square, way.hidden_length)))
+                way.step_square, way.turn_square_100, way.pose_square_25, way.pose_square_50,
+                way.pose_square_100, way.hidden_length)))
     Console().print(table)
     print('scale: of the last tenth over that of the first; t_rel (%) and r_rel (deg per 100 m): '
           'drift;\n  step, turn, pose: squared errors over covariances, median over what it is if '
-          'these are true, of a\n  step among its neighbours, and of the turn and the pose after '
-          '100 m; no ground: length over the\n  truth by the height of the camera, while there '
-          'is none in sight')
+          'these are true, of a\n  step among its neighbours, of the turn after 100 m, and of '
+          'poses after 25, 50 and 100 m in the unit\n  where they begin; no ground: length over '
+          'the truth by the height of the camera, while there is none\n  in sight')

@@ -1,0 +1,132 @@
+"""An integrated pose is as sure as its steps leave it that have errors in common."""
+
+from dataclasses import replace
+
+from cards import Cards, pose
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import rotation_exp, rotation_log
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.scale import Common, Length
+from djet_ros.odometry.uncertainty import _ALIKE, _PASSED_ON, PathCovariance
+from djet_ros.odometry.visual_odometry import VisualOdometry
+import numpy as np
+import pytest
+
+# A way that turns, by steps of a metre; what errs in a step, and its root.
+STEP = np.eye(4)
+STEP[:3, :3], STEP[:3, 3] = rotation_exp(np.array([0.01, 0.08, 0.0])), (0.05, 0.0, 1.0)
+ROOT = np.diag([2e-3, 1e-3, 4e-3, 2e-3, 1e-3, 5e-4])
+COUNT, SAMPLES = 24, 4000
+
+
+def sampled(scales, own):
+    """
+    Covariance (6, 6) of what becomes of samples of the way: their poses against the true one.
+
+    scales: (COUNT, SAMPLES) logarithms of how much too long steps are; own: (COUNT, SAMPLES, 6)
+    what else errs in them, along the axes of the camera before.
+    """
+    true, R, p = np.eye(4), np.tile(np.eye(3), (SAMPLES, 1, 1)), np.zeros((SAMPLES, 3))
+    for scale, error in zip(scales, own):
+        way = STEP[:3, 3] * np.exp(scale)[:, None] + error[:, :3]
+        p = p + np.einsum('nij,nj->ni', R, way)
+        R = R @ rotation_exp(error[:, 3:]) @ STEP[:3, :3]
+        true = true @ STEP
+    off = np.concatenate([p - true[:3, 3], rotation_log(R @ true[:3, :3].T)], axis=1)
+    return off.T @ off / SAMPLES
+
+
+def told(covariance, commons, by_pairs):
+    path, here = PathCovariance(), np.eye(4)
+    for common in commons:
+        moved = path.moved_by_pair if by_pairs else path.moved
+        path, here = moved(here, STEP, covariance, common), here @ STEP
+    return path.pose
+
+
+def same(one, other):
+    """Hold two covariances against one another: no direction differs by more than chance."""
+    ratios = np.linalg.eigvals(np.linalg.solve(one, other)).real
+    assert ratios == pytest.approx(np.ones(6), abs=0.15)
+
+
+def test_a_scale_that_wanders_and_is_measured_again_swings_the_whole_way():
+    rng = np.random.default_rng(0)
+    factor, share = np.zeros(SAMPLES), rng.normal(0, 0.02, SAMPLES)
+    variance, scales, commons = 0.0, [], []
+    for number in range(COUNT):
+        kept = 0.5 if number % 8 == 7 else 1.0
+        noise = rng.normal(0, 0.004, SAMPLES)
+        factor, variance = kept * factor + noise, kept**2 * variance + 0.004**2
+        scales.append(factor + share)
+        commons.append(Common(np.array([variance, 0.02**2]), np.array([kept, 1.0])))
+    own = rng.normal(size=(COUNT, SAMPLES, 6)) @ ROOT
+    same(told(ROOT**2, commons, by_pairs=False), sampled(scales, own))
+
+
+def test_pairs_that_see_the_same_err_alike():
+    rng = np.random.default_rng(1)
+    lasting, own = np.zeros((SAMPLES, 6)), []
+    for number in range(COUNT):
+        fresh = np.sqrt(_ALIKE * (1 - _PASSED_ON**2 * (number > 0)))
+        lasting = _PASSED_ON * lasting + fresh * rng.normal(size=(SAMPLES, 6))
+        rest = np.sqrt(1 - _ALIKE) * rng.normal(size=(SAMPLES, 6))
+        own.append((lasting + rest) @ ROOT)
+    found = sampled(np.zeros((COUNT, SAMPLES)), np.array(own))
+    same(told(ROOT**2, [None] * COUNT, by_pairs=True), found)
+    alone = told(ROOT**2, [None] * COUNT, by_pairs=False)
+    assert np.trace(found[3:, 3:]) > 2 * np.trace(alone[3:, 3:])
+
+
+def test_the_same_steps_seen_from_another_first_camera_are_as_sure():
+    common = Common(np.array([1e-4, 1e-3]), np.ones(2))
+    turned = np.eye(4)
+    turned[:3, :3] = rotation_exp(np.array([0.3, -1.2, 2.0]))
+    paths = []
+    for here in np.eye(4), turned:
+        path = PathCovariance()
+        for _ in range(5):
+            path, here = path.moved_by_pair(here, STEP, ROOT**2, common), here @ STEP
+        paths.append(path.pose)
+    turn = np.kron(np.eye(2), turned[:3, :3])
+    assert paths[1] == pytest.approx(turn @ paths[0] @ turn.T, abs=1e-15)
+
+
+def test_what_lengths_have_in_common_is_in_the_sigma_of_metres_alone():
+    common = Common(np.array([0.03**2, 0.04**2]), np.ones(2))
+    metric = Length(2.0, 2 * np.sqrt(0.05**2 + 0.01**2), True, common=common)
+    assert metric.own.sigma == pytest.approx(0.02)
+    assert replace(metric, metric=False).own.sigma == metric.sigma
+
+
+def test_a_path_of_metres_of_a_wrong_share_is_wrong_by_that_share():
+    common = Common(np.array([0.0, 0.05**2]), np.ones(2))
+    path, here, way = PathCovariance(), np.eye(4), np.eye(4)
+    way[2, 3] = 1.0
+    for _ in range(100):
+        path, here = path.moved_by_pair(here, way, np.eye(6) * 1e-12, common), here @ way
+    assert np.sqrt(path.pose[2, 2]) == pytest.approx(5, rel=1e-3)
+    back = way.copy()
+    back[2, 3] = -1.0
+    for _ in range(100):
+        path, here = path.moved_by_pair(here, back, np.eye(6) * 1e-12, common), here @ back
+    assert np.sqrt(path.pose[2, 2]) < 0.01  # back at the start, of whatever size the way was
+
+
+def test_the_covariance_that_is_published_is_that_of_its_steps():
+    cards, here, results = Cards(), np.eye(4), []
+    odometry = VisualOdometry(EstimatorConfig(max_features=800))
+    path = PathCovariance()
+    for number in range(6):
+        frame = cards.frame(0.0, here, noise=number)
+        before = results[-1].pose if results else np.eye(4)
+        result = odometry.process(Frame(frame.gray, frame.K, number * 10**8, 'camera'))
+        if number:
+            assert result.common is not None
+            path = path.moved_by_pair(before, result.motion, result.motion_covariance,
+                                      result.common)
+            assert result.pose_covariance == pytest.approx(path.pose)
+        results.append(result)
+        here = here @ pose(x=0.16, z=0.12)
+    wandered = [result.common.variances[0] for result in results[1:]]
+    assert all(np.diff(wandered) > 0)
