@@ -8,13 +8,13 @@ from pathlib import Path
 
 from djet_ros.cli.main import main
 from djet_ros.core.geometry import rotation_angle
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Status
 from djet_ros.lab.beside import GYRO, is_wrong, MASK, Moment, NOTHING, trial_rows
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
+from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
 import numpy as np
 import pytest
 
@@ -85,15 +85,16 @@ def test_what_can_be_mended_is_one_line_and_exit_code_2(
     assert said in error and error.count('\n') == 1
 
 
-def gone(scene: Scene, poses: Array, seed: int) -> list[OdometryResult]:
-    """Go a way with a gyro of the usual errors."""
-    felt = feel(poses, 0.1, Mems(), seed, scene.level)
+def gone(scene: Scene, poses: Array, seed: int, period: float = 0.1, first: int = 0
+         ) -> list[OdometryResult]:
+    """Go a way with a gyro of the usual errors, from some moment of the scene on."""
+    felt = feel(poses, period, Mems(), seed, scene.level)
     gyro = Gyro(GyroNoise(Mems.gyro, Mems.gyro_walk))
     gyro.mount(felt.to_camera)
     for stamp, rate in zip(felt.stamps_ns.tolist(), felt.rates, strict=True):
         gyro.add(stamp, rate)
     one = VisualOdometry(gyro=gyro)
-    return [one.process(Frame(scene.render(pose, i), scene.K, i * 10**8))
+    return [one.process(Frame(scene.render(pose, first + i), scene.K, round(i * period * 1e9)))
             for i, pose in enumerate(poses)]
 
 
@@ -106,6 +107,14 @@ def test_with_a_gyro_a_camera_stands_while_lorries_fill_most_of_the_picture() ->
         assert rotation_angle(result.pose[:3, :3], np.eye(3)) < np.radians(0.1)
 
 
+def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
+    scene = make_scene('traffic', 70, (620, 188))
+    results = gone(scene, scene.trajectory(16), 70, first=22)
+    # Nothing is left to stand still for.
+    assert Status.AMBIGUOUS in {result.status for result in results}
+    assert all(result.stationary for result in results if result.status in TRACKED)
+
+
 @pytest.mark.parametrize(('axis', 'step'), [(0, 0.05), (2, 0.2)])
 def test_a_camera_that_glides_off_without_a_turn_does_not_stand(axis: int, step: float) -> None:
     scene = make_scene('road', 31, (620, 188))
@@ -114,3 +123,13 @@ def test_a_camera_that_glides_off_without_a_turn_does_not_stand(axis: int, step:
     results = gone(scene, poses, 31)
     assert all(result.stationary for result in results[1:4])
     assert not any(result.stationary for result in results[4:])
+
+
+def test_a_camera_that_glides_on_without_a_turn_is_believed_in_the_end() -> None:
+    scene = make_scene('road', 31, (620, 188))
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[3:, 2, 3] = 0.3 * np.arange(1, 10)
+    results = gone(scene, poses, 31, period=0.5)
+    assert all(result.stationary for result in results[1:3])
+    assert results[3].status is Status.AMBIGUOUS
+    assert all(result.status is Status.OK for result in results[-2:])

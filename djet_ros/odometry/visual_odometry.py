@@ -44,6 +44,10 @@ _HARDLY = 3
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4
 
+# Nanoseconds; chosen: a lorry that drives past at a walk has left the image by then, and for so
+# long a camera that begins to move can do without its gyro feeling it.
+_NOT_FELT_NS = 3_000_000_000
+
 
 @dataclass(frozen=True)
 class OdometryResult:
@@ -170,6 +174,7 @@ class VisualOdometry:
         if self._stands_still(frame, relative):
             return self._stay(frame, relative, self._one_scale.of_rest(span))
         relative = self._weighed(frame, self._by_depths(relative), known.turn)
+        relative = self._begun(frame, relative)
         if relative.status not in TRACKED:
             return self._lose(frame, view, relative, self._one_scale.of_rest(span))
 
@@ -230,6 +235,19 @@ class VisualOdometry:
         # What turned otherwise was not the camera, but something that fills the image.
         return fused(relative, turn) if agreed else replace(
             relative, status=Status.DEGENERATE, t=np.zeros(3))
+
+    def _begun(self, frame: Frame, relative: RelativePose) -> RelativePose:
+        """
+        Doubt that a camera has begun to move whose gyro feels nothing.
+
+        It stood, and something that fills the image moves. Whatever drives, flies or is held
+        turns a little as it starts; on a rail it may not, and is believed in the end.
+        """
+        if (relative.status is Status.OK and self._stood and self._gyro is not None
+                and frame.stamp_ns - self._known_ns < _NOT_FELT_NS
+                and self._gyro.at_rest(self._since_ns, frame.stamp_ns)):
+            return replace(relative, status=Status.AMBIGUOUS)
+        return relative
 
     def _stands_still(self, frame: Frame, relative: RelativePose) -> bool:
         return self._nothing_moved(relative) or self._only_others_moved(frame, relative)
