@@ -41,18 +41,19 @@ _SOBEL = 8.0
 
 
 def detect_corners(gray: Image, max_features: int, contrast: float,
-                   mask: Mask | None = None) -> Features:
+                   mask: Mask | None = None, smoothed: Image | None = None) -> Features:
     """
     Detect corners in a gray image (H, W) uint8; images too small for a descriptor give none.
 
     contrast: rms slope, in gray levels per pixel, that a corner has at least in its weakest
     direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
-    in the image made smaller. Octaves number the sizes. mask: (H, W) bool, where no point may be.
+    in the image made smaller. Octaves number the sizes. mask: (H, W) bool, where no point may be;
+    smoothed: gray as ORB's tests see it, where that is known already.
     """
     sizes = [(octave, scale, round(share * max_features))
              for octave, (scale, share) in enumerate(_SIZES)
              if min(gray.shape) > 2 * scale * (REACH + 1)]
-    found = each(lambda size: _of_size(gray, *size, contrast, mask), sizes)
+    found = each(lambda size: _of_size(gray, *size, contrast, mask, smoothed), sizes)
     if not found:
         none = np.empty(0, np.float32)
         return Features(np.empty((0, 2)), np.empty(0, np.int32), none, none,
@@ -113,7 +114,7 @@ def _short(numbers: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
-             mask: Mask | None,
+             mask: Mask | None, smoothed: Image | None,
              ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float32], Image]:
     """Points, octaves, responses and descriptors of the corners of one size."""
     width, height = (max(1, round(side / scale)) for side in gray.shape[::-1])
@@ -130,7 +131,8 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
     strengths = slopes[rows, columns]
     chosen = spread_out(_pixels(points), strengths, most, lonely[rows, columns])
     points, strengths = points[chosen], strengths[chosen]
-    descriptors = dense_descriptors(smooth(image), _pixels(points))
+    seen = smooth(image) if smoothed is None or scale != 1 else smoothed
+    descriptors = dense_descriptors(seen, _pixels(points))
     return ((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
             np.sqrt(strengths), descriptors)
 

@@ -99,14 +99,17 @@ class TwoViewEstimator:
         be told from.
         """
         mask = None if left_out is None else blocked(left_out)
-        return View(gray, K, self.features(gray, mask) if features is None else features,
-                    smooth(gray), DescriptorDistances(self.config).seen(gray), mask)
+        smoothed = smooth(gray)
+        if features is None:
+            features = self.features(gray, mask, smoothed)
+        return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
 
-    def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
+    def features(self, gray: NDArray[np.uint8], mask: Mask | None = None,
+                 smoothed: NDArray[np.uint8] | None = None) -> Features:
         """Detect the features of a gray image (H, W) uint8, but where a mask (H, W) is True."""
         if self.config.detector == 'corners':
             return detect_corners(gray, self.config.max_features, self.config.corner_contrast,
-                                  mask)
+                                  mask, smoothed)
         return detect_orb(gray, self.config.max_features, self.config.fast_threshold, mask)
 
     def estimate(self, previous: View, current: View, prior: RelativePose | None = None,

@@ -28,7 +28,11 @@ def rotation_exp(omega: Array) -> Array:
     """Rotation matrices (…, 3, 3) of rotation vectors, (3,) or (N, 3), in radians."""
     if omega.ndim == 1:  # Rodrigues' formula
         return np.asarray(cv2.Rodrigues(omega)[0])
-    return np.asarray(Rotation.from_rotvec(omega).as_matrix())
+    angle = np.linalg.norm(omega, axis=1)[:, None, None]
+    turning = skew(omega)
+    # sin(a) / a and (1 - cos(a)) / a^2
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * turning
+                      + np.sinc(angle / (2 * np.pi))**2 / 2 * (turning @ turning))
 
 
 def rotation_log(R: Array) -> Array:
@@ -105,8 +109,11 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     R, weights = np.eye(3), np.ones(len(x))
     for _ in range(rounds):
         R = nearest_rotation((y.T * weights) @ x)
-        deviation = np.linalg.norm(y - x @ R.T, axis=1)
-        weights = 1 / (1 + (deviation / max(float(np.median(deviation)), 1e-9))**2)
+        off = y - x @ R.T
+        squared = np.einsum('ij,ij->i', off, off)
+        # Half of them deviate by less than the median.
+        weights = 1 / (1 + squared / max(float(np.partition(squared, len(squared) // 2)[
+            len(squared) // 2]), 1e-18))
     return R
 
 

@@ -31,7 +31,7 @@ _BLOCK = 2048
 _WARPED_BLOCK = 256
 
 # Tests per pass over the points at most: enough to spare calls, few enough to stay in the cache.
-_TESTS_AT_ONCE = 32
+_TESTS_AT_ONCE = 16
 
 
 def smooth(gray: Image, scale: float = 1.0) -> Image:

@@ -9,7 +9,7 @@ things in turn.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import cv2
@@ -19,14 +19,23 @@ Second = TypeVar('Second')
 Task = TypeVar('Task')
 Result = TypeVar('Result')
 
+# Kept, as it takes longer to make a thread than to do much of what these do.
+_others = ThreadPoolExecutor(4, 'djet')
+
 
 def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
     """Do two things at once, the first of them in the calling thread."""
     if cv2.getNumThreads() < 2:
         return first(), second()
-    with ThreadPoolExecutor(1) as other:
-        later = other.submit(second)
-        return first(), later.result()
+    later = _others.submit(second)
+    try:
+        done = first()
+    finally:
+        # What nobody has begun is done here: so no two can wait for one another.
+        begun = not later.cancel()
+        if begun:
+            wait([later])
+    return done, later.result() if begun else second()
 
 
 def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:

@@ -299,7 +299,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     """Tell how patches at x are seen at y, as they are where that is not plausible."""
     seen = growth(pose.R, pose.t, rays(K, x), rays(K, y))
     # Of the same size without any parallax, or on the epipole; gone where it comes too near.
-    seen = np.nan_to_num(seen, nan=1.0, posinf=-1.0, neginf=-1.0)
+    seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
     return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
