@@ -29,6 +29,9 @@ _BLOCK = 3
 # Least share of the smaller eigenvalue in the larger one; the rest are edges.
 _LEAST_RATIO = 0.1
 
+# Rows of blocks that are looked at at once.
+_STRIP = 32
+
 # Corners are the strongest of all that are so near, in each second pixel each way: those of the
 # wider surroundings come first, and the others where there are not enough.
 _APART, _AT_LEAST_APART = 3, 1
@@ -69,9 +72,21 @@ def corner_slopes(image: Image) -> NDArray[np.float32]:
     Gives (H // 2, W // 2): of blocks around each second pixel, which takes a third of the time.
     """
     # Halves are exact, and OpenCV is five times as fast, where both sides are even.
-    height, width = image.shape
-    dx, dy = cv2.spatialGradient(image[:height // 2 * 2, :width // 2 * 2])
-    xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))
+    height, width = (side // 2 for side in image.shape)
+    image, slopes = image[:2 * height, :2 * width], np.empty((height, width), np.float32)
+    for first in range(0, height, _STRIP):
+        slopes[first:first + _STRIP] = _slopes_of_rows(image, first, min(first + _STRIP, height))
+    return slopes
+
+
+def _slopes_of_rows(image: Image, first: int, after: int) -> NDArray[np.float32]:
+    """Slopes of some rows of blocks: what stands for an image meanwhile stays in the cache."""
+    # With the rows that are next to them, and those that these take their slopes from.
+    start, end = max(first - 1, 0), min(after + 1, len(image) // 2)
+    top = max(2 * start - 1, 0)
+    dx, dy = (slope[2 * start - top:2 * end - top]
+              for slope in cv2.spatialGradient(image[top:2 * end + 1]))
+    xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))[first - start:after - start]
                   for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     trace = xx + yy
     # Not by cv2.magnitude: its last bit depends on where in memory the arrays lie.

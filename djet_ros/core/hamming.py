@@ -89,7 +89,7 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
     inverse = inverses(warp).astype(np.float32)
     ends, of_tests = _ends(tests.tobytes())
     # OpenCV is three times as fast on floating point numbers as on short ones.
-    image, places = smoothed.astype(np.float32), points.astype(np.float32)
+    image, places = smoothed.astype(np.float32, copy=False), points.astype(np.float32)
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
     def look(start: int) -> None:

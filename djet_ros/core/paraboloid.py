@@ -7,7 +7,7 @@ A paraboloid is Q(v) = v^T A' v + 2 v^T b + c with v relative to its centre, in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 from djet_ros.core.types import Array
@@ -108,6 +108,11 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
 def times(A: Array, v: Array) -> Array:
     """Products (N, 2) of matrices (N, 2, 2) and vectors (N, 2)."""
     return np.asarray(np.einsum('nij,nj->ni', A, v))
+
+
+def largest(values: Array) -> Array:
+    """Give the largest absolute value (N,) of each of (N, ...), cheaper than ``max``."""
+    return np.asarray(reduce(np.maximum, np.abs(values).reshape(len(values), -1).T))
 
 
 def inverse_2x2(A: Array) -> Array:

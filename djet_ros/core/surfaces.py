@@ -8,6 +8,7 @@ optimiser does not know which one it is given.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import cv2
@@ -28,6 +29,7 @@ from djet_ros.core.orb_pattern import pattern
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
     indefinite,
+    largest,
     Paraboloids,
     project_to_positive,
 )
@@ -107,14 +109,14 @@ class DescriptorSurface:
         """Fit paraboloids to the surfaces around the whole pixels next to y."""
         if warp is None:
             return self._around_pixels(y)
-        moved = np.abs(self._latest.centres - y).max(1) > _NEAR_ENOUGH
-        warped = np.abs(warp - self._warp).max((1, 2)) > _WARP_STEP
+        moved = largest(self._latest.centres - y) > _NEAR_ENOUGH
+        warped = largest(warp - self._warp) > _WARP_STEP
         usable = self._usable(np.rint(y), _CLOSE // 2)
         # Most matches rest from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         return self._kept(anew, usable, y, self._distances.between_pixels(
-            self._previous, self.x[anew], self._current, y[anew], warp[anew],
+            self._floating, self.x[anew], self._current, y[anew], warp[anew],
             self._contrast_around(y, usable), _CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
@@ -130,6 +132,11 @@ class DescriptorSurface:
         surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
         return self._kept(anew, usable, y, fit_paraboloids(
             surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
+
+    @cached_property
+    def _floating(self) -> NDArray[np.float32]:
+        """Give the previous image (H, W) as places between pixels are read from it."""
+        return self._previous.astype(np.float32)
 
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
         """Measure the contrast where matches are at first, and keep it."""

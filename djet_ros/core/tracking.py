@@ -26,7 +26,7 @@ from djet_ros.core.jet import (
     Residuals,
     robust_scale,
 )
-from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
+from djet_ros.core.paraboloid import constrained_minimum, largest, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
 from djet_ros.core.surfaces import comparable, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
@@ -272,7 +272,7 @@ def _scale(residuals: Array) -> float:
 
 def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:
     """(N,) bool mask of the minima inside the sampled window: the rest is extrapolation."""
-    reach = np.abs(paraboloids.minima() - paraboloids.centres).max(1)
+    reach = largest(paraboloids.minima() - paraboloids.centres)
     return np.asarray(reach <= config.window // 2)
 
 
