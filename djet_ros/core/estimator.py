@@ -210,11 +210,13 @@ class TwoViewEstimator:
 
         # Joint epipolar tracking on the residual surfaces.
         K, x = current.K, surface.x
-        track = self._track(surface, K, y, starts, before, observe, known, timings)
+        # Where the camera goes on as before, it is known at once how patches are seen.
+        ahead = None if starts else before
+        track = self._track(surface, K, y, starts, before, observe, known, ahead, timings)
         if track is None and not starts:  # another basin comes near: all starts, same surfaces
             with _timed(timings, 'starts'):
                 starts = self._starts(K, x, y, before, known)
-            track = self._track(surface, K, y, starts, before, observe, known, timings)
+            track = self._track(surface, K, y, starts, before, observe, known, ahead, timings)
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
@@ -268,12 +270,13 @@ class TwoViewEstimator:
         return ReprojectionSurface(x, y)
 
     def _track(self, surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-               before: Pose | None, observe: Observer | None, known: Known,
+               before: Pose | None, observe: Observer | None, known: Known, ahead: Pose | None,
                timings: dict[str, float]) -> Track | None:
         with _timed(timings, 'jet'):
             if self.config.method == 'five_point':
                 return hold(surface, K, y, starts[0])
-            return track_jointly(surface, K, y, starts, self.config, before, observe, known.turn)
+            return track_jointly(surface, K, y, starts, self.config, before, observe, known.turn,
+                                 ahead)
 
     def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
                 track: Track, before: Pose | None) -> RelativePose:

@@ -115,7 +115,8 @@ Observer = Callable[[Round], None]
 
 def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                   config: EstimatorConfig, prior: Pose | None = None,
-                  observe: Observer | None = None, turn: Turn | None = None) -> Track | None:
+                  observe: Observer | None = None, turn: Turn | None = None,
+                  ahead: Pose | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
@@ -124,9 +125,11 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     motion. Without any starts they are looked for around the prior: None unless one is clearly the
     right one. Where two bodies move, it is the camera's motion, as far as that can be told. None
     where too few matches have a usable surface. observe: is called at the end of each round; turn:
-    a rotation that was measured, which tells basins and bodies apart.
+    a rotation that was measured, which tells basins and bodies apart; ahead: a pose by which
+    patches are seen from the first round on, if one is likely.
     """
-    found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool))
+    found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool),
+                   ahead)
     if found is None:
         return None
     track, begun = found
@@ -155,13 +158,13 @@ class _Begun(NamedTuple):
 
 def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            config: EstimatorConfig, prior: Pose | None, observe: Observer | None,
-           turn: Turn | None, alive: NDArray[np.bool_]) -> tuple[Track, _Begun] | None:
+           turn: Turn | None, alive: NDArray[np.bool_],
+           ahead: Pose | None = None) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     poses, begun = starts, None
-    # Where the camera goes on as before, it is known at once how patches are seen.
-    warp = (None if starts or prior is None or not config.warp_reference
-            else _warps(prior, K, surface.x, y)[0])
+    warp = (None if ahead is None or not config.warp_reference
+            else _warps(ahead, K, surface.x, y)[0])
     rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
