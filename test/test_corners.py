@@ -129,3 +129,11 @@ def test_slopes_do_not_depend_on_where_in_memory_they_are_worked_out():
             seen.add(corner_slopes(noise).tobytes())
             held.append(np.empty(size))
         assert len(seen) == 1
+
+
+@pytest.mark.parametrize('rows', [20, 52, 96])
+def test_slopes_are_the_same_whatever_stands_far_above_them(image, rows):
+    whole, below = corner_slopes(image), corner_slopes(image[2 * rows:])
+    # At a border, slopes are taken from what is mirrored there.
+    assert np.array_equal(whole[rows + 2:], below[2:])
+    assert below[2:].any()

@@ -144,3 +144,21 @@ def test_few_or_no_features_give_few_or_no_matches(pair, ours, theirs):
     too_far = Features(current.points + 1e5, current.octaves, current.angles, current.responses,
                        current.descriptors)
     assert len(match_nearby(previous, too_far, search_radius=100.0)) == 0
+
+
+@pytest.mark.parametrize('reach', [3.0, 17.0, 400.0])
+def test_those_that_are_close_are_found_on_whichever_side_they_are(reach):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-50, 250, (300, 2))  # some are foreseen beyond the image
+    angle = rng.uniform(0, 2 * np.pi, 300)
+    away = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    descriptors = rng.integers(0, 256, (300, 32), np.uint8)
+
+    def at(places):
+        return Features(places, np.zeros(300, np.int32), np.zeros(300, np.float32),
+                        np.ones(300, np.float32), descriptors)
+
+    near, far = (match_close(at(points), at(points + share * reach * away), reach, 0)
+                 for share in (0.999, 1.001))
+    assert np.array_equal(near[np.argsort(near[:, 0])], np.stack([np.arange(300)] * 2, axis=1))
+    assert len(far) == 0

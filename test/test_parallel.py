@@ -42,3 +42,10 @@ def test_two_things_are_under_way_at_once_where_opencv_may_take_two_threads(thre
 def test_an_error_in_either_of_two_things_comes_out(threads: int, bad: int) -> None:
     with pytest.raises(ZeroDivisionError):
         both(lambda: 1 // bad, lambda: 1 // (1 - bad))
+
+
+def test_many_things_within_one_another_wait_for_none_that_was_not_begun(threads: int) -> None:
+    def count(depth: int) -> int:
+        return 1 if depth == 0 else sum(both(lambda: count(depth - 1), lambda: count(depth - 1)))
+
+    assert count(6) == 2**6
