@@ -6,7 +6,9 @@ from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose
+from djet_ros.core.window import TUNING, Window
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
@@ -227,3 +229,37 @@ def test_another_estimator_goes_on_at_the_last_speed(cards):
     drive.go([pose(x=0.16, z=0.12)] * 3)
     drive.odometry.configure(EstimatorConfig(max_features=600), OdometryConfig(), Unmeasured())
     assert lengths(drive.go([pose(x=0.16, z=0.12)] * 2)) == pytest.approx(1, rel=0.05)
+
+
+def test_where_a_landmark_is_seen_does_not_hang_on_where_it_was_expected(cards):
+    drive = Drive(cards)
+    drive.go([pose(x=0.16, z=0.03)] * 4)
+    window = drive.odometry._one_scale._window
+    found = window._landmarks
+    before, seen = found.minima[:, -1].copy(), found.seen[:, -1].copy()
+    focal, R = window._K[0, 0], window._poses.R.copy()
+    for pixels in (-1.0, -0.5, 0.5, 1.0):
+        window._poses.R[-1] = rotation_exp(np.array([0.0, pixels / focal, 0.0])) @ R[-1]
+        found.seen[:, -1] = False
+        window._measure()
+        both = seen & found.seen[:, -1]
+        assert both.sum() > 0.5 * seen.sum()
+        moved = (found.minima[both, -1] - before[both])[:, 0]
+        assert abs(np.median(moved)) < 0.06 * abs(pixels)
+
+
+def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
+    estimator, rng = TwoViewEstimator(ESTIMATOR), np.random.default_rng(2)
+    views = [estimator.view(frame.gray, frame.K) for frame in (
+        cards.frame(0.0, pose(x=x), noise=n) for n, x in enumerate((0, 0.3)))]
+    pair = estimator.estimate(*views)
+    factors = np.exp(rng.normal(0, 0.5, len(pair.x)))
+    wrong = replace(pair, y_opt=pair.x + factors[:, None] * (pair.y_opt - pair.x))
+    window = Window(ESTIMATOR, replace(TUNING, landmarks=40))
+    window.start(views[0])
+    window._append(views[1], wrong, 1.0)
+    window._found(wrong, 1.0)
+    at = {tuple(x): factor for x, factor in zip(pair.x, factors)}
+    chosen = np.log([at[tuple(x)] for x in window._landmarks.found])
+    assert len(chosen) == 40
+    assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)

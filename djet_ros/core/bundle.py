@@ -271,29 +271,30 @@ def eliminate(linear: Linearised, weights: Array, weight: float, frames: int) ->
 
     weights: (M,) of the observations; weight: that of where the landmarks were found.
     """
-    count, rows = len(weights), np.arange(len(weights))[:, None]
-    J = np.zeros((count, 6 * frames, 2))
-    block = np.arange(6)
-    J[rows, 6 * linear.frame[:, None] + block] = linear.by_frame.transpose(0, 2, 1)
-    J[rows, 6 * linear.anchor[:, None] + block] += linear.by_anchor.transpose(0, 2, 1)
-    root = np.sqrt(weights)[:, None]
-    J *= root[:, None]
-    e, own = linear.residuals * root, linear.by_own * root[:, None]
-    flat = J.transpose(0, 2, 1).reshape(-1, 6 * frames)
+    count, n = len(weights), len(linear.off)
+    root = np.sqrt(weights)[:, None, None]
+    by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
+    e, back = linear.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
+    J = np.zeros((count, 2, frames, 6))
+    rows = np.arange(count)
+    J[rows, :, linear.frame], J[rows, :, linear.anchor] = by_frame, by_anchor
+    flat = J.reshape(-1, 6 * frames)
     H, g = flat.T @ flat, flat.T @ e.ravel()
-    seen, first = np.unique(linear.landmark, return_index=True)
-    n = len(linear.off)
-    information = np.tile(np.eye(3) * _TRACE, (n, 1, 1))
-    slopes, coupling = np.zeros((n, 3)), np.zeros((n, 3, 6 * frames))
+    information, slopes = np.tile(np.eye(3) * _TRACE, (n, 1, 1)), np.zeros((n, 3))
     transposed = linear.held.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ linear.held
     slopes[:, 1:] = np.einsum('nij,nj->ni', transposed, linear.off)
+    coupling = np.zeros((n, frames, 3, 6))
     if count:
-        back = own.transpose(0, 2, 1)
-        information[seen] += np.add.reduceat(back @ own, first)
-        slopes[seen] += np.add.reduceat(np.einsum('nij,nj->ni', back, e), first)
-        coupling[seen] = np.add.reduceat(back @ J.transpose(0, 2, 1), first)
+        # Each landmark is seen once by a frame, and has one anchor.
+        coupling[linear.landmark, linear.frame] = back @ by_frame
+        first = np.flatnonzero(np.diff(linear.landmark, prepend=-1))
+        seen, anchor = linear.landmark[first], linear.anchor[first]
+        coupling[seen, anchor] = np.add.reduceat(back @ by_anchor, first)
+        information[seen] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
+        slopes[seen] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
+    coupled = coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)
     variances = np.asarray(np.linalg.inv(information), float)
-    gain = (variances @ coupling).reshape(-1, 6 * frames).T
-    return Reduced(H - gain @ coupling.reshape(-1, 6 * frames), g - gain @ slopes.ravel(),
-                   coupling, variances, slopes)
+    gain = (variances @ coupled).reshape(-1, 6 * frames).T
+    return Reduced(H - gain @ coupled.reshape(-1, 6 * frames), g - gain @ slopes.ravel(),
+                   coupled, variances, slopes)

@@ -49,7 +49,7 @@ _MOST_STRETCH = 2.0
 _NEAR_ENOUGH = 0.05
 
 # Side of the window around a place where the minimum is expected.
-_CLOSE = 3
+CLOSE = 3
 
 # Matches and tests by which the contrast is measured, and how far it may change.
 _MEASURED, _MEASURED_TESTS = 200, 32
@@ -111,13 +111,13 @@ class DescriptorSurface:
             return self._around_pixels(y)
         moved = largest(self._latest.centres - y) > _NEAR_ENOUGH
         warped = largest(warp - self._warp) > _WARP_STEP
-        usable = self._usable(np.rint(y), _CLOSE // 2)
+        usable = self._usable(np.rint(y), CLOSE // 2)
         # Most matches rest from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         return self._kept(anew, usable, y, self._distances.between_pixels(
             self._floating, self.x[anew], self._current, y[anew], warp[anew],
-            self._contrast_around(y, usable), _CLOSE // 2))
+            self._contrast_around(y, usable), CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit them with the references of whole pixels, as the paper does."""
@@ -217,9 +217,18 @@ class DescriptorDistances:
         References are taken between pixels, so that a minimum at y comes to lie on a whole pixel:
         there a paraboloid fits without a bias. warp: (N, 2, 2) how they are seen at y.
         """
+        return self.around(self.shifted(there, x, y, warp, contrast), here, y, radius)
+
+    def shifted(self, there: NDArray[Any], x: Array, y: Array, warp: Array,
+                contrast: float) -> NDArray[Any]:
+        """Descriptors (T, N) next to x whose minima at y come to lie on whole pixels."""
+        back = np.einsum('nij,nj->ni', inverses(warp), y - np.rint(y))
+        return self.reference(there, x - back, contrast, warp)
+
+    def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
+               radius: int) -> Paraboloids:
+        """Fit paraboloids to the distances in an image around y (N, 2), from `shifted` ones."""
         centres = np.rint(y).astype(np.int64)
-        back = np.einsum('nij,nj->ni', inverses(warp), y - centres)
-        references = self.reference(there, x - back, contrast, warp)
         return _unlocked(
             fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))
 

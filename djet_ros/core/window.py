@@ -38,7 +38,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
-from djet_ros.core.surfaces import comparable, DescriptorDistances, with_minimum
+from djet_ros.core.surfaces import CLOSE, comparable, DescriptorDistances, with_minimum
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +59,6 @@ class WindowTuning:
     gone: float = 0.4
     # chosen: side of the cells over which landmarks spread, as a share of that with one in each
     cell: float = 0.75
-    # octaves of depth that count as equally near, when landmarks are chosen: 1 or 4 drift more
-    classes: float = 2.0
     # what a pair's matches add to landmarks, which are some of them, as a share of what they tell
     # of its rotation and direction: 0.1 drifts less than 1 on rendered and real streets
     pair: float = 0.1
@@ -69,8 +67,8 @@ class WindowTuning:
     # robust standard deviations beyond which an observation is false, and where the loss bends
     outlier: float = 4.0
     bend: float = 3.0
-    # pixels; chosen, far below any noise
-    least_scale: float = 0.05
+    # pixels; chosen, below the noise of rendered streets, which is 0.04
+    least_scale: float = 0.02
     # factor on the variances of observations: neighbours and later frames err alike
     inflation: float = 2.0
     # chosen: pixels between a landmark and a match of a pair that are taken for one another
@@ -292,10 +290,8 @@ class Window:
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
         present = projected(self._K, in_frame(self._K, self._poses, here, anchor))
         side = tuning.cell * np.sqrt(self._images[anchor].size / tuning.landmarks)
-        # Near ones tell most. Only coarse classes of depth count: by the noisy depths themselves
-        # the largest errors would be chosen, and each step come out a little shorter.
-        nearest = np.argsort(-np.floor(np.log2(rho) / tuning.classes), kind='stable')
-        x, rho = x[nearest], rho[nearest]
+        # Near ones tell most, but by their own noisy depths those would be chosen that err most,
+        # and each step come out shorter: by 6 % in 300 small pictures, by coarse classes too.
         chosen = _spread(x, present, side, tuning.landmarks - len(here))
         self._landmarks = self._landmarks.joined(Landmarks.at(
             x[chosen], rho[chosen] / length, anchor, len(self._images)))
@@ -310,39 +306,58 @@ class Window:
             expected, self._images[newest].shape, radius)
         # One that neither of the last two frames saw is gone.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
-        for anchor in range(newest):
-            mine = np.flatnonzero(wanted & (landmarks.anchors == anchor))
+        warps = np.empty((len(landmarks), 2, 2))
+        for anchor in np.unique(landmarks.anchors[wanted]):
+            mine = wanted & (landmarks.anchors == anchor)
             turn = self._poses.R[newest] @ self._poses.R[anchor].T
-            warp = patch_warp(self._K, turn, expected[mine], 1 / places[mine, 2])
-            plausible = comparable(warp)
-            mine, warp = mine[plausible], warp[plausible]
-            if len(mine):
-                self._take(mine, self._surfaces(anchor, mine, warp, expected[mine], radius))
+            warps[mine] = patch_warp(self._K, turn, expected[mine], 1 / places[mine, 2])
+        mine = np.argsort(landmarks.anchors, kind='stable')
+        mine = mine[wanted[mine]]
+        mine = mine[comparable(warps[mine])]
+        # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, so
+        # that all would swing about where they were expected; close ones around it do not.
+        mine, fits = self._around(mine, warps[mine], expected[mine], radius)
+        close = fits.minima()
+        good = ~at(self._mask, close) & self._distances.describable(
+            close, self._images[newest].shape, CLOSE // 2)
+        mine = mine[good]
+        self._take(*self._around(mine, warps[mine], close[good], CLOSE // 2))
 
-    def _surfaces(self, anchor: int, mine: NDArray[np.int64], warp: Array, expected: Array,
-                  radius: int) -> Paraboloids:
-        """Paraboloids around expected places in the newest frame, for landmarks of an anchor."""
-        points = self._landmarks.found[mine]
-        contrast = self._distances.contrast(
-            self._images[anchor], np.rint(points).astype(np.int64),
-            self._images[-1], np.rint(expected).astype(np.int64))
-        return with_minimum(self._distances.between_pixels(
-            self._images[anchor], points, self._images[-1], expected, warp, contrast, radius),
-            'drop')[0]
+    def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
+                ) -> tuple[NDArray[np.int64], Paraboloids]:
+        """
+        Sample surfaces of landmarks (M,) around places (M, 2) in the newest frame.
+
+        They come ordered by their anchors, for images are sampled one by one, surfaces at once.
+        Gives those that have a minimum within the window, and their paraboloids.
+        """
+        if not len(mine):
+            return mine, Paraboloids(places, warps, places, places[:, 0], np.empty(0, bool))
+        anchors, here = self._landmarks.anchors[mine], self._images[-1]
+        found, references = self._landmarks.found[mine], []
+        for anchor in np.unique(anchors):
+            some, there = anchors == anchor, self._images[anchor]
+            contrast = self._distances.contrast(
+                there, np.rint(found[some]).astype(np.int64),
+                here, np.rint(places[some]).astype(np.int64))
+            references.append(self._distances.shifted(
+                there, found[some], places[some], warps[some], contrast))
+        fits, _ = with_minimum(self._distances.around(
+            np.concatenate(references, axis=1), here, places, radius), 'drop')
+        inside = np.abs(fits.minima() - places).max(1) <= radius
+        good = fits.usable & inside
+        return mine[good], Paraboloids(*(array[good] for array in vars(fits).values()))
 
     def _take(self, mine: NDArray[np.int64], fits: Paraboloids) -> None:
         """Take the minima of paraboloids as observations, and their curvatures as weights."""
         minima = fits.minima()
-        inside = np.abs(minima - fits.centres).max(1) <= self._config.window // 2
-        good = fits.usable & inside
         # As in any least squares, what the best fit leaves over tells the noise.
-        left = np.maximum(fits.values(minima), 1e-3)[good]
-        spread = inverse_2x2(fits.A[good]) * left[:, None, None]
-        chosen = mine[good]
-        self._landmarks.minima[chosen, -1] = minima[good]
-        self._landmarks.roots[chosen, -1] = np.linalg.cholesky(
+        left = np.maximum(fits.values(minima), 1e-3)
+        spread = inverse_2x2(fits.A) * left[:, None, None]
+        self._landmarks.minima[mine, -1] = minima
+        self._landmarks.roots[mine, -1] = np.linalg.cholesky(
             np.linalg.inv(spread)).transpose(0, 2, 1)
-        self._landmarks.seen[chosen, -1] = True
+        self._landmarks.seen[mine, -1] = True
 
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
