@@ -8,7 +8,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose
-from djet_ros.core.window import TUNING, Window
+from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
@@ -263,3 +263,13 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     chosen = np.log([at[tuple(x)] for x in window._landmarks.found])
     assert len(chosen) == 40
     assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)
+
+
+def test_near_is_told_by_what_is_beyond_a_patch():
+    rng = np.random.default_rng(3)
+    points, values = rng.uniform(0, (600, 180), (300, 2)), rng.normal(size=300)
+    cells = np.floor((points - np.minimum(points.min(0), 0)) / _PATCH)
+    apart = np.abs(cells[:, None] - cells).max(2)
+    expected = [values[mask].mean() if mask.any() else values.mean() for mask in apart == 2]
+    assert _around_patches(points, values) == pytest.approx(expected)
+    assert not len(_around_patches(points[:0], values[:0]))
