@@ -38,8 +38,12 @@ class BasinTuning:
     matches_to_sketch: int = 800
     # chosen: it costs little to refine all starts on so few, and there basins lie closer
     few_matches: int = 400
-    # chosen: directions all round from which basins are looked for then
+    # chosen: directions all round from which basins are looked for then, and around the motion
+    # before
     directions: int = 10
+    # chosen: and by many matches, which lie in a plane or are in doubt less often: RANSAC may miss
+    # the right one where the camera went a hundredth of the distance
+    directions_of_many: int = 20
     # chosen: the cheapest that lie in different basins are refined
     refined_starts: int = 3
     # rad; chosen: poses nearer than this lie in one basin
@@ -101,6 +105,7 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
         starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
                                              _held(turn, scale)), tight, TUNING.turned_starts)
     elif len(problem.blur) > TUNING.few_matches:
+        starts = [*starts, *all_round(starts[0].R, TUNING.directions_of_many)]
         starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
                             TUNING.refined_starts)
     else:
