@@ -245,6 +245,10 @@ def test_the_scale_at_the_end_is_told_over_that_at_the_start():
     assert scale_change(truth, truth) == pytest.approx(1)
     assert scale_change(7 * truth, truth) == pytest.approx(1)
     assert scale_change(grown, truth) == pytest.approx(1.1**0.9, rel=0.005)
+    still = np.where(np.arange(len(truth))[:, None] < len(truth) / 8, truth[0], truth)
+    assert np.isnan(scale_change(still, truth))
+    assert np.isfinite(scale_change(truth, still))  # the way begins later
+    assert np.isnan(scale_change(truth, np.zeros_like(truth)))
 
 
 def test_both_trajectories_have_a_pose_for_each_frame(replayed):

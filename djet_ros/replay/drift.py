@@ -21,6 +21,9 @@ from scipy.spatial.transform import Rotation
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 _EVERY = 10
 
+# Share of the longer way of two below which the other is none.
+_STANDS = 1e-3
+
 
 @dataclass(frozen=True)
 class Drift:
@@ -70,15 +73,17 @@ def scale_change(places: Array, truth: Array) -> float:
     """
     Scale of a path (N, 3) over the last tenth of the true way, over that in the first tenth.
 
-    Lengths of steps are summed up over either; 1 where the path has one scale.
+    Lengths of steps are summed up over either; 1 where the path has one scale, NaN where it
+    stands still on one of them, or the truth all along.
     """
     here, there = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (places, truth))
     way = np.cumsum(there)
     # At least a step each: that in which the first tenth ends, and that in which the last begins.
     first, last = way - there <= 0.1 * way[-1], way >= 0.9 * way[-1]
-    with np.errstate(divide='ignore', invalid='ignore'):
-        return float(here[last].sum() / there[last].sum()
-                     / (here[first].sum() / there[first].sum()))
+    begun, ended = here[first].sum(), here[last].sum()
+    if min(begun, ended) <= _STANDS * max(begun, ended) or not there.any():
+        return float('nan')
+    return float(ended / there[last].sum() / (begun / there[first].sum()))
 
 
 def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
