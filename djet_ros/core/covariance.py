@@ -17,8 +17,8 @@ CELL = 32
 # as a patch's perspective or a haze, is seen by these, each of which errs by itself.
 _LARGE_CELLS = 20
 
-# Pixels; chosen, a fiftieth: what an image's sampling, its lens and its rolling rows are good for.
-_SHIFT = 0.02
+# Pixels; chosen: what an image's sampling, its lens and its rolling rows are good for.
+_SHIFT = 0.015
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -51,9 +51,11 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     The noise is that of the residuals themselves, in whichever of the two images it arose: see
     `_jackknife`. Many small cells tell the shape of the covariance. A few large ones, which hold
     what errs together from one small cell to the next, tell its size: with C of the small and C'
-    of the large, tr(C^-1 C') / 5 is how much larger the variances are on average over the five
-    directions, and 1 where the small cells err each by itself. What no residual shows comes to
-    that: all that is seen in a large cell may be shifted a little.
+    of the large, q = tr(C^-1 C') / 5 is how much larger the variances are on average over the
+    five directions, and 1 where the small cells err each by itself. The image is about as many
+    large cells wide as these are small ones, and what errs together all over it shows in none;
+    its variance is taken to grow by q once more. What no residual shows comes to that: all that
+    is seen in a large cell may be shifted a little.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -74,7 +76,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     correlated = max(1.0, np.trace(np.linalg.solve(noise, large_cells)) / 5)
     pull, = summed_by_cell(places, J * weights, side=max(large, CELL))
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
-    covariance = correlated / flattening**2 * small_cells + shifts @ shifts.T
+    covariance = (correlated / flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
