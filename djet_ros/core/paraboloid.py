@@ -38,6 +38,15 @@ class Paraboloids:
         """Places y* = centre - A'^-1 b (N, 2) where the gradient vanishes."""
         return np.asarray(self.centres - times(inverse_2x2(self.A), self.b))
 
+    def of(self, chosen: NDArray[Any]) -> Paraboloids:
+        """Give those at some places, a mask (N,) bool or indices."""
+        return Paraboloids(self.centres[chosen], self.A[chosen], self.b[chosen], self.c[chosen],
+                           self.usable[chosen])
+
+    def minimum_within(self, radius: float) -> NDArray[np.bool_]:
+        """(N,) bool mask of those whose minimum lies at most so far off, along either axis."""
+        return np.asarray(largest(self.minima() - self.centres) <= radius)
+
     def values(self, y: Array) -> Array:
         """Values (N,) of the paraboloids at pixels y (N, 2)."""
         v = y - self.centres

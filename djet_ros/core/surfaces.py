@@ -8,7 +8,6 @@ optimiser does not know which one it is given.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, Protocol
 
 import cv2
@@ -32,6 +31,7 @@ from djet_ros.core.paraboloid import (
     largest,
     Paraboloids,
     project_to_positive,
+    times,
 )
 from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
@@ -95,11 +95,11 @@ class DescriptorSurface:
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
         self.x, self._config = x, config
         self._distances = DescriptorDistances(config)
-        self._previous, self._current = previous.tested, current.tested
-        self._has_reference = (self._distances.describable(x, self._previous.shape)
+        self._previous, self._current = previous, current.tested
+        self._has_reference = (self._distances.describable(x, previous.tested.shape)
                                & ~at(previous.mask, x))
         self._mask = current.mask
-        self._latest = _no_paraboloids(len(x))
+        self._latest = no_paraboloids(len(x))
         # How the reference of each match was seen last, and how far x is from its pixel.
         self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
@@ -116,7 +116,7 @@ class DescriptorSurface:
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         return self._kept(anew, usable, y, self._distances.between_pixels(
-            self._floating, self.x[anew], self._current, y[anew], warp[anew],
+            self._previous.floating, self.x[anew], self._current, y[anew], warp[anew],
             self._contrast_around(y, usable), CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
@@ -128,21 +128,16 @@ class DescriptorSurface:
         self._warp[anew] = np.eye(2)
         pixels = np.rint(self.x).astype(np.int64)
         references = self._distances.reference(
-            self._previous, pixels[anew], self._contrast_around(centres, usable))
+            self._previous.tested, pixels[anew], self._contrast_around(centres, usable))
         surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
         return self._kept(anew, usable, y, fit_paraboloids(
             surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
-
-    @cached_property
-    def _floating(self) -> NDArray[np.float32]:
-        """Give the previous image (H, W) as places between pixels are read from it."""
-        return self._previous.astype(np.float32)
 
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
         """Measure the contrast where matches are at first, and keep it."""
         if self._contrast is None:
             self._contrast = self._distances.contrast(
-                self._previous, np.rint(self.x[usable]).astype(np.int64), self._current,
+                self._previous.tested, np.rint(self.x[usable]).astype(np.int64), self._current,
                 np.rint(y[usable]).astype(np.int64))
         return self._contrast
 
@@ -222,7 +217,7 @@ class DescriptorDistances:
     def shifted(self, there: NDArray[Any], x: Array, y: Array, warp: Array,
                 contrast: float) -> NDArray[Any]:
         """Descriptors (T, N) next to x whose minima at y come to lie on whole pixels."""
-        back = np.einsum('nij,nj->ni', inverses(warp), y - np.rint(y))
+        back = times(inverses(warp), y - np.rint(y))
         return self.reference(there, x - back, contrast, warp)
 
     def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
@@ -332,10 +327,11 @@ def _unlocked(fitted: Paraboloids) -> Paraboloids:
     """
     seen = fitted.minima() - fitted.centres
     drawn = _LOCKING / (2 * np.pi) * np.sin(2 * np.pi * seen)
-    return replace(fitted, b=fitted.b - np.einsum('nij,nj->ni', fitted.A, drawn))
+    return replace(fitted, b=fitted.b - times(fitted.A, drawn))
 
 
-def _no_paraboloids(n: int) -> Paraboloids:
+def no_paraboloids(n: int) -> Paraboloids:
+    """Give paraboloids of which none is usable."""
     return Paraboloids(np.full((n, 2), np.nan), np.repeat(np.eye(2)[None], n, axis=0),
                        np.zeros((n, 2)), np.zeros(n), np.zeros(n, bool))
 

@@ -26,7 +26,7 @@ from djet_ros.core.jet import (
     Residuals,
     robust_scale,
 )
-from djet_ros.core.paraboloid import constrained_minimum, largest, Paraboloids
+from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
 from djet_ros.core.surfaces import comparable, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
@@ -175,12 +175,13 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive = alive & paraboloids.usable
         voting = alive & plausible & ours & (
-            _minimum_inside(paraboloids, config) | (not config.cull_outside))
+            # The rest is extrapolation.
+            paraboloids.minimum_within(config.window // 2) | (not config.cull_outside))
         if voting.sum() < config.min_matches:
             return None
         # Step 2: global pose optimisation.
         places = surface.x[voting]
-        problem = jet_problem(K, places, _take(paraboloids, voting), TUNING.epipole_blur,
+        problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
         begun = begun or _Begun(problem, places, voting)
         basin = _basin(problem, places, poses, config, prior, turn)
@@ -273,12 +274,6 @@ def _scale(residuals: Array) -> float:
     return max(robust_scale(residuals), LEAST_SCALE)
 
 
-def _minimum_inside(paraboloids: Paraboloids, config: EstimatorConfig) -> NDArray[np.bool_]:
-    """(N,) bool mask of the minima inside the sampled window: the rest is extrapolation."""
-    reach = largest(paraboloids.minima() - paraboloids.centres)
-    return np.asarray(reach <= config.window // 2)
-
-
 def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
     """Places y + v_opt (N, 2) for the paraboloids around their centres."""
     lines = epipolar_lines(F, x)
@@ -306,8 +301,3 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
     return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
-
-
-def _take(paraboloids: Paraboloids, chosen: NDArray[np.bool_]) -> Paraboloids:
-    p = paraboloids
-    return Paraboloids(p.centres[chosen], p.A[chosen], p.b[chosen], p.c[chosen], p.usable[chosen])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,11 @@ class View:
     smoothed: NDArray[np.uint8]
     tested: NDArray[Any]
     mask: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def floating(self) -> NDArray[np.float32]:
+        """Give `tested` as places between pixels are read from it; converted once for all."""
+        return self.tested.astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,13 @@ from djet_ros.core.geometry import (
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
-from djet_ros.core.surfaces import CLOSE, comparable, DescriptorDistances, with_minimum
+from djet_ros.core.surfaces import (
+    CLOSE,
+    comparable,
+    DescriptorDistances,
+    no_paraboloids,
+    with_minimum,
+)
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +136,7 @@ class Window:
 
     def start(self, view: View) -> None:
         """Forget everything; this frame is the first."""
-        self._K, self._images = view.K, [view.tested]
+        self._K, self._images, self._floating = view.K, [view.tested], [view.floating]
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
@@ -259,6 +265,7 @@ class Window:
         self._is_keyframe.append(self.is_new)
         self._has_landmarks.append(False)
         self._images.append(view.tested)
+        self._floating.append(view.floating)
         self._mask = view.mask
         self._landmarks = self._landmarks.with_frame()
 
@@ -322,8 +329,9 @@ class Window:
         mine = np.argsort(landmarks.anchors, kind='stable')
         mine = mine[wanted[mine]]
         mine = mine[comparable(warps[mine])]
-        # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, so
-        # that all would swing about where they were expected; close ones around it do not.
+        # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, as
+        # what undoes the locking is made for close ones: all would swing about where they were
+        # expected. Close ones around it do not.
         mine, fits = self._around(mine, warps[mine], expected[mine], radius)
         close = fits.minima()
         good = ~at(self._mask, close) & self._distances.describable(
@@ -340,7 +348,7 @@ class Window:
         Gives those that have a minimum within the window, and their paraboloids.
         """
         if not len(mine):
-            return mine, Paraboloids(places, warps, places, places[:, 0], np.empty(0, bool))
+            return mine, no_paraboloids(0)
         anchors, here = self._landmarks.anchors[mine], self._images[-1]
         found, references = self._landmarks.found[mine], []
         for anchor in np.unique(anchors):
@@ -349,12 +357,11 @@ class Window:
                 there, np.rint(found[some]).astype(np.int64),
                 here, np.rint(places[some]).astype(np.int64))
             references.append(self._distances.shifted(
-                there, found[some], places[some], warps[some], contrast))
+                self._floating[anchor], found[some], places[some], warps[some], contrast))
         fits, _ = with_minimum(self._distances.around(
             np.concatenate(references, axis=1), here, places, radius), 'drop')
-        inside = np.abs(fits.minima() - places).max(1) <= radius
-        good = fits.usable & inside
-        return mine[good], Paraboloids(*(array[good] for array in vars(fits).values()))
+        good = fits.usable & fits.minimum_within(radius)
+        return mine[good], fits.of(good)
 
     def _take(self, mine: NDArray[np.int64], fits: Paraboloids) -> None:
         """Take the minima of paraboloids as observations, and their curvatures as weights."""
@@ -436,7 +443,8 @@ class Window:
         self._prior = self._prior.without_frame(frame)
         self._landmarks = self._landmarks.without_frame(frame)
         self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
-        lists: tuple[list[Any], ...] = self._images, self._is_keyframe, self._has_landmarks
+        lists: tuple[list[Any], ...] = (
+            self._images, self._floating, self._is_keyframe, self._has_landmarks)
         for things in lists:
             del things[frame]
 
