@@ -129,6 +129,7 @@ def basin_ahead(problem: JetProblem, places: Array, before: Pose,
     Choose among the basins around the motion before: its own, and of directions all round.
 
     A few hundred matches lead to them, and all choose; None where they are not clearly for one.
+    Before that is said, all refine them, for some may have been on the way to one and the same.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
     tight = Loss()
@@ -139,9 +140,18 @@ def basin_ahead(problem: JetProblem, places: Array, before: Pose,
         tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
         if steps:
             basins = _promising(some, found, tight, TUNING.refined_starts)
-    if (preferences(losses_at(problem, basins, tight), places, 0)[1:] < TUNING.clear).any():
-        return None
+    if not _is_clear(problem, places, basins, tight):
+        refined = refine_all(problem, basins, tight, TUNING.steps_to_compare)
+        basins = _promising(problem, refined, tight, TUNING.refined_starts)
+        if not _is_clear(problem, places, basins, tight):
+            return None
     return basin_of(problem, basins[0])
+
+
+def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:
+    """Tell whether matches clearly prefer the first of some basins to the others."""
+    preferred = preferences(losses_at(problem, basins, loss), places, 0)
+    return bool((preferred[1:] >= TUNING.clear).all())
 
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:

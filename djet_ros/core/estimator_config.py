@@ -87,7 +87,7 @@ class EstimatorConfig:
     max_iterations: int = parameter(
         3, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
     epsilon: float = parameter(
-        1e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
+        1e-3, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
         minimum=1e-12, maximum=1.0)
     min_parallax: float = parameter(
         0.5, 'parallax that three quarters of the matches stay below when the direction of '
@@ -107,7 +107,7 @@ _PAPER: dict[str, Any] = {
     'grading': 0.0, 'binary_tests': 256, 'patch_scale': 1.0, 'warp_reference': False,
     'indefinite': 'drop', 'cull_outside': False,
     'weigh_by_fit': False, 'loss': 'none',
-    'step': 'share', 'step_share': 0.3, 'max_iterations': 20,
+    'step': 'share', 'step_share': 0.3, 'max_iterations': 20, 'epsilon': 1e-4,
 }
 
 

@@ -8,6 +8,8 @@ Constrained Tracking").
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 from djet_ros.core.types import Array
 import numpy as np
@@ -65,9 +67,21 @@ def homogeneous(points: Array) -> Array:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
+def inverse_of(K: Array) -> Array:
+    """Inverse (3, 3) of a camera matrix (3, 3): each is asked for some fifty times a frame."""
+    return _inverse(np.asarray(K, float).tobytes())
+
+
+@lru_cache(maxsize=8)
+def _inverse(matrix: bytes) -> Array:
+    inverse = np.asarray(np.linalg.inv(np.frombuffer(matrix).reshape(3, 3)))
+    inverse.setflags(write=False)
+    return inverse
+
+
 def rays(K: Array, points: Array) -> Array:
     """Take pixels (N, 2) to their viewing rays K^-1 x (N, 3), with z = 1."""
-    K_inv = np.linalg.inv(K)
+    K_inv = inverse_of(K)
     return np.asarray(points @ K_inv[:, :2].T + K_inv[:, 2])
 
 
@@ -78,7 +92,7 @@ def essential(R: Array, t: Array) -> Array:
 
 def fundamental(K: Array, R: Array, t: Array) -> Array:
     """Fundamental matrix F = K^-T [t]_x R K^-1, (3, 3)."""
-    K_inv = np.linalg.inv(K)
+    K_inv = inverse_of(K)
     return np.asarray(K_inv.T @ essential(R, t) @ K_inv)
 
 
@@ -176,7 +190,7 @@ def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, the derivative is
     Z_A / Z_B (M_12 - y m_3^T), with M_12 the first two rows of M and m_3 the third.
     """
-    M = K @ R @ np.linalg.inv(K)
+    M = K @ R @ inverse_of(K)
     return np.asarray(growth[:, None, None] * (M[:2, :2] - y[:, :, None] * M[2, :2]))
 
 

@@ -30,6 +30,9 @@ _BLOCK = 2048
 # Points per pass of warped patches, which take up to 512 places in the image each (2 MB).
 _WARPED_BLOCK = 256
 
+# Tests times points below which it takes longer to gather patches than to look where tests do.
+_FEW = 20_000
+
 # Tests per pass over the points at most: enough to spare calls, few enough to stay in the cache.
 _TESTS_AT_ONCE = 16
 
@@ -72,6 +75,10 @@ def intensities(smoothed: NDArray[Any], points: Pixels,
     Raises ValueError where a point is too close to the border for a descriptor.
     """
     require_describable(points, smoothed, 0, tests)
+    if len(points) * len(tests) < _FEW:
+        width, pixels = smoothed.shape[1], np.ravel(smoothed)
+        first, (px, py, qx, qy) = points[:, 1] * width + points[:, 0], tests.T[:, :, None]
+        return pixels.take(py * width + px + first), pixels.take(qy * width + qx + first)
     patches = gather_patches(smoothed, points, reach(tests))
     px, py, qx, qy = tests.T + reach(tests)
     return patches[py, px], patches[qy, qx]

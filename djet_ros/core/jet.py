@@ -15,8 +15,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from djet_ros.core.geometry import essential, rays, rotation_exp, sphere_tangents, unit
-from djet_ros.core.paraboloid import inverse_2x2, median, Paraboloids
+from djet_ros.core.geometry import (
+    essential,
+    inverse_of,
+    rays,
+    rotation_exp,
+    sphere_tangents,
+    unit,
+)
+from djet_ros.core.paraboloid import median, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -123,13 +130,13 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     distance from the epipole, in pixels, within which lines are not trusted; 0 is as printed.
     by_fit: take the variance of a match to be in proportion to what is left at its minimum.
     """
-    minima, S = paraboloids.minima(), inverse_2x2(paraboloids.A)
+    minima, S = paraboloids.minima(), paraboloids.inverses
     spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
     if by_fit and len(S):
         spread *= _left_over(paraboloids, minima)
     widths = np.abs(spread[0] + spread[2]) / 2
     spread /= max(median(widths), 1e-12) if len(S) else 1.0
-    G = np.linalg.inv(K)[:2, :2]
+    G = inverse_of(K)[:2, :2]
     # The entries of G S G^T.
     (a, b), (c, d) = G
     spread = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],

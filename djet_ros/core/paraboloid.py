@@ -7,7 +7,7 @@ A paraboloid is Q(v) = v^T A' v + 2 v^T b + c with v relative to its centre, in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import Any
 
 from djet_ros.core.types import Array
@@ -36,7 +36,17 @@ class Paraboloids:
 
     def minima(self) -> Array:
         """Places y* = centre - A'^-1 b (N, 2) where the gradient vanishes."""
-        return np.asarray(self.centres - times(inverse_2x2(self.A), self.b))
+        return np.asarray(self.centres + self.ways)
+
+    @cached_property
+    def inverses(self) -> Array:
+        """The inverse matrices A'^-1, an array (N, 2, 2)."""
+        return inverse_2x2(self.A)
+
+    @cached_property
+    def ways(self) -> Array:
+        """Give the ways (N, 2) from the centres to the minima."""
+        return -times(self.inverses, self.b)
 
     def of(self, chosen: NDArray[Any]) -> Paraboloids:
         """Give those at some places, a mask (N,) bool or indices."""
@@ -45,7 +55,7 @@ class Paraboloids:
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
         """(N,) bool mask of those whose minimum lies at most so far off, along either axis."""
-        return np.asarray(largest(self.minima() - self.centres) <= radius)
+        return np.asarray(largest(self.ways) <= radius)
 
     def values(self, y: Array) -> Array:
         """Values (N,) of the paraboloids at pixels y (N, 2)."""

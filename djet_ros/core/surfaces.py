@@ -325,8 +325,7 @@ def _unlocked(fitted: Paraboloids) -> Paraboloids:
 
     A first-order inverse of d - k sin(2 pi d) / (2 pi), by which minima lie a share of d off.
     """
-    seen = fitted.minima() - fitted.centres
-    drawn = _LOCKING / (2 * np.pi) * np.sin(2 * np.pi * seen)
+    drawn = _LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.ways)
     return replace(fitted, b=fitted.b - times(fitted.A, drawn))
 
 

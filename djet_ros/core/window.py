@@ -37,7 +37,7 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
-from djet_ros.core.paraboloid import inverse_2x2, Paraboloids
+from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.surfaces import (
     CLOSE,
     comparable,
@@ -368,7 +368,7 @@ class Window:
         minima = fits.minima()
         # As in any least squares, what the best fit leaves over tells the noise.
         left = np.maximum(fits.values(minima), 1e-3)
-        spread = inverse_2x2(fits.A) * left[:, None, None]
+        spread = fits.inverses * left[:, None, None]
         self._landmarks.minima[mine, -1] = minima
         self._landmarks.roots[mine, -1] = np.linalg.cholesky(
             np.linalg.inv(spread)).transpose(0, 2, 1)
