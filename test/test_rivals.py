@@ -129,7 +129,7 @@ def going_on(x: np.ndarray, y: np.ndarray, before: Pose) -> RelativePose:
     residuals = np.random.default_rng(7).normal(0, NOISE, len(x))
     prior = RelativePose(Status.OK, before.R, before.t, residuals=residuals)
     return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
-        uniform_view(), uniform_view(), x, y, prior, goes_on=True)
+        uniform_view(), uniform_view(), x, y, prior, ahead=before)
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
+from djet_ros.core.geometry import fit_rotation
 from djet_ros.core.jet import (
     epipolar_residuals,
     JetProblem,
@@ -15,6 +16,7 @@ from djet_ros.core.jet import (
     robust_scale,
     Solution,
 )
+from djet_ros.core.paraboloid import median
 from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
 from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
 from djet_ros.core.starts import all_round, around, thinned
@@ -86,13 +88,27 @@ class Basin:
     rivals: tuple[Pose, ...] = ()
 
 
+@dataclass(frozen=True)
+class Ahead:
+    """
+    A pose by which the camera likely goes on, its t zeros where the direction is not known.
+
+    others: gives the starts where it may not.
+    """
+
+    pose: Pose
+    others: Callable[[], list[Pose]]
+
+
 def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                config: EstimatorConfig, prior: Pose | None, turn: Turn | None) -> Basin:
+                config: EstimatorConfig, prior: Pose | None, turn: Turn | None,
+                sought: bool = False) -> Basin:
     """
     Choose among starts by what they come to.
 
     places: (N, 2) pixels of the matches; prior: the motion before, which decides where the matches
-    do not; turn: a rotation that was measured, which all of them have to have.
+    do not; turn: a rotation that was measured, which all of them have to have; sought: whether
+    basins were looked for in all directions already, and are among the starts.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
     scale = max(refine_all(some, starts, Loss(), 0).scales().min(), LEAST_SCALE)
@@ -105,7 +121,7 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
         starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
                                              _held(turn, scale)), tight, TUNING.turned_starts)
     elif len(problem.blur) > TUNING.few_matches:
-        starts = [*starts, *all_round(starts[0].R, TUNING.directions_of_many)]
+        starts = [*starts, *all_round(starts[0].R, 0 if sought else TUNING.directions_of_many)]
         starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
                             TUNING.refined_starts)
     else:
@@ -123,35 +139,50 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     return Basin(best, max(scale, LEAST_SCALE), others_move, tuple(basins))
 
 
-def basin_ahead(problem: JetProblem, places: Array, before: Pose,
-                config: EstimatorConfig) -> Basin | None:
+def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
+                config: EstimatorConfig) -> Basin:
     """
     Choose among the basins around the motion before: its own, and of directions all round.
 
-    A few hundred matches lead to them, and all choose; None where they are not clearly for one.
-    Before that is said, all refine them, for some may have been on the way to one and the same.
+    A few hundred matches lead to them, and all choose. Where these are not clearly for one, they
+    are led on, for some may have been on the way to one and the same; where that does not help,
+    they are held against others. Where a turn alone explains the matches, none of that matters.
     """
     some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
     tight = Loss()
-    basins = around(before, TUNING.directions)
+    basins = around(ahead.pose, TUNING.directions)
     for steps in (0, TUNING.steps_to_sketch, TUNING.steps_to_sketch):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), LEAST_SCALE)
         tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
         if steps:
             basins = _promising(some, found, tight, TUNING.refined_starts)
-    if not _is_clear(problem, places, basins, tight):
-        refined = refine_all(problem, basins, tight, TUNING.steps_to_compare)
-        basins = _promising(problem, refined, tight, TUNING.refined_starts)
-        if not _is_clear(problem, places, basins, tight):
-            return None
-    return basin_of(problem, basins[0])
+    if (_is_clear(problem, places, basins, tight)
+            or _mere_turn(problem, config.min_parallax)):
+        return basin_of(problem, basins[0])
+    basins = _promising(some, refine_all(some, basins, tight, TUNING.steps_to_compare), tight,
+                        TUNING.refined_starts)
+    if _is_clear(problem, places, basins, tight):
+        return basin_of(problem, basins[0])
+    before = ahead.pose if ahead.pose.t.any() else None
+    return right_basin(problem, places, [*basins, *ahead.others()], config, before, None,
+                       sought=True)
 
 
 def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:
     """Tell whether matches clearly prefer the first of some basins to the others."""
     preferred = preferences(losses_at(problem, basins, loss), places, 0)
     return bool((preferred[1:] >= TUNING.clear).all())
+
+
+def _mere_turn(problem: JetProblem, parallax: float) -> bool:
+    """Tell whether a turn alone brings three quarters of the matches to within some pixels."""
+    rays_x, rays_y = problem.rays_x.T, problem.rays_y.T
+    turned = rays_x @ fit_rotation(rays_x, rays_y).T
+    off = np.linalg.norm(turned[:, :2] / turned[:, 2:] - rays_y[:, :2], axis=1)
+    # A typical residual surface is of a pixel.
+    pixel = np.sqrt(median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
+    return bool(np.quantile(off, 0.75) < parallax * pixel)
 
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:

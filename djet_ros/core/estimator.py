@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
+from djet_ros.core.basins import Ahead
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -23,7 +24,7 @@ from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.parallel import both
-from djet_ros.core.prediction import foresee, predict, reach_of
+from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
 from djet_ros.core.starts import five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
@@ -125,8 +126,9 @@ class TwoViewEstimator:
         with _timed(timings, 'matching'):
             foreseen = self._match_foreseen(previous, current, prior, known)
         if foreseen is not None and prior is not None:
-            result = self.estimate_matched(previous, current, *foreseen, prior, timings,
-                                           known=known, goes_on=True)
+            x, y, ahead = foreseen
+            result = self.estimate_matched(previous, current, x, y, prior, timings, known=known,
+                                           ahead=ahead)
             if _as_good(result, prior):
                 return replace(result, timings=timings)
         with _timed(timings, 'matching'):
@@ -140,19 +142,30 @@ class TwoViewEstimator:
         return self._match_widely(previous, current, None, Known())
 
     def _match_foreseen(self, previous: View, current: View, prior: RelativePose | None,
-                        known: Known) -> tuple[Array, Array] | None:
+                        known: Known) -> tuple[Array, Array, Pose] | None:
         """
         Match features where the motion before foresees them; None where too few are there.
 
-        Nor where other things move: a gyro is asked to tell these from the world.
+        Nor where other things move: a gyro is asked to tell these from the world. Gives pixels x
+        and y (N, 2), and the motion; where the camera turns otherwise than before, with the turn
+        that the largest features tell.
         """
         if (prior is None or known.turn is not None or self.config.search_radius >= 1
                 or prior.inliers.sum() < _MANY or prior.inliers.mean() < _MOST):
             return None
-        there = previous.features
-        R = prior.R if known.guess is None else known.guess.R
-        foreseen = replace(there, points=foresee(there, current.K, R, prior))
         reach = min(_FORESEEN, self.config.search_radius * max(current.gray.shape))
+        R = prior.R if known.guess is None else known.guess.R
+        matched = self._match_close(previous, current, prior, R, reach)
+        if matched is None:
+            R = likely_rotation(previous.features, current.features, current.K, [R], reach)
+            matched = self._match_close(previous, current, prior, R, reach)
+        return None if matched is None else (*matched, Pose(R, prior.t))
+
+    def _match_close(self, previous: View, current: View, prior: RelativePose, R: Array,
+                     reach: float) -> tuple[Array, Array] | None:
+        """Match features next to where they are seen after a turn R (3, 3) and a way as before."""
+        there = previous.features
+        foreseen = replace(there, points=foresee(there, current.K, R, prior))
         matches = match_close(foreseen, current.features, reach, _SURE_BITS)
         y = current.features.points[matches[:, 1]]
         off = np.linalg.norm(y - foreseen.points[matches[:, 0]], axis=1)
@@ -187,36 +200,32 @@ class TwoViewEstimator:
                          prior: RelativePose | None = None,
                          timings: dict[str, float] | None = None,
                          observe: Observer | None = None,
-                         known: Known | None = None, goes_on: bool = False) -> RelativePose:
+                         known: Known | None = None, ahead: Pose | None = None) -> RelativePose:
         """
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
         timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1;
-        known: as for ``estimate``; goes_on: whether matches were found where the motion before
-        foresees them, so that its basin will do as a start where none other comes near.
+        known: as for ``estimate``; ahead: the motion by which matches were foreseen where they
+        are, so that its basin will do as a start where none other comes near; its t may be zeros.
         """
         known = known or Known()
         timings = {} if timings is None else timings
         if len(x) < self.config.min_matches:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
-        # Starting poses; none where those around the motion before will do.
+        # Starting poses; none where those around the motion ahead will do.
         before = _pose(prior)
-        goes_on = goes_on and before is not None
-        begun = self._begin(previous, current, x, y, before, known, goes_on, timings)
+        begun = self._begin(previous, current, x, y, before, known, ahead is not None, timings)
         if begun is None:
             return RelativePose(Status.DEGENERATE, x=x, y=y)
         starts, surface, y = begun
 
         # Joint epipolar tracking on the residual surfaces.
         K, x = current.K, surface.x
-        # Where the camera goes on as before, it is known at once how patches are seen.
-        ahead = None if starts else before
-        track = self._track(surface, K, y, starts, before, observe, known, ahead, timings)
-        if track is None and not starts:  # another basin comes near: all starts, same surfaces
-            with _timed(timings, 'starts'):
-                starts = self._starts(K, x, y, before, known)
-            track = self._track(surface, K, y, starts, before, observe, known, ahead, timings)
+        # Where it is known how the camera goes on, so is at once how patches are seen.
+        likely = None if starts or ahead is None else Ahead(
+            ahead, lambda: self._starts(K, x, y, before, known))
+        track = self._track(surface, K, y, starts, before, observe, known, likely, timings)
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
 
@@ -270,7 +279,7 @@ class TwoViewEstimator:
         return ReprojectionSurface(x, y)
 
     def _track(self, surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-               before: Pose | None, observe: Observer | None, known: Known, ahead: Pose | None,
+               before: Pose | None, observe: Observer | None, known: Known, ahead: Ahead | None,
                timings: dict[str, float]) -> Track | None:
         with _timed(timings, 'jet'):
             if self.config.method == 'five_point':

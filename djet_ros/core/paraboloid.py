@@ -40,12 +40,12 @@ class Paraboloids:
 
     @cached_property
     def inverses(self) -> Array:
-        """The inverse matrices A'^-1, an array (N, 2, 2)."""
+        """Inverse matrices of all A, (N, 2, 2)."""
         return inverse_2x2(self.A)
 
     @cached_property
     def ways(self) -> Array:
-        """Give the ways (N, 2) from the centres to the minima."""
+        """Ways (N, 2) from the centres to the minima."""
         return -times(self.inverses, self.b)
 
     def of(self, chosen: NDArray[Any]) -> Paraboloids:

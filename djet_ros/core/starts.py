@@ -134,8 +134,13 @@ def all_round(R: Array, count: int) -> list[Pose]:
 
 
 def around(pose: Pose, count: int) -> list[Pose]:
-    """Give a pose, and others of its rotation: straight ahead, and in directions all round."""
-    return [pose, Pose(pose.R, FORWARD), *all_round(pose.R, count)]
+    """
+    Give a pose, and others of its rotation: straight ahead, and in directions all round.
+
+    Without itself, where its t is zeros, as its direction is not known.
+    """
+    itself = [pose] if pose.t.any() else []
+    return [*itself, Pose(pose.R, FORWARD), *all_round(pose.R, count)]
 
 
 def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:

@@ -6,7 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from djet_ros.core.basins import Basin, basin_ahead, basin_of, judged, LEAST_SCALE, right_basin
+from djet_ros.core.basins import (
+    Ahead,
+    Basin,
+    basin_ahead,
+    basin_of,
+    judged,
+    LEAST_SCALE,
+    right_basin,
+)
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
@@ -116,17 +124,17 @@ Observer = Callable[[Round], None]
 def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                   config: EstimatorConfig, prior: Pose | None = None,
                   observe: Observer | None = None, turn: Turn | None = None,
-                  ahead: Pose | None = None) -> Track | None:
+                  ahead: Ahead | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
     y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
     on; of those that the matches do not decide between, the one next to the prior, the previous
-    motion. Without any starts they are looked for around the prior: None unless one is clearly the
-    right one. Where two bodies move, it is the camera's motion, as far as that can be told. None
-    where too few matches have a usable surface. observe: is called at the end of each round; turn:
-    a rotation that was measured, which tells basins and bodies apart; ahead: a pose by which
-    patches are seen from the first round on, if one is likely.
+    motion. Without any starts they are looked for around the pose ahead. Where two bodies move, it
+    is the camera's motion, as far as that can be told. None where too few matches have a usable
+    surface. observe: is called at the end of each round; turn: a rotation that was measured, which
+    tells basins and bodies apart; ahead: if one is likely, a pose by which patches are seen from
+    the first round on.
     """
     found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool),
                    ahead)
@@ -159,12 +167,12 @@ class _Begun(NamedTuple):
 def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            config: EstimatorConfig, prior: Pose | None, observe: Observer | None,
            turn: Turn | None, alive: NDArray[np.bool_],
-           ahead: Pose | None = None) -> tuple[Track, _Begun] | None:
+           ahead: Ahead | None = None) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     poses, begun = starts, None
     warp = (None if ahead is None or not config.warp_reference
-            else _warps(ahead, K, surface.x, y)[0])
+            else _warps(ahead.pose, K, surface.x, y)[0])
     rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
@@ -184,9 +192,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
         begun = begun or _Begun(problem, places, voting)
-        basin = _basin(problem, places, poses, config, prior, turn)
-        if basin is None:
-            return None
+        basin = _basin(problem, places, poses, config, prior, turn, ahead)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
@@ -226,12 +232,12 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
 
 
 def _basin(problem: JetProblem, places: Array, poses: list[Pose], config: EstimatorConfig,
-           prior: Pose | None, turn: Turn | None) -> Basin | None:
-    """Take the right basin of several poses, of those around the prior, or of the only one."""
+           prior: Pose | None, turn: Turn | None, ahead: Ahead | None) -> Basin:
+    """Take the right basin of several poses, of those around one ahead, or of the only one."""
     if len(poses) > 1:
         return right_basin(problem, places, poses, config, prior, turn)
-    if not poses and prior is not None:
-        return basin_ahead(problem, places, prior, config)
+    if not poses and ahead is not None:
+        return basin_ahead(problem, places, ahead, config)
     return basin_of(problem, poses[0])
 
 
