@@ -30,11 +30,12 @@ def rotation_exp(omega: Array) -> Array:
     """Rotation matrices (…, 3, 3) of rotation vectors, (3,) or (N, 3), in radians."""
     if omega.ndim == 1:  # Rodrigues' formula
         return np.asarray(cv2.Rodrigues(omega)[0])
-    angle = np.linalg.norm(omega, axis=1)[:, None, None]
-    turning = skew(omega)
+    # Of no turn at all, the quotients are 1 to the last bit.
+    half = np.maximum(np.sqrt((omega * omega).sum(1)) / 2, 1e-9)[:, None, None]
+    turning, quotient = skew(omega), np.sin(half) / half
     # sin(a) / a and (1 - cos(a)) / a^2
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * turning
-                      + np.sinc(angle / (2 * np.pi))**2 / 2 * (turning @ turning))
+    return np.asarray(np.eye(3) + quotient * np.cos(half) * turning
+                      + quotient**2 / 2 * (turning @ turning))
 
 
 def rotation_log(R: Array) -> Array:

@@ -99,8 +99,11 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
         there = _look(problem, products, R_new, t_new, loss, held)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
-        R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
-            better, there, here)
+        if better.all():
+            R, t, here = R_new, t_new, there
+        elif better.any():
+            R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
+                better, there, here)
     return Sketch(R, t, here.costs, here.r, here.sign)
 
 
@@ -186,10 +189,13 @@ def _slopes(products: Array, R: Array, t: Array, here: _Look,
 def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
     """Damped Gauss-Newton steps (S, 5); none where a start has nothing to go by."""
     diagonal = H.diagonal(axis1=1, axis2=2)
-    usable = np.asarray(np.isfinite(H).all((1, 2)) & diagonal.any(1))
-    ridge = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True)
-    H = np.where(usable[:, None, None], H + ridge[:, :, None] * np.eye(5), np.eye(5))
-    gradient = np.where(usable[:, None], gradient, 0.0)
+    most = diagonal.max(1, keepdims=True)
+    ridge = damping[:, None] * diagonal + 1e-12 * most
+    H = H + ridge[:, :, None] * np.eye(5)
+    if not (np.isfinite(H.sum()) and most.all()):
+        usable = np.asarray(np.isfinite(H).all((1, 2)) & diagonal.any(1))
+        H = np.where(usable[:, None, None], H, np.eye(5))
+        gradient = np.where(usable[:, None], gradient, 0.0)
     return np.asarray(-np.linalg.solve(H, gradient[..., None])[..., 0])
 
 
