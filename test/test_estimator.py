@@ -438,6 +438,33 @@ def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_
     assert len(foreseen.x) > 0.9 * len(estimator.estimate(a, c).x)
 
 
+def test_after_a_jerk_features_are_foreseen_by_the_turn_that_the_largest_tell():
+    scene = make_scene('road', size=(620, 376))
+    estimator = TwoViewEstimator()
+    poses = scene.trajectory(3)
+    poses[2][:3, :3] = poses[2][:3, :3] @ Rotation.from_rotvec([0.03, 0.1, 0.02]).as_matrix()
+    a, b, c = (estimator.view(scene.render(pose, i), scene.K) for i, pose in enumerate(poses))
+    alone = estimator.estimate(b, c)
+    result = estimator.estimate(b, c, estimator.estimate(a, b))
+    assert 'starts' in alone.timings and 'starts' not in result.timings
+    assert len(result.x) > 0.9 * len(alone.x)
+    true = np.linalg.inv(poses[2]) @ poses[1]
+    assert np.degrees(rotation_angle(result.R, true[:3, :3])) < 0.02
+    assert np.degrees(direction_angle(result.t, true[:3, 3])) < 0.3
+
+
+def test_one_mere_turn_after_another_needs_no_starts_and_has_no_rivals():
+    scene = make_scene('rotation', size=(620, 376))
+    estimator = TwoViewEstimator()
+    poses = scene.trajectory(3)
+    a, b, c = (estimator.view(scene.render(pose, i), scene.K) for i, pose in enumerate(poses))
+    result = estimator.estimate(b, c, estimator.estimate(a, b))
+    true = np.linalg.inv(poses[2]) @ poses[1]
+    assert result.status is Status.NO_PARALLAX
+    assert 'starts' not in result.timings and not result.rivals
+    assert np.degrees(rotation_angle(result.R, true[:3, :3])) < 0.01
+
+
 def test_a_prior_helps_or_does_no_harm(pair):
     previous, current, (R, t) = pair
     estimator = TwoViewEstimator()

@@ -10,6 +10,7 @@ from djet_ros.core.hamming import (
     describable,
     descriptor_bits,
     hamming_surfaces,
+    intensities,
     intensities_through,
     match_distances,
     smooth,
@@ -117,6 +118,14 @@ def test_many_points_at_once_are_as_one_at_a_time():
     for k in (0, 2047, 2048, 4095, 4096, 4999):
         alone = hamming_surfaces(bits[:, k:k + 1], image_b, points[k:k + 1], 2)
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
+
+
+def test_few_points_are_tested_as_many_are():
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, 256, (120, 160), np.uint8)
+    points = rng.integers(20, 100, (200, 2))
+    for one, other in zip(intensities(image, points[:9]), intensities(image, points)):
+        assert np.array_equal(one, other[:, :9])
 
 
 def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
