@@ -7,7 +7,13 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, rotation_log
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Common, Length
-from djet_ros.odometry.uncertainty import _ALIKE, _PASSED_ON, PathCovariance
+from djet_ros.odometry.uncertainty import (
+    _ALIKE,
+    _PASSED_ON,
+    compose,
+    in_a_chain,
+    PathCovariance,
+)
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
@@ -130,3 +136,14 @@ def test_the_covariance_that_is_published_is_that_of_its_steps():
         here = here @ pose(x=0.16, z=0.12)
     wandered = [result.common.variances[0] for result in results[1:]]
     assert all(np.diff(wandered) > 0)
+
+
+def test_independent_edges_of_a_graph_are_together_as_unsure_as_the_integrated_pose():
+    ahead, covariance = pose(z=1.0), ROOT @ ROOT
+    path, chain, here = PathCovariance(), np.zeros((6, 6)), np.eye(4)
+    for _ in range(300):
+        path = path.moved_by_pair(here, ahead, covariance)
+        chain = compose(here, chain, ahead, in_a_chain(covariance))
+        here = here @ ahead
+    assert np.linalg.eigvals(np.linalg.solve(chain, path.pose)).real == pytest.approx(
+        np.ones(6), abs=0.1)

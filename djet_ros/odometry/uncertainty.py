@@ -134,6 +134,16 @@ class PathCovariance:
             crossed + np.outer(along, common.variances))
 
 
+def in_a_chain(covariance: Array) -> Array:
+    """
+    Covariance (6, 6) of a pair's motion for a graph, whose edges err independently.
+
+    What neighbours err alike adds up along a chain as if each were that much less sure. Loops
+    close long chains; a few pairs by themselves are surer than that.
+    """
+    return covariance * (1 + 2 * _ALIKE * _PASSED_ON / (1 - _PASSED_ON))
+
+
 def _lever(pose: Array, motion: Array) -> Array:
     """(6, 6) what an error of a pose (4, 4) becomes at the end of the next motion (4, 4)."""
     lever = np.eye(6)

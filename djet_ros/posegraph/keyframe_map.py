@@ -10,7 +10,7 @@ from typing import NamedTuple
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.uncertainty import compose, rotated, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import compose, in_a_chain, rotated, UNKNOWN_MOTION
 from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
@@ -196,8 +196,10 @@ class KeyframeMap:
         """Move the keyframes, at least one, to where the edges want them; see ``optimise``."""
         assert self.newest is not None
         assert self._newest_step is not None
-        edges = tuple(replace(edge, source=edge.source - self.first,
-                              target=edge.target - self.first) for edge in self.edges)
+        edges = tuple(replace(
+            edge, source=edge.source - self.first, target=edge.target - self.first,
+            covariance=in_a_chain(edge.covariance) if edge.kind == 'odometry' else edge.covariance)
+            for edge in self.edges)
         optimised = optimise(PoseGraph(
             np.array([one.stamp_ns for one in self.keyframes]),
             np.array([one.pose for one in self.keyframes]), edges))
