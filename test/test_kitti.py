@@ -37,6 +37,19 @@ def test_real_frames_are_read(kitti):
     assert sequence.K[0, 0] == 721.5377
 
 
+def test_what_rectification_left_of_distortion_is_undone(small_kitti):
+    folder = small_kitti(size=(64, 48))
+    rectified = KittiSequence(folder)
+    with (folder / 'calib.txt').open('a') as calibration:
+        calibration.write('D: 0.2 0 0 0 0\n')
+    sequence = KittiSequence(folder)
+    assert sequence.distortion.tolist() == [0.2, 0, 0, 0, 0]
+    assert (sequence.raw(2) == rectified.image(2)).all()
+    undone = cv2.undistort(rectified.image(2), sequence.K, sequence.distortion)
+    assert (sequence.image(2) == undone)[4:-4, 4:-4].all()
+    assert (sequence.image(2) != rectified.image(2)).any()
+
+
 def test_a_range_of_frames_starts_its_own_poses(small_kitti):
     folder = small_kitti(frames=6)
     whole, part = KittiSequence(folder), KittiSequence(folder, start=2, end=5)

@@ -30,7 +30,8 @@ class KittiSequence(FrameSequence):
     """
     A folder ``.../sequences/NN`` with ``image_0/*.png``, ``calib.txt`` and ``times.txt``.
 
-    The left gray camera (already rectified). Stamps are those of times.txt
+    The left gray camera, already rectified; what that left of distortion may stand in calib.txt,
+    in a row ``D: k1 k2 p1 p2 k3`` as OpenCV has them. Stamps are those of times.txt
     plus STAMP_OFFSET_NS. Rendered sequences may have an ``imu.csv`` as EuRoC has it, and a row
     ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, where it exists, from
     ``../../poses/NN.txt``, and expressed in the first camera of the range start <= i < end.
@@ -44,12 +45,13 @@ class KittiSequence(FrameSequence):
         paths = _image_paths(self.folder)
         chosen = _frame_range(len(paths), start, end, self.folder)
         K = read_camera(self.folder / 'calib.txt')
+        distortion = _distortion(self.folder / 'calib.txt')
         stamps = _stamps(self.folder / 'times.txt', len(paths))[chosen]
         images = ImageFiles(paths[chosen])
         truth = None
         if (file := _poses_file(self.folder, poses)) is not None:
             truth = from_first(_poses(file, len(paths))[chosen])
-        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth,
+        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth, distortion,
                          imu=_imu(self.folder))
 
 
@@ -65,18 +67,33 @@ def read_camera(path: Path) -> Array:
 
 def _calibration(path: Path, name: str, meaning: str) -> tuple[int, Array]:
     """Line and matrix (3, 4) of a row of a calib.txt; DjetError where there is none."""
+    row = _row(path, name, 12)
+    if row is None:
+        raise DjetError(f"{path} has no line '{name}:'; {meaning}")
+    return row[0], np.array(row[1]).reshape(3, 4)
+
+
+def _distortion(path: Path) -> list[float]:
+    """Coefficients of distortion from the row D of a calib.txt; none where there is no row."""
+    row = _row(path, 'D', 5)
+    return [] if row is None else row[1]
+
+
+def _row(path: Path, name: str, count: int) -> tuple[int, list[float]] | None:
+    """Line and numbers of the first row of a name, if there is one; DjetError if it is wrong."""
     rows = [(number, text.partition(':')[2]) for number, text in lines(path)
             if text.partition(':')[0].strip() == name]
     if not rows:
-        raise DjetError(f"{path} has no line '{name}:'; {meaning}")
+        return None
     number, row = rows[0]
     try:
         values = numbers(row)
     except ValueError as error:
         raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
-    if len(values) != 12:
-        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers, 12 belong there')
-    return number, np.array(values).reshape(3, 4)
+    if len(values) != count:
+        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers, {count} belong '
+                        'there')
+    return number, values
 
 
 def _imu(folder: Path) -> ImuTrack | None:
