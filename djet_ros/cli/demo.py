@@ -10,10 +10,9 @@ from typing import Any
 
 from djet_ros.cli import main
 from djet_ros.cli.options import add_output
-from djet_ros.cli.terminal import new_table, spread
+from djet_ros.cli.terminal import console, new_table, spread
 from djet_ros.errors import DjetError
 from djet_ros.replay.results import PLOT, SUMMARY
-from rich.console import Console
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     for method, folder in results.items():
         _djet('replay', bag, '--output', folder, '--method', method, *overwrite)
 
-    Console().print(_comparison({method: json.loads((folder / SUMMARY).read_text())
+    console().print(_comparison({method: json.loads((folder / SUMMARY).read_text())
                                  for method, folder in results.items()}))
     for folder in results.values():
         print(f'plot: {folder / PLOT}')

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.options import add_output, add_topics
-from djet_ros.cli.terminal import new_table, progress_bar, spread
+from djet_ros.cli.terminal import console, new_table, progress_bar, spread
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.sections import Config, OdometryConfig
@@ -18,7 +18,6 @@ from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import BESIDE, open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import PLOT, ResultsFolder
-from rich.console import Console
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -60,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay with a progress bar on stderr, and show what came of it on stdout."""
     outcome = replayed(args, configured(args), args.source, args.output)
     if outcome.summary['frames']:
-        Console().print(_table(outcome.summary))
+        console().print(_table(outcome.summary))
         print(f'results: {args.output}')
         if (args.output / PLOT).exists():
             print(f'plot: {args.output / PLOT}')

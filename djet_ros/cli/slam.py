@@ -8,7 +8,7 @@ from typing import Any
 
 from djet_ros.cli.options import add_output
 from djet_ros.cli.replay import add_replay_options, configured, replayed
-from djet_ros.cli.terminal import new_table, progress_bar
+from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
@@ -23,7 +23,6 @@ from djet_ros.recordings.recording import open_recording, Recording
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.results import SUMMARY as REPLAY_SUMMARY
-from rich.console import Console
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -76,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         source.close()
     summary = write_report(args.output, slam, truth, name, config)
-    Console().print(_table(summary))
+    console().print(_table(summary))
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
 

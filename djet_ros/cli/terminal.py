@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+import os
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -18,6 +19,16 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+
+# Columns of tables that go to a file or to another program, where nothing has to be cut.
+_FILE_WIDTH = 200
+
+
+def console() -> Console:
+    """Give what tables are printed on: as wide as the terminal, or as wide as they are."""
+    found = Console()
+    return found if found.is_terminal or 'COLUMNS' in os.environ else Console(width=_FILE_WIDTH)
 
 
 class _Rate(ProgressColumn):

@@ -19,7 +19,8 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_log, sphere_tangents, unit
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.pairs import has_failed, PairChunk
-from djet_ros.lab.sequences import opened, plain_name
+from djet_ros.lab.scenes.sequence import rendered_scene
+from djet_ros.lab.sequences import Dataset, opened, plain_name
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, TRACKED, VisualOdometry
 from djet_ros.replay.pair_errors import angles_off
@@ -151,11 +152,16 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
     claims = np.degrees(np.sqrt([np.trace(pose.covariance_5[:3, :3]),
                                  np.trace(pose.covariance_5[3:, 3:])]))
     yield Coverage(
-        plain_name(chunk.dataset.folder), chunk.dataset.name, start, previous, current,
+        _scene(chunk.dataset), chunk.dataset.name, start, previous, current,
         pose.status.value, has_failed(rotation, direction, true_motion), rotation, direction,
         float(claims[0]), float(claims[1]),
         normalised_square(pose, true_motion) if np.isfinite(direction) else float('nan'),
         len(pose.x), int(pose.inliers.sum()))
+
+
+def _scene(dataset: Dataset) -> str:
+    """Name what is seen; a recorded corridor is none that was rendered."""
+    return rendered_scene(dataset.folder) or f'{plain_name(dataset.folder)} (recorded)'
 
 
 def normalised_square(pose: RelativePose, true_motion: Array) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.options import add_json_output, check_output, write_json
-from djet_ros.cli.terminal import new_table
+from djet_ros.cli.terminal import console, new_table
 from djet_ros.errors import DjetError
 from djet_ros.lab.bench import bench, QUOTED_POINTS
 from rich.console import Console
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     with Console(stderr=True).status('measuring ...') as status:
         figures = bench(args.source, args.pairs,
                         lambda stage: status.update(f'measuring with {stage} ...'))
-    Console().print(_table(figures))
+    console().print(_table(figures))
     write_json(args.output, figures, lambda plot: draw(figures, plot))
     return 0
 

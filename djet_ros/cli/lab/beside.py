@@ -10,7 +10,7 @@ import json
 
 from djet_ros.cli.lab.pair_runs import recorded
 from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers, split
-from djet_ros.cli.terminal import compact_table
+from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -27,7 +27,6 @@ from djet_ros.lab.beside import (
 from djet_ros.lab.pairs import FAILURE
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 # Pairs that are listed one by one at most.
@@ -81,19 +80,19 @@ def _moments(args: argparse.Namespace, chunks: Sequence[TrialChunk]) -> list[Mom
 
 
 def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:
-    console = Console()
-    console.print(_pairs(rows))
+    out = console()
+    out.print(_pairs(rows))
     print(f'failed: {FAILURE},\n  or a way where there was none; wrong: of those, the ones told '
           'as if they were right; stood: told\n  as no motion; turn and way: errors of rotation '
           'and direction in degrees, mean and worst of what\n  was told; ratio: of the mean, over '
           'that with nothing; black images are not among these pairs')
     if any(np.isfinite(row.dark_off_deg) or row.bias_off for row in rows):
-        console.print(_beyond(rows))
+        out.print(_beyond(rows))
         print('dark: worst turn since it was light, and its squared error over its covariance, 3 '
               'on average if\n  that is true; bias: how far off at the end, as a share of the '
               'true one')
     if wrong := [moment for moment in moments if is_wrong(moment)]:
-        console.print(_list_of(wrong))
+        out.print(_list_of(wrong))
 
 
 def _pairs(rows: Sequence[Row]) -> Table:

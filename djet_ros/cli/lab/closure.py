@@ -9,14 +9,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from djet_ros.cli.options import add_json_output, check_output, split, write_json
-from djet_ros.cli.terminal import new_table, progress_bar
+from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.methods import check_names, TITLES
 from djet_ros.lab.sequences import plain_name, readable_frames
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 # The 5-point method has no covariance of its own worth the name, and no surfaces.
@@ -52,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         with progress_bar('triangles', max(min(args.frames, len(sequence)) - 2, 1)) as progress:
             found = closures(sequence, methods, args.frames, progress)
     summaries = {method: summary(triangles) for method, triangles in found.items()}
-    Console().print(_table(name, summaries))
+    console().print(_table(name, summaries))
     print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '
           'average if true;\noff truth: error of single rotations, median, where there is ground '
           'truth')

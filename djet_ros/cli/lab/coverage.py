@@ -22,7 +22,7 @@ from djet_ros.cli.options import (
     check_workers,
     split,
 )
-from djet_ros.cli.terminal import compact_table, new_table, progress_bar
+from djet_ros.cli.terminal import compact_table, console, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
@@ -43,7 +43,6 @@ from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import RecordStore
 from djet_ros.recordings.outputs import write_whole
-from rich.console import Console
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -144,26 +143,27 @@ def _whole(place: Path) -> bool:
 
 
 def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
-    console = Console()
+    out = console()
     for start in dict.fromkeys(row.start for row in rows):
-        console.print(_shares([row for row in rows if row.start == start],
-                              f'poses inside their own ellipsoids, pairs {start}'))
-    print('given up: with no pose; right: of those, the ones whose best guess was right\n'
+        out.print(_shares([row for row in rows if row.start == start],
+                          f'poses inside their own ellipsoids, pairs {start}'))
+    print('none: pairs given up; right: of those, the ones whose best guess was right\n'
           f'failed: {FAILURE}\n'
           f'sure: of those, the ones that claim better than {SURE_ROTATION:g} and '
           f'{SURE_DIRECTION:g} deg\n'
-          'median: of e^T C^-1 e, over its expectation; bounds of shares are in coverage.json')
+          'NEES: median of e^T C^-1 e, over its expectation; bounds of shares are in '
+          'coverage.json')
     if wrong := [record for record in records if record.wrong_and_sure]:
-        console.print(_list_of(wrong))
+        out.print(_list_of(wrong))
 
 
 def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
-    table = compact_table('', 'pairs', 'OK', 'given up', 'right', 'failed', 'sure', 'median',
-                          *(f'{100 * level:g} %' for level in LEVELS), title=title)
+    table = compact_table('', 'pairs', 'OK', 'none', 'right', 'failed', 'sure', 'NEES',
+                          *(f'{100 * level:g}%' for level in LEVELS), title=title)
     for row in rows:
         table.add_row(row.scene, *map(str, (
             row.pairs, row.told, row.given_up, row.needlessly, row.failed, row.wrong_and_sure)),
-            f'{row.median:.2f}', *(f'{100 * share:.1f}' for share, _, _ in row.inside))
+            f'{row.median:.2f}', *(f'{100 * share:.3g}' for share, _, _ in row.inside))
     return table
 
 

@@ -10,14 +10,13 @@ import json
 
 from djet_ros.cli.lab.pair_runs import recorded
 from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers
-from djet_ros.cli.terminal import compact_table
+from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
 from djet_ros.lab.lengths import go, STRETCHES, Way, WayChunk
 from djet_ros.recordings.outputs import write_whole
 import numpy as np
-from rich.console import Console
 
 DESCRIPTION = """\
 Render streets and go along them by images alone, and once more with the camera's height while the
@@ -74,7 +73,7 @@ def _show(ways: Sequence[Way]) -> None:
                 way.scale_change, way.translation_percent, way.rotation_deg_per_100m,
                 way.step_square, way.turn_square_100, way.pose_square_25, way.pose_square_50,
                 way.pose_square_100, way.hidden_length)))
-    Console().print(table)
+    console().print(table)
     print('scale: of the last tenth over that of the first; t_rel (%) and r_rel (deg per 100 m): '
           'drift;\n  step, turn, pose: squared errors over covariances, median over what it is if '
           'these are true, of a\n  step among its neighbours, of the turn after 100 m, and of '

@@ -13,7 +13,7 @@ import shutil
 from typing import Any
 
 from djet_ros.cli.options import add_frames, add_output, add_workers, check_workers
-from djet_ros.cli.terminal import progress_bar
+from djet_ros.cli.terminal import console, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairRecord
@@ -89,13 +89,13 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
 
 def show(tables: Sequence[ReadableTable], folder: Path) -> None:
     """Print the tables, and where the page is that has them too."""
-    console = Console()
+    out = console()
     for table in tables:
-        _print(console, table)
-    console.print(f'page: {folder / "index.html"}', soft_wrap=True)
+        _print(out, table)
+    out.print(f'page: {folder / "index.html"}', soft_wrap=True)
 
 
-def _print(console: Console, table: ReadableTable) -> None:
+def _print(out: Console, table: ReadableTable) -> None:
     """Print a table section by section; figures that are not ours are dim."""
     for section, lines in groupby(table.lines, lambda line: line.cells[:table.sections]):
         printed = Table(title=', '.join(section), title_justify='left', box=SIMPLE_HEAD,
@@ -107,5 +107,5 @@ def _print(console: Console, table: ReadableTable) -> None:
             cells = [Text(cell, 'bold' if column in line.bold else '')
                      for column, cell in enumerate(line.cells)]
             printed.add_row(*cells[table.sections:], style='dim' if line.foreign else '')
-        console.print(printed)
-    console.print(Text(table.caption, 'italic'))
+        out.print(printed)
+    out.print(Text(table.caption, 'italic'))
