@@ -489,6 +489,19 @@ def test_a_black_frame_is_a_status_and_no_crash(pair, method):
         assert not result.t.any()
 
 
+def test_steps_of_nine_metres_through_leaves_are_found_among_mostly_false_matches(kitti: Path):
+    sequence = KittiSequence(kitti / 'sequences/03', start=280, end=301)
+    estimator = TwoViewEstimator()
+    views = [estimator.view(sequence.image(i), sequence.K) for i in (0, 10, 20)]
+    for (i, there), (j, here) in pairwise(zip((0, 10, 20), views)):
+        result = estimator.estimate(there, here)
+        true_motion = np.linalg.inv(sequence.poses[j]) @ sequence.poses[i]
+        assert result.status is Status.OK
+        assert result.inliers.mean() < 0.25
+        assert np.degrees(rotation_angle(result.R, true_motion[:3, :3])) < 0.2
+        assert np.degrees(direction_angle(result.t, true_motion[:3, 3])) < 2
+
+
 # Real frames.
 
 @pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])

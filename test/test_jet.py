@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
 from djet_ros.core.jet import (
+    core_scale,
     epipolar_residuals,
     jet_problem,
     Loss,
@@ -273,6 +274,15 @@ def test_the_robust_scale_is_the_standard_deviation_of_the_inliers():
     assert robust_scale(residuals) == pytest.approx(0.7, rel=0.02)
     residuals[:5000] = 1e6
     assert robust_scale(residuals) == pytest.approx(0.7, rel=0.1)
+
+
+def test_the_core_scale_is_that_of_the_right_matches_where_most_are_false():
+    rng = np.random.default_rng(13)
+    right = rng.normal(0, 0.1, 10_000)
+    false = rng.uniform(-20, 20, 15_000)
+    assert core_scale(np.concatenate([right, false])) == pytest.approx(0.1, rel=0.05)
+    assert core_scale(right) == pytest.approx(0.1, rel=0.05)
+    assert core_scale(np.full(30, 2.0)) == pytest.approx(robust_scale(np.full(30, 2.0)))
 
 
 def test_matches_that_determine_nothing_leave_the_pose_finite():

@@ -7,14 +7,23 @@ import json
 from pathlib import Path
 
 from djet_ros.cli.main import main
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import rotation_angle
+from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Status
 from djet_ros.lab.beside import GYRO, is_wrong, MASK, Moment, NOTHING, trial_rows
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import (
+    camera_motion,
+    OdometryResult,
+    TRACKED,
+    VisualOdometry,
+)
+from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 import pytest
 
@@ -33,6 +42,26 @@ def test_every_pair_of_the_whip_turns_by_fifteen_degrees_and_goes_on() -> None:
     ways = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert min(turns) > 14 and max(turns) < 16
     assert ways.min() > 0.01
+
+
+def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None:
+    scene, frame = make_scene('whip', 105), 37
+    poses, estimator = scene.trajectory(61), TwoViewEstimator()
+    before, previous, current = (
+        estimator.view(scene.render(poses[i], i), scene.K) for i in range(frame - 2, frame + 1))
+    prior = estimator.estimate(before, previous, known=felt_turn(poses[frame - 2:frame]))
+    relative = estimator.estimate(
+        previous, current, prior, felt_turn(poses[frame - 1:frame + 1]))
+    true_motion = np.linalg.inv(poses[frame - 1]) @ poses[frame]
+    rotation, direction = angles_off(camera_motion(relative), true_motion)
+    assert relative.status is Status.OK
+    assert rotation < 0.1 and direction < 2
+
+
+def felt_turn(poses: Array) -> Known:
+    """Give the turn between two poses (2, 4, 4) as a gyro tells it, to a hundredth of a degree."""
+    R = poses[1, :3, :3].T @ poses[0, :3, :3]
+    return Known(Turn(R, np.radians(0.01)**2 * np.eye(3)))
 
 
 def test_traffic_passes_before_a_camera_that_stands() -> None:

@@ -9,11 +9,11 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
 from djet_ros.core.jet import (
+    core_scale,
     epipolar_residuals,
     JetProblem,
     Loss,
     minimise,
-    robust_scale,
     Solution,
 )
 from djet_ros.core.paraboloid import median
@@ -62,10 +62,6 @@ class BasinTuning:
     agreeing: float = 3.0
     # chosen: basins that are left to themselves to see whether they turn away
     turned_starts: int = 5
-    # chosen: rounds in which residuals that do not belong together are left out, and from how many
-    # robust standard deviations on
-    core_rounds: int = 8
-    core: float = 2.5
     # standard deviations by which matches prefer the basin ahead to all others: one wrong of three
     # millions
     clear: float = 5.0
@@ -134,8 +130,8 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     basins = _promising(problem, refined, tight, TUNING.refined_starts, possible)
     best = basins.pop(_likeliest(losses_at(problem, basins, tight), places, basins, prior))
     # All matches are placed equally well, whatever they move with.
-    scale = (min(map(_core_scale, refined.r)) if others_move
-             else robust_scale(epipolar_residuals(problem, best.R, best.t).r))
+    scale = (min(map(core_scale, refined.r)) if others_move
+             else core_scale(epipolar_residuals(problem, best.R, best.t).r))
     return Basin(best, max(scale, LEAST_SCALE), others_move, tuple(basins))
 
 
@@ -187,7 +183,7 @@ def _mere_turn(problem: JetProblem, parallax: float) -> bool:
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:
     """Give the basin of a pose that has no rival."""
-    scale = robust_scale(epipolar_residuals(problem, pose.R, pose.t).r)
+    scale = core_scale(epipolar_residuals(problem, pose.R, pose.t).r)
     return Basin(pose, max(scale, LEAST_SCALE))
 
 
@@ -218,14 +214,6 @@ def _likeliest(losses: Array, places: Array, poses: list[Pose], prior: Pose | No
         return best
     undecided = preferences(losses, places, best) < DECIDED
     return min(np.flatnonzero(undecided).tolist(), key=lambda number: apart(prior, poses[number]))
-
-
-def _core_scale(residuals: Array) -> float:
-    """Give the standard deviation of the residuals that belong together, which may be few."""
-    scale = robust_scale(residuals)
-    for _ in range(TUNING.core_rounds):
-        scale = robust_scale(residuals[np.abs(residuals) < TUNING.core * scale])
-    return scale
 
 
 def _turned_so(turn: Turn, sketch: Sketch) -> NDArray[np.bool_]:

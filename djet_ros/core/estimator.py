@@ -12,6 +12,7 @@ from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb, match_close, match_everywhere, match_nearby
+from djet_ros.core.fusion import agrees
 from djet_ros.core.geometry import (
     epipolar_lines,
     facing,
@@ -26,7 +27,7 @@ from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.parallel import both
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
-from djet_ros.core.starts import five_point, Known, known_starts, starting_poses
+from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorDistances,
     DescriptorSurface,
@@ -65,6 +66,9 @@ _NOISIER, _LEAST_NOISE = 1.5, 0.1
 # chosen: share of the matches that agree in a rigid world; .6 was the least seen there, with the
 # preset fast, and .2 to .6 before a lorry.
 _MOST = 0.55
+
+# chosen: directions all round under a measured rotation, where the usual starts lead away from it.
+_DIRECTIONS = 20
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -231,7 +235,19 @@ class TwoViewEstimator:
 
         # What is to be believed of it.
         with _timed(timings, 'result'):
-            return self._result(previous, current, surface, y, track, before)
+            result = self._result(previous, current, surface, y, track, before)
+        if known.turn is None or agrees(known.turn, result):
+            return result
+
+        # A wrong basin of the camera's own motion has fewer inliers; another body may have more.
+        starts = all_round(known.turn.R, _DIRECTIONS)
+        track = self._track(surface, K, y, starts, before, observe, known, None, timings)
+        if track is None:
+            return result
+        with _timed(timings, 'result'):
+            turned = self._result(previous, current, surface, y, track, before)
+        more = turned.inliers.sum() > result.inliers.sum()
+        return turned if more and agrees(known.turn, turned) else result
 
     def _begin(self, previous: View, current: View, x: Array, y: Array, before: Pose | None,
                known: Known, goes_on: bool, timings: dict[str, float]

@@ -33,6 +33,10 @@ _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good 
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
 
+# Robust standard deviations beyond which residuals do not belong together; chosen: rounds in which
+# these are left out.
+_CORE, _CORE_ROUNDS = 2.5, 8
+
 # What is left over at a minimum is noise itself: a match has at least this share of the usual.
 _LEAST_LEFT = 0.25
 
@@ -215,6 +219,22 @@ def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Arra
 def robust_scale(residuals: Array) -> float:
     """Give the standard deviation of the inliers, from the median absolute residual."""
     return 1.4826 * median(np.abs(residuals)) if len(residuals) else 1.0
+
+
+def core_scale(residuals: Array) -> float:
+    """
+    Give the standard deviation of the residuals that belong together, which may be few.
+
+    The median tells it where most are right. Over wide baselines most matches are false, and far
+    from their epipolar lines; they are left out round by round.
+    """
+    scale = robust_scale(residuals)
+    for _ in range(_CORE_ROUNDS):
+        belonging = np.abs(residuals) < _CORE * scale
+        if belonging.all():
+            break
+        scale = robust_scale(residuals[belonging])
+    return scale
 
 
 def _evaluate(problem: JetProblem, R: Array, t: Array,

@@ -26,13 +26,13 @@ from djet_ros.core.geometry import (
     values_on,
 )
 from djet_ros.core.jet import (
+    core_scale,
     epipolar_residuals,
     jet_problem,
     JetProblem,
     Loss,
     minimise,
     Residuals,
-    robust_scale,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
@@ -277,7 +277,7 @@ def _told_apart(second: SecondMotion, prior: Pose | None, turn: Turn | None) -> 
 
 
 def _scale(residuals: Array) -> float:
-    return max(robust_scale(residuals), LEAST_SCALE)
+    return max(core_scale(residuals), LEAST_SCALE)
 
 
 def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
