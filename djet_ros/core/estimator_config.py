@@ -87,7 +87,7 @@ class EstimatorConfig:
     max_iterations: int = parameter(
         3, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
     epsilon: float = parameter(
-        1e-3, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
+        3e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
         minimum=1e-12, maximum=1.0)
     min_parallax: float = parameter(
         0.5, 'parallax that three quarters of the matches stay below when the direction of '
