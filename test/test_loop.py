@@ -10,12 +10,12 @@ import subprocess
 import sys
 
 from djet_ros.config.flat import from_flat
-from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.scale import GroundTruthScale
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.recording import open_recording
+from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
 import pytest
 from ros_messages import message_type

@@ -26,6 +26,7 @@ from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
+from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
@@ -207,6 +208,19 @@ def test_the_summary_holds_counts_and_errors(replayed):
     for name, limit in (('rotation_error_deg', 0.5), ('translation_error_deg', 10)):
         assert set(said[name]) == {'mean', 'median', 'p95', 'max'}
         assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
+
+
+def test_positions_are_held_against_the_true_ones_in_the_best_unit(replayed, folder):
+    results, _ = replayed
+    said = summary(results)
+    truth = KittiSequence(folder).poses[:, :3, 3]
+    _, estimate = read_tum(results / 'trajectory_tum.txt')
+    metric = said['scale_kind'] == 'metric'
+    assert said['positions']['rmse_m'] == pytest.approx(
+        position_rmse(aligned(estimate[:, :3, 3], truth, metric), truth), rel=1e-3)
+    assert said['positions']['way_m'] == pytest.approx(
+        np.linalg.norm(np.diff(truth, axis=0), axis=1).sum())
+    assert said['positions']['rmse_m'] < 0.02 * said['positions']['way_m']
 
 
 @pytest.mark.slow

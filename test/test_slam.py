@@ -16,7 +16,6 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import compose
@@ -26,6 +25,7 @@ from djet_ros.posegraph.places import PlaceIndex
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.trajectories import read_tum
+from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
 import pytest
 

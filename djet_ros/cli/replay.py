@@ -112,6 +112,9 @@ def _table(summary: dict[str, Any]) -> Table:
         table.add_row('error in degrees', 'mean / median / p95 / max')
         table.add_row('  rotation', spread(summary['rotation_error_deg']))
         table.add_row('  direction of translation', spread(summary['translation_error_deg']))
+    if positions := summary.get('positions'):
+        table.add_row('positions, rmse after alignment',
+                      f"{positions['rmse_m']:.3f} m on {positions['way_m']:.1f} m")
     if drift := summary.get('drift'):
         table.add_row('drift over 100 m and more', f"{drift['segments']} segments, "
                       f"to {drift['longest']} m")

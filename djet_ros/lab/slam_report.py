@@ -13,13 +13,13 @@ from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.lab.alignment import aligned, position_rmse
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.posegraph.graph_files import write_graph
 from djet_ros.posegraph.offline import PARAMETERS, Slam, travelled
 from djet_ros.recordings.outputs import write_whole
+from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
 
 PLOT = 'slam.png'

@@ -25,6 +25,7 @@ from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
+from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, one_factor, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
@@ -218,6 +219,7 @@ class Replay:
                 rotation_error_deg=statistics(errors.rotation_deg),
                 translation_error_deg=statistics(errors.translation_deg))
             summary['drift'] = log.drift(truth)
+            summary['positions'] = log.positions(truth)
             self._folder.add_errors(pairs, errors)
         if len(log.steps) > 1:
             self._plot(truth)
@@ -242,6 +244,10 @@ class Replay:
         positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
             if known.size else None
         plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], positions, title, unit)
+
+
+# So few places can be moved onto any others.
+_LEAST_PLACES = 4
 
 
 @dataclass
@@ -277,6 +283,21 @@ class _Log:
             return {**asdict(found), 'translation_percent': None, 'scale_change': None}
         change = scale_change(poses[:, :3, 3], truth[known][:, :3, 3])
         return {**asdict(found), 'scale_change': change if np.isfinite(change) else None}
+
+    def positions(self, truth: Array) -> dict[str, float] | None:
+        """
+        Root mean square error of positions, in metres, and the length of the true way.
+
+        After the path was moved onto the true one (N, 4, 4), its scale free too unless it is in
+        metres; None where lengths mean nothing.
+        """
+        known = np.isfinite(truth).all(axis=(1, 2))
+        if self.scale is Scale.UNKNOWN or known.sum() < _LEAST_PLACES:
+            return None
+        way = truth[known, :3, 3]
+        places = np.array([step.pose[:3, 3] for step in self.steps])[known]
+        return {'rmse_m': position_rmse(aligned(places, way, self.scale is Scale.METRIC), way),
+                'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())}
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
