@@ -11,7 +11,7 @@ from djet_ros.core.basins import Ahead
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.features import detect_orb, match_close, match_everywhere, match_nearby
+from djet_ros.core.features import detect_orb
 from djet_ros.core.fusion import agrees
 from djet_ros.core.geometry import (
     epipolar_lines,
@@ -24,8 +24,8 @@ from djet_ros.core.geometry import (
 from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
+from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
 from djet_ros.core.parallel import both
-from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
@@ -45,34 +45,15 @@ from scipy.special import ndtr
 # 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
 _CHANCE_BITS = 112
 
-# Share of the inliers of the pair before that near matches have to come to.
-_ENOUGH = 0.8
-
-# Pixels around where the motion before foresees them in which features are sought first (19 of 20
-# lie there, on streets and in the hand), and bits in which the sure ones differ at most: others
-# differ by some 100, the best of ten.
-_FORESEEN, _SURE_BITS = 24.0, 64
-
-# Share of the matches that have to be within half of that.
-_NEARLY_ALL = 0.9
-
-# chosen: fewer matches than these leave a choice of motions, so that all are sought widely.
-_MANY = 200
-
 # chosen: by as much the distances of matches from their epipolar lines may grow from one pair to
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
-
-# chosen: share of the matches that agree in a rigid world; .6 was the least seen there, with the
-# preset fast, and .2 to .6 before a lorry.
-_MOST = 0.55
 
 # chosen: directions all round under a measured rotation, where the usual starts lead away from it.
 _DIRECTIONS = 20
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
-
 
 # Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
 _SURPRISING = 20.5
@@ -128,77 +109,22 @@ class TwoViewEstimator:
         """
         known, timings = known or Known(), dict[str, float]()
         with _timed(timings, 'matching'):
-            foreseen = self._match_foreseen(previous, current, prior, known)
+            foreseen = match_foreseen(previous, current, prior, known, self.config.search_radius)
         if foreseen is not None and prior is not None:
-            x, y, ahead = foreseen
+            (x, y), ahead = foreseen
             result = self.estimate_matched(previous, current, x, y, prior, timings, known=known,
                                            ahead=ahead)
             if _as_good(result, prior):
                 return replace(result, timings=timings)
         with _timed(timings, 'matching'):
-            x, y = self._match_widely(previous, current, prior, known)
+            x, y = match_widely(previous, current, prior, known, self.config.search_radius)
         return replace(
             self.estimate_matched(previous, current, x, y, prior, timings, known=known),
             timings=timings)
 
-    def match(self, previous: View, current: View) -> tuple[Array, Array]:
+    def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
-        return self._match_widely(previous, current, None, Known())
-
-    def _match_foreseen(self, previous: View, current: View, prior: RelativePose | None,
-                        known: Known) -> tuple[Array, Array, Pose] | None:
-        """
-        Match features where the motion before foresees them; None where too few are there.
-
-        Nor where other things move: a gyro is asked to tell these from the world. Gives pixels x
-        and y (N, 2), and the motion; where the camera turns otherwise than before, with the turn
-        that the largest features tell.
-        """
-        if (prior is None or known.turn is not None or self.config.search_radius >= 1
-                or prior.inliers.sum() < _MANY or prior.inliers.mean() < _MOST):
-            return None
-        reach = min(_FORESEEN, self.config.search_radius * max(current.gray.shape))
-        R = prior.R if known.guess is None else known.guess.R
-        matched = self._match_close(previous, current, prior, R, reach)
-        if matched is None:
-            R = likely_rotation(previous.features, current.features, current.K, [R], reach)
-            matched = self._match_close(previous, current, prior, R, reach)
-        return None if matched is None else (*matched, Pose(R, prior.t))
-
-    def _match_close(self, previous: View, current: View, prior: RelativePose, R: Array,
-                     reach: float) -> tuple[Array, Array] | None:
-        """Match features next to where they are seen after a turn R (3, 3) and a way as before."""
-        there = previous.features
-        foreseen = replace(there, points=foresee(there, current.K, R, prior))
-        matches = match_close(foreseen, current.features, reach, _SURE_BITS)
-        y = current.features.points[matches[:, 1]]
-        off = np.linalg.norm(y - foreseen.points[matches[:, 0]], axis=1)
-        # Where many are far off, as after a step twice as long, others are farther than the reach.
-        if (len(matches) < max(_ENOUGH * prior.inliers.sum(), _MANY)
-                or np.quantile(off, _NEARLY_ALL) > reach / 2):
-            return None
-        return there.points[matches[:, 0]], y
-
-    def _match_widely(self, previous: View, current: View, prior: RelativePose | None,
-                      known: Known) -> tuple[Array, Array]:
-        """Match features that lie near where a turn alone would bring them, or anywhere."""
-        there, here = previous.features, current.features
-        matches = (match_everywhere(there, here) if self.config.search_radius >= 1
-                   else self._match_turned(there, here, current, prior, known))
-        return there.points[matches[:, 0]], here.points[matches[:, 1]]
-
-    def _match_turned(self, there: Features, here: Features, current: View,
-                      prior: RelativePose | None, known: Known) -> NDArray[np.int64]:
-        radius = self.config.search_radius * max(current.gray.shape)
-        rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
-        turned = replace(there, points=predict(
-            there, here, current.K, rotations, radius, sure=known.turn is not None))
-        # As far as the motion before took them; and widely, where that finds too few.
-        near = reach_of(prior, current.K) if prior is not None else radius
-        matches = match_nearby(turned, here, min(near, radius))
-        if prior is not None and near < radius and len(matches) < _ENOUGH * prior.inliers.sum():
-            matches = match_nearby(turned, here, radius)
-        return matches
+        return match_widely(previous, current, None, Known(), self.config.search_radius)
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None,
@@ -359,7 +285,7 @@ def _as_good(result: RelativePose, prior: RelativePose) -> bool:
     noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
     return (result.status in (Status.OK, Status.NO_PARALLAX)
             and robust_scale(result.residuals) < _NOISIER * noise
-            and result.inliers.mean() > _MOST)
+            and result.inliers.mean() > RIGID)
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
