@@ -58,6 +58,17 @@ def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None
     assert rotation < 0.1 and direction < 2
 
 
+def test_of_two_bodies_that_may_turn_as_was_measured_each_is_led_to_its_end() -> None:
+    scene, frame, estimator = make_scene('moving_object', 58), 12, TwoViewEstimator()
+    poses = scene.trajectory(41)[frame - 1:frame + 1]
+    views = [estimator.view(scene.render(pose, frame - 1 + i), scene.K)
+             for i, pose in enumerate(poses)]
+    relative = estimator.estimate(*views, known=felt_turn(poses))
+    rotation, direction = angles_off(camera_motion(relative), np.linalg.inv(poses[0]) @ poses[1])
+    assert relative.status is Status.OK
+    assert rotation < 0.05 and direction < 1
+
+
 def felt_turn(poses: Array) -> Known:
     """Give the turn between two poses (2, 4, 4) as a gyro tells it, to a hundredth of a degree."""
     R = poses[1, :3, :3].T @ poses[0, :3, :3]

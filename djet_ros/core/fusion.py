@@ -35,11 +35,17 @@ class Turn:
         """Rotation vectors (…, 3) from the left that take R, (3, 3) or (N, 3, 3), to this."""
         return rotation_log(self.R @ R.swapaxes(-1, -2))
 
+    def may_be(self, R: Array) -> bool:
+        """Tell whether no rotation (3, 3) is a thousand times likelier than this one."""
+        return bool(self._square(R) <= _DECIDED)
+
     def prefers(self, R: Array, other: Array) -> bool:
         """Tell whether this decides for one rotation (3, 3), found in images, and against one."""
-        allowed = self.covariance + _SLACK**2 * np.eye(3)
-        one, other = (z @ np.linalg.solve(allowed, z) for z in (self.off(R), self.off(other)))
-        return bool(other - one > _DECIDED)
+        return bool(self._square(other) - self._square(R) > _DECIDED)
+
+    def _square(self, R: Array) -> float:
+        z = self.off(R)
+        return float(z @ np.linalg.solve(self.covariance + _SLACK**2 * np.eye(3), z))
 
 
 def agrees(turn: Turn, relative: RelativePose) -> bool:

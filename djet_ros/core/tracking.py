@@ -143,6 +143,12 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     track, begun = found
     if len(starts) == 1:
         return track
+    if turn is not None and not turn.may_be(track.pose.R):
+        for rival in begun.rivals:
+            led = _track(surface, K, y, [rival], config, prior, observe, None,
+                         np.ones(len(y), bool))
+            if led is not None and turn.prefers(led[0].pose.R, track.pose.R):
+                track = led[0]
     second = second_motion(begun.problem, begun.places, track.pose, track.scale(),
                            config.min_matches)
     if second is None:
@@ -157,11 +163,16 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
 
 
 class _Begun(NamedTuple):
-    """The first round: its problem, the pixels (M, 2) of its matches, and (N,) bool which."""
+    """
+    The first round: its problem, the pixels (M, 2) of its matches, and (N,) bool which.
+
+    rivals: the poses of other basins.
+    """
 
     problem: JetProblem
     places: Array
     voting: NDArray[np.bool_]
+    rivals: tuple[Pose, ...]
 
 
 def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
@@ -191,8 +202,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         places = surface.x[voting]
         problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
-        begun = begun or _Begun(problem, places, voting)
         basin = _basin(problem, places, poses, config, prior, turn, ahead)
+        begun = begun or _Begun(problem, places, voting, basin.rivals)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
