@@ -96,8 +96,8 @@ def test_what_was_written_before_a_kill_is_readable(drive, tmp_path, seed):
     poses, rows, delivered = read_back(results)
     assert poses >= lines
     assert abs(rows - poses) <= 1
-    # The bag holds back the newest stamp alone.
-    assert delivered >= poses - 1
+    # The bag holds back the newest stamp, and a kill may fall between two files.
+    assert delivered >= poses - 2
     told = json.loads((results / 'summary.json').read_text())
     assert told['complete'] is False
     before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
