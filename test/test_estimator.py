@@ -447,7 +447,7 @@ def test_after_a_jerk_features_are_foreseen_by_the_turn_that_the_largest_tell():
     alone = estimator.estimate(b, c)
     result = estimator.estimate(b, c, estimator.estimate(a, b))
     assert 'starts' in alone.timings and 'starts' not in result.timings
-    assert len(result.x) > 0.9 * len(alone.x)
+    assert len(result.x) > 0.8 * len(alone.x)  # as many as are asked for
     true = np.linalg.inv(poses[2]) @ poses[1]
     assert np.degrees(rotation_angle(result.R, true[:3, :3])) < 0.02
     assert np.degrees(direction_angle(result.t, true[:3, 3])) < 0.3
