@@ -332,22 +332,20 @@ class Window:
         # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, as
         # what undoes the locking is made for close ones: all would swing about where they were
         # expected. Close ones around it do not.
-        contrasts = dict[int, float]()
-        mine, fits = self._around(mine, warps[mine], expected[mine], radius, contrasts)
+        mine, fits = self._around(mine, warps[mine], expected[mine], radius)
         close = fits.minima()
         good = ~at(self._mask, close) & self._distances.describable(
             close, self._images[newest].shape, CLOSE // 2)
         mine = mine[good]
-        self._take(*self._around(mine, warps[mine], close[good], CLOSE // 2, contrasts))
+        self._take(*self._around(mine, warps[mine], close[good], CLOSE // 2))
 
-    def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int,
-                contrasts: dict[int, float]) -> tuple[NDArray[np.int64], Paraboloids]:
+    def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
+                ) -> tuple[NDArray[np.int64], Paraboloids]:
         """
         Sample surfaces of landmarks (M,) around places (M, 2) in the newest frame.
 
         They come ordered by their anchors, for images are sampled one by one, surfaces at once.
-        Gives those that have a minimum within the window, and their paraboloids. contrasts: those
-        of the newest frame over anchors, where they are known already; the others are put there.
+        Gives those that have a minimum within the window, and their paraboloids.
         """
         if not len(mine):
             return mine, no_paraboloids(0)
@@ -355,13 +353,12 @@ class Window:
         found, references = self._landmarks.found[mine], []
         for anchor in np.unique(anchors).tolist():
             some, there = anchors == anchor, self._images[anchor]
-            if anchor not in contrasts:
-                contrasts[anchor] = self._distances.contrast(
-                    there, np.rint(found[some]).astype(np.int64),
-                    here, np.rint(places[some]).astype(np.int64))
+            # Of where they are sampled: that of where they were expected would bend the scale.
+            contrast = self._distances.contrast(
+                there, np.rint(found[some]).astype(np.int64),
+                here, np.rint(places[some]).astype(np.int64))
             references.append(self._distances.shifted(
-                self._floating[anchor], found[some], places[some], warps[some],
-                contrasts[anchor]))
+                self._floating[anchor], found[some], places[some], warps[some], contrast))
         fits, _ = with_minimum(self._distances.around(
             np.concatenate(references, axis=1), here, places, radius), 'drop')
         good = fits.usable & fits.minimum_within(radius)
