@@ -7,7 +7,7 @@ from djet_ros.core.features import detect_orb, match_close, match_everywhere, ma
 from djet_ros.core.types import Features
 import numpy as np
 import pytest
-from two_view import textured
+from two_view import some, textured
 
 SIZE = (320, 240)
 
@@ -19,12 +19,6 @@ def pair():
     turned = cv2.warpAffine(image, cv2.getRotationMatrix2D((160, 120), 4, 1.02), SIZE,
                             borderMode=cv2.BORDER_REFLECT)
     return detect_orb(image, 700), detect_orb(cv2.convertScaleAbs(turned, alpha=1.1), 700)
-
-
-def some(features, chosen):
-    """Give some of the features, by index or slice."""
-    return Features(features.points[chosen], features.octaves[chosen], features.angles[chosen],
-                    features.responses[chosen], features.descriptors[chosen])
 
 
 def distances(previous, current):

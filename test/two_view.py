@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import unit
-from djet_ros.core.types import View
+from djet_ros.core.types import Features, View
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -76,6 +76,12 @@ def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
         box = [(round(v), round(v + e)) for v, e in zip(corner, extent)]
         image[slice(*box[1]), slice(*box[0])] += rng.uniform(-60, 60)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def some(features: Features, chosen: np.ndarray | slice) -> Features:
+    """Give some of the features, by index or slice."""
+    return Features(features.points[chosen], features.octaves[chosen], features.angles[chosen],
+                    features.responses[chosen], features.descriptors[chosen])
 
 
 def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-from djet_ros.core.basins import Ahead
+from djet_ros.core.basins import Ahead, TUNING as BASIN_TUNING
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -48,9 +48,6 @@ _CHANCE_BITS = 112
 # chosen: by as much the distances of matches from their epipolar lines may grow from one pair to
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
-
-# chosen: directions all round under a measured rotation, where the usual starts lead away from it.
-_DIRECTIONS = 20
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
@@ -166,7 +163,7 @@ class TwoViewEstimator:
             return result
 
         # A wrong basin of the camera's own motion has fewer inliers; another body may have more.
-        starts = all_round(known.turn.R, _DIRECTIONS)
+        starts = all_round(known.turn.R, BASIN_TUNING.directions_of_many)
         track = self._track(surface, K, y, starts, before, observe, known, None, timings)
         if track is None:
             return result

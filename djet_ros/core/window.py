@@ -351,7 +351,7 @@ class Window:
             return mine, no_paraboloids(0)
         anchors, here = self._landmarks.anchors[mine], self._images[-1]
         found, references = self._landmarks.found[mine], []
-        for anchor in np.unique(anchors).tolist():
+        for anchor in np.unique(anchors):
             some, there = anchors == anchor, self._images[anchor]
             # Of where they are sampled: that of where they were expected would bend the scale.
             contrast = self._distances.contrast(
