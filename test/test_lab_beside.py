@@ -147,6 +147,13 @@ def test_with_a_gyro_a_camera_stands_while_lorries_fill_most_of_the_picture() ->
         assert rotation_angle(result.pose[:3, :3], np.eye(3)) < np.radians(0.1)
 
 
+@pytest.mark.parametrize('seed', [105, 106])
+def test_a_camera_stands_for_what_stood_before_it_while_lorries_hide_nearly_all(seed: int) -> None:
+    scene = make_scene('traffic', seed)
+    results = gone(scene, scene.trajectory(10), seed)
+    assert all(result.stationary for result in results[1:])
+
+
 def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
     scene = make_scene('traffic', 70, (620, 188))
     results = gone(scene, scene.trajectory(16), 70, first=22)

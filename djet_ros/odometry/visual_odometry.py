@@ -14,6 +14,7 @@ from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
 from djet_ros.odometry.scale import Common, Length, Scale, scale_source, ScaleSource
+from djet_ros.odometry.standstill import Standstill
 from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.uncertainty import (
     motion_covariance,
@@ -32,14 +33,6 @@ UNDECIDED = (Status.AMBIGUOUS, Status.TWO_MOTIONS)
 
 # Statuses of a frame at which the odometry started or restarted, without a pair.
 STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
-
-# Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
-# that are where they were if the camera stands in front of traffic; chosen: and if it has stood
-# before, as most do where they begin.
-_CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
-
-# Times the displacement of what stands still up to which something hardly moves.
-_HARDLY = 3
 
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4
@@ -149,7 +142,7 @@ class VisualOdometry:
         self._one_scale.reset()
         self._prior: RelativePose | None = None
         self._bad_pairs = self._since_ns = self._known_ns = 0
-        self._stood = True
+        self._standstill = Standstill()
         self._pose, self._path = np.eye(4), PathCovariance()
 
     def process(self, frame: Frame) -> OdometryResult:
@@ -190,7 +183,8 @@ class VisualOdometry:
         self._pose, self._path = result.pose, path
         self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
-        self._prior, self._bad_pairs, self._stood = relative, 0, False
+        self._prior, self._bad_pairs = relative, 0
+        self._standstill.moved()
         return result
 
     def _by_depths(self, relative: RelativePose) -> RelativePose:
@@ -243,42 +237,15 @@ class VisualOdometry:
         It stood, and something that fills the image moves. Whatever drives, flies or is held
         turns a little as it starts; on a rail it may not, and is believed in the end.
         """
-        if (relative.status is Status.OK and self._stood and self._gyro is not None
+        if (relative.status is Status.OK and self._standstill.stood and self._gyro is not None
                 and frame.stamp_ns - self._known_ns < _NOT_FELT_NS
                 and self._gyro.at_rest(self._since_ns, frame.stamp_ns)):
             return replace(relative, status=Status.AMBIGUOUS)
         return relative
 
     def _stands_still(self, frame: Frame, relative: RelativePose) -> bool:
-        return self._nothing_moved(relative) or self._only_others_moved(frame, relative)
-
-    def _only_others_moved(self, frame: Frame, relative: RelativePose) -> bool:
-        """
-        Tell traffic from a motion of the camera: the gyro felt nothing, and much did not move.
-
-        A part of the matches all over the image has to be where it was; a smaller one will do for
-        a camera that stood before. To one that moves, some things hardly move and more of them
-        move a little; before one that stands, things move or do not. Slow motion does not pass for
-        standstill for long, as the reference frame stays and displacements add up.
-        """
-        if self._gyro is None or not len(relative.x) or not self._gyro.at_rest(
-                self._since_ns, frame.stamp_ns):
-            return False
-        shift = np.linalg.norm(relative.y - relative.x, axis=1) / self._config.standstill
-        still, hardly = shift < 1, (shift >= 1) & (shift < _HARDLY)
-        cells = np.floor_divide(relative.x, _CELL)
-        spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
-        least = _STILL_AS_BEFORE if self._stood else _STILL
-        return bool(still.mean() > least and spread > least and still.sum() > hardly.sum())
-
-    def _nothing_moved(self, relative: RelativePose) -> bool:
-        # Two equal images are DEGENERATE to most estimators, for want of any residual.
-        if relative.status not in (*TRACKED, Status.DEGENERATE) or not len(relative.x):
-            return False
-        refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
-        y = relative.y_opt if refined else relative.y
-        shift = np.linalg.norm(y - relative.x, axis=1)
-        return float(np.median(shift)) < self._config.standstill
+        at_rest = self._gyro is not None and self._gyro.at_rest(self._since_ns, frame.stamp_ns)
+        return self._standstill.told(relative, self._config.standstill, at_rest)
 
     def _start(self, frame: Frame, view: View, status: Status,
                backwards: bool) -> OdometryResult:
@@ -312,7 +279,8 @@ class VisualOdometry:
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
         """Stand still: no motion, and the reference frame stays."""
-        self._bad_pairs, self._stood = 0, True
+        self._bad_pairs = 0
+        self._standstill.stay(relative, self._config.standstill)
         covariance = standstill_covariance(relative, length)
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
                               self._path.moved(self._pose, np.eye(4), covariance), stationary=True)
@@ -347,6 +315,7 @@ class VisualOdometry:
         self._reference, self._view = frame, view
         self._since_ns = frame.stamp_ns
         self._since_covariance = np.zeros((6, 6))
+        self._standstill.refer()
         self._forget()
 
     def _forget(self) -> None:

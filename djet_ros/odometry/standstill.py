@@ -1,0 +1,117 @@
+"""Whether the camera stands still: where nothing moves, and where only others do."""
+
+from __future__ import annotations
+
+from djet_ros.core.types import Array, RelativePose, Status
+import numpy as np
+from numpy.typing import NDArray
+
+# Statuses of pairs that a camera may have stood still in without any help; two equal images are
+# DEGENERATE to most estimators, for want of any residual.
+_NOTHING_WRONG = (Status.OK, Status.NO_PARALLAX, Status.DEGENERATE)
+
+# Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
+# that are where they were if the camera stands in front of traffic; chosen: and if it has stood
+# before, as most do where they begin.
+_CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
+
+# Times the displacement of what stands still up to which something hardly moves.
+_HARDLY = 3
+
+# chosen: so many features that stood before tell that they still do; false matches of a thousand
+# features end within a third of a pixel of where they began less than once in a hundred pairs.
+_WITNESSES = 10
+
+
+class Standstill:
+    """
+    Remembers of a reference view what stood in it, while the camera did.
+
+    Features are told by their pixels, which are the same in all pairs with one reference.
+    """
+
+    def __init__(self) -> None:
+        self.stood = True
+        self._world = np.empty(0, np.complex128)
+
+    def refer(self) -> None:
+        """Take another reference view, of which nothing is known yet."""
+        self._world = np.empty(0, np.complex128)
+
+    def moved(self) -> None:
+        """Take that the camera moved."""
+        self.stood = False
+
+    def stay(self, relative: RelativePose, most: float) -> None:
+        """Take that the camera stood; most: pixels by which what stands is displaced at most."""
+        self.stood = True
+        features = _named(relative.x)
+        still = _displacements(relative.x, relative.y) < most
+        self._world = np.union1d(np.setdiff1d(self._world, features), features[still])
+
+    def told(self, relative: RelativePose, most: float, at_rest: bool) -> bool:
+        """
+        Tell whether the camera stands still in a pair with the reference view.
+
+        most: as for ``stay``; at_rest: whether a gyro felt nothing.
+        """
+        if not len(relative.x):
+            return False
+        return _nothing_moved(relative, most) or (at_rest and (
+            self._only_others_moved(relative, most) or self._world_stands(relative, most)))
+
+    def _only_others_moved(self, relative: RelativePose, most: float) -> bool:
+        """
+        Tell traffic from a motion of the camera: much did not move.
+
+        A part of the matches all over the image has to be where it was; a smaller one will do for
+        a camera that stood before. To one that moves, some things hardly move and more of them
+        move a little; before one that stands, things move or do not. Slow motion does not pass for
+        standstill for long, as the reference view stays and displacements add up.
+        """
+        still, hardly = _still_and_hardly(relative, most)
+        cells = np.floor_divide(relative.x, _CELL)
+        spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
+        least = _STILL_AS_BEFORE if self.stood else _STILL
+        return bool(still.mean() > least and spread > least and still.sum() > hardly.sum())
+
+    def _world_stands(self, relative: RelativePose, most: float) -> bool:
+        """
+        Tell whether what stood before still does, however little is seen of it behind a lorry.
+
+        What the lorry hides is matched falsely, all over the search area. If it were the camera
+        that moved, all but the furthest of what stood would be displaced a little, or agree with
+        the motion that the pair tells; so more has to be where it was than either.
+        """
+        still, hardly = _still_and_hardly(relative, most)
+        world = np.isin(_named(relative.x), self._world)
+        moved = np.zeros(len(world), bool)
+        if len(relative.inliers):
+            moved = relative.inliers & ~still
+        standing = (world & still).sum()
+        return bool(standing >= _WITNESSES and standing > (world & hardly).sum()
+                    and standing > (world & moved).sum())
+
+
+def _nothing_moved(relative: RelativePose, most: float) -> bool:
+    if relative.status not in _NOTHING_WRONG:
+        return False
+    refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
+    y = relative.y_opt if refined else relative.y
+    return float(np.median(_displacements(relative.x, y))) < most
+
+
+def _still_and_hardly(relative: RelativePose, most: float
+                      ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) bool masks of the matches that are where they were, and that are off by a little."""
+    shift = _displacements(relative.x, relative.y)
+    return shift < most, (shift >= most) & (shift < _HARDLY * most)
+
+
+def _displacements(x: Array, y: Array) -> Array:
+    return np.asarray(np.linalg.norm(y - x, axis=1))
+
+
+def _named(x: Array) -> NDArray[np.complex128]:
+    """Make one number (N,) of each of some pixels (N, 2)."""
+    return np.asarray(x[:, 0] + 1j * x[:, 1], np.complex128)
