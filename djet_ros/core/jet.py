@@ -16,14 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from djet_ros.core.geometry import (
-    essential,
     inverse_of,
     rays,
     rotation_exp,
+    skew,
     sphere_tangents,
-    unit,
 )
-from djet_ros.core.paraboloid import median, Paraboloids
+from djet_ros.core.paraboloid import median, middle, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +32,16 @@ _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good 
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
 
+# chosen: by its weight alone, as if all others were right, a match makes steps too short; by the
+# bend of its loss, too long where many are false. Half way takes three steps of four.
+_LEAST_CURVED = 0.3
+
 # Robust standard deviations beyond which residuals do not belong together; chosen: rounds in which
 # these are left out.
 _CORE, _CORE_ROUNDS = 2.5, 8
+
+# Standard deviation of normal residuals over the median of their absolute values.
+_NORMAL = 1.4826
 
 # What is left over at a minimum is noise itself: a match has at least this share of the usual.
 _LEAST_LEFT = 0.25
@@ -108,7 +114,8 @@ class Loss:
         if self.name == 'cauchy':
             return self.scale**2 * np.log1p(u), 1 / (1 + u)
         if self.name == 'geman_mcclure':
-            return squared / (1 + u), 1 / (1 + u)**2
+            flat = 1 / (1 + u)
+            return squared * flat, flat * flat
         if self.name == 'huber':
             root = np.sqrt(np.maximum(u, 1.0))
             return self.scale**2 * np.where(u <= 1, u, 2 * root - 1), 1 / root
@@ -120,7 +127,8 @@ class Loss:
         if self.name == 'cauchy':
             return (1 - u) / (1 + u)**2
         if self.name == 'geman_mcclure':
-            return (1 - 3 * u) / (1 + u)**3
+            flat = 1 / (1 + u)
+            return (1 - 3 * u) * flat * flat * flat
         return np.where(u <= 1, 1.0, 0.0) if self.name == 'huber' else np.ones_like(squared)
 
 
@@ -163,37 +171,39 @@ def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:
 
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     """Residuals at the pose (R, t) with their analytic Jacobian over 3 + 2 parameters."""
-    m = R @ problem.rays_x
-    l1, l2, l3 = essential(R, t) @ problem.rays_x
-    y1, y2, y3 = problem.rays_y
-    s11, s12, s22 = problem.spread
-    e = y1 * l1 + y2 * l2 + y3 * l3
-    Ml1, Ml2 = s11 * l1 + s12 * l2, s12 * l1 + s22 * l2
-    variance = l1 * Ml1 + l2 * Ml2  # g^T A'^-1 g
-    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
-    root, pull = np.sqrt(size), e * np.sign(variance) / size
-    # dr = w^T dl, with dl = t x (omega x m) for the rotation and dt x m for the translation.
-    w = np.array([y1 - pull * Ml1, y2 - pull * Ml2, y3]) / root
-    w1, w2, w3 = w
-    by_rotation = (t @ m) * w - (w * m).sum(0) * t[:, None]
-    m1, m2, m3 = m
-    moment = np.array([m2 * w3 - m3 * w2, m3 * w1 - m1 * w3, m1 * w2 - m2 * w1])
     tangents = sphere_tangents(t)
-    return Residuals(e / root, np.where(variance < 0, -1.0, 1.0),
-                     np.concatenate([by_rotation, tangents.T @ moment]), tangents)
+    # Of t, and of the two directions in which it moves.
+    E, *by_direction = skew(np.vstack([t, tangents.T])) @ R
+    x, y, spread = problem.rays_x, problem.rays_y, problem.spread
+    lines = E @ x
+    e = (y * lines).sum(0)
+    # The first two components of the lines, times the covariances of their points.
+    M = spread[:2] * lines[0] + spread[1:] * lines[1]
+    variance = lines[0] * M[0] + lines[1] * M[1]  # g^T A'^-1 g
+    sign = np.where(variance < 0, -1.0, 1.0)
+    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
+    root = np.sqrt(size)
+    # dr = w^T dE x, with the variance's own change in w.
+    w = y.copy()
+    w[:2] -= e * sign / size * M
+    w /= root
+    # [t]_x [e_i]_x R = e_i (R^T t)^T - t_i R
+    slopes = np.concatenate([np.eye(3)[:, :, None] * (t @ R) - t[:, None, None] * R, by_direction])
+    jacobian = slopes.reshape(5, 9) @ (w[:, None] * x).reshape(9, -1)
+    return Residuals(e / root, sign, jacobian, tangents)
 
 
 def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
              max_steps: int = _MAX_STEPS) -> Solution:
     """
-    Minimise the summed loss from a starting pose by Levenberg-Marquardt, iteratively reweighted.
+    Minimise the summed loss from a starting pose by Levenberg-Marquardt steps.
 
     Never ends above the cost of the start. t must have unit length.
     """
     residuals, (cost, weights) = _evaluate(problem, R, t, loss)
     damping = 1e-4
     for _ in range(max_steps):
-        step = _step(residuals, weights, damping)
+        step = _step(residuals, weights, loss, damping)
         if step is None:
             break
         R_new, t_new = moved(R, t, residuals.tangents, step)
@@ -213,12 +223,22 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
 
 def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
     """Move a pose by a step (5,): rotation vector in rad from the left, then along the sphere."""
-    return rotation_exp(step[:3]) @ R, unit(t + tangents @ step[3:])
+    t = t + tangents @ step[3:]  # not shorter than before
+    return rotation_exp(step[:3]) @ R, t / np.sqrt(t @ t)
 
 
 def robust_scale(residuals: Array) -> float:
     """Give the standard deviation of the inliers, from the median absolute residual."""
-    return 1.4826 * median(np.abs(residuals)) if len(residuals) else 1.0
+    return _NORMAL * median(np.abs(residuals)) if len(residuals) else 1.0
+
+
+def robust_scales(residuals: Array) -> Array:
+    """Give the same (S,) of each row of (S, N)."""
+    half, odd = divmod(residuals.shape[1], 2)
+    if not half:
+        return np.array([robust_scale(row) for row in residuals])
+    middle = np.partition(np.abs(residuals), (half - 1, half), axis=1)[:, half - 1:half + 1]
+    return _NORMAL * (middle[:, 1] if odd else (middle[:, 0] + middle[:, 1]) / 2)
 
 
 def core_scale(residuals: Array) -> float:
@@ -228,12 +248,14 @@ def core_scale(residuals: Array) -> float:
     The median tells it where most are right. Over wide baselines most matches are false, and far
     from their epipolar lines; they are left out round by round.
     """
-    scale = robust_scale(residuals)
-    for _ in range(_CORE_ROUNDS):
-        belonging = np.abs(residuals) < _CORE * scale
-        if belonging.all():
+    # Of ordered ones, those that belong together come first.
+    ordered = np.sort(np.abs(residuals))
+    count = len(ordered)
+    for _ in range(1 + _CORE_ROUNDS):
+        scale = _NORMAL * middle(ordered[:count]) if count else 1.0
+        before, count = count, int(ordered.searchsorted(_CORE * scale))
+        if count == before:
             break
-        scale = robust_scale(residuals[belonging])
     return scale
 
 
@@ -244,13 +266,17 @@ def _evaluate(problem: JetProblem, R: Array, t: Array,
     return residuals, (float((residuals.sign * values).sum()), weights)
 
 
-def _step(residuals: Residuals, weights: Array, damping: float) -> Array | None:
-    """Damped Gauss-Newton step; indefinite surfaces pull with their sign, but curve upwards."""
-    J = residuals.jacobian
-    H = (J * weights) @ J.T
-    gradient = J @ (weights * residuals.sign * residuals.r)
-    diagonal = np.diag(H)
+def _step(residuals: Residuals, weights: Array, loss: Loss, damping: float) -> Array | None:
+    """
+    Damped Newton step; indefinite surfaces pull with their sign, but curve upwards.
+
+    A match curves as much as its robust loss does, or as a share of what its weight makes it.
+    """
+    J, r = residuals.jacobian, residuals.r
+    H = (J * np.maximum(loss.curvature(r * r), _LEAST_CURVED * weights)) @ J.T
+    gradient = J @ (weights * residuals.sign * r)
+    diagonal = H.diagonal()
     if not np.isfinite(H).all() or not diagonal.any():
         return None
-    H = H + np.diag(damping * diagonal + 1e-12 * diagonal.max())
+    H.ravel()[::6] += damping * diagonal + 1e-12 * diagonal.max()
     return np.asarray(-np.linalg.solve(H, gradient))

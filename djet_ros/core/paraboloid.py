@@ -92,10 +92,15 @@ def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Par
 def median(values: Array) -> float:
     """Median of (N,) values, at a third of the price of ``np.median``."""
     half = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, half)[half])
-    parts = np.partition(values, (half - 1, half))
-    return float(parts[half - 1] + parts[half]) / 2
+    return middle(np.partition(values, half if len(values) % 2 else (half - 1, half)))
+
+
+def middle(ordered: Array) -> float:
+    """Median of (N,) values that are ordered, at least at their middle."""
+    half = len(ordered) // 2
+    if len(ordered) % 2:
+        return float(ordered[half])
+    return float(ordered[half - 1] + ordered[half]) / 2
 
 
 def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from djet_ros.core.geometry import (
     sphere_tangents,
     unit,
 )
-from djet_ros.core.jet import JetProblem, Loss, robust_scale
+from djet_ros.core.jet import JetProblem, Loss, robust_scales
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ class Sketch:
 
     def scales(self) -> Array:
         """Give the robust standard deviations (S,) of the residuals."""
-        return np.array([robust_scale(r) for r in self.r])
+        return robust_scales(self.r)
 
 
 @dataclass(frozen=True)
