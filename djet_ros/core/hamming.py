@@ -160,12 +160,17 @@ def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels
     sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
     # As many at once as can be summed in the type of the differences.
     at_once = min(_TESTS_AT_ONCE, np.iinfo(f'u{reference.itemsize}').max // most)
-    for start in range(0, len(centres), _BLOCK):
-        block = slice(start, start + _BLOCK)
+
+    def sum_up(start: int) -> None:
+        block = slice(start, start + size)
         patches = gather_patches(image, centres[block], reach(tests) + radius)
         # What a mask has chosen comes points first, which is three times slower to compare.
         chosen = np.ascontiguousarray(reference[:, block])
         sums[:, :, block] = _summed(chosen, patches, radius, tests, outcome, differ, at_once)
+
+    # Half as many in two threads; each call costs something.
+    size = min(_BLOCK, max(1, -(-len(centres) // 2))) if cv2.getNumThreads() > 1 else _BLOCK
+    each(sum_up, range(0, len(centres), size))
     return sums
 
 
