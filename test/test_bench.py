@@ -44,6 +44,12 @@ def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(output)
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
+def test_the_stages_add_up_to_the_time_that_a_pair_takes(output):
+    figures = json.loads(output.read_text())
+    for run in (figures, figures['all_cores']):
+        assert 0.9 < sum(run['stages_ms'].values()) * run['pairs_per_second'] / 1e3 < 1
+
+
 @pytest.mark.slow
 def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output, tmp_path):
     write_kitti_bag(KittiSequence(sequence), tmp_path / 'bag')

@@ -405,6 +405,22 @@ def test_stage_times_add_up_to_the_time_it_took(pair, threads):
     assert 0.8 * took < sum(stages.values()) < took
 
 
+def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
+    scene = make_scene('road', size=(620, 188))
+    estimator = TwoViewEstimator()
+    a, b = (estimator.view(scene.render(pose, i), scene.K)
+            for i, pose in enumerate(scene.trajectory(2)))
+    alone = estimator.estimate(a, b)
+    # A motion ahead that is none, of a camera that flies sideways and looks up.
+    astray = Pose(Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix(), np.array([1.0, 0.0, 0.0]))
+    began = perf_counter()
+    stages: dict[str, float] = {}
+    estimator.estimate_matched(a, b, alone.x, alone.y, timings=stages, ahead=astray)
+    took = perf_counter() - began
+    assert stages['starts'] > 0
+    assert 0.8 * took < sum(stages.values()) < took
+
+
 def test_the_result_tells_the_hamming_distances_at_the_final_places(pair):
     previous, current, _ = pair
     result = TwoViewEstimator().estimate(previous, current)

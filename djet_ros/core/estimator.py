@@ -83,9 +83,10 @@ class TwoViewEstimator:
         """
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
-        if features is None:
-            features = self.features(gray, mask, smoothed)
-        return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
+        found, tested = both(
+            lambda: self.features(gray, mask, smoothed) if features is None else features,
+            lambda: DescriptorDistances(self.config).seen(gray))
+        return View(gray, K, found, smoothed, tested, mask)
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None,
                  smoothed: NDArray[np.uint8] | None = None) -> Features:
@@ -149,9 +150,13 @@ class TwoViewEstimator:
 
         # Joint epipolar tracking on the residual surfaces.
         K, x = current.K, surface.x
+
+        def others() -> list[Pose]:
+            with _timed(timings, 'starts', within='jet'):
+                return self._starts(K, x, y, before, known)
+
         # Where it is known how the camera goes on, so is at once how patches are seen.
-        likely = None if starts or ahead is None else Ahead(
-            ahead, lambda: self._starts(K, x, y, before, known))
+        likely = None if starts or ahead is None else Ahead(ahead, others)
         track = self._track(surface, K, y, starts, before, observe, known, likely, timings)
         if track is None:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
@@ -236,9 +241,9 @@ class TwoViewEstimator:
         sign = facing(R, track.pose.t, rays_x, rays_y)
         t = sign * track.pose.t
 
-        covariances = pose_covariance(
-            track.residuals, track.loss, x[track.voting], t, sign < 0)
-        hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
+        covariances, hamming = both(
+            lambda: pose_covariance(track.residuals, track.loss, x[track.voting], t, sign < 0),
+            lambda: match_distances(previous.smoothed, x, current.smoothed, track.y_opt))
         status = Status.OK
         if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()
                 or _by_chance(hamming[inliers])):
@@ -330,9 +335,13 @@ def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+def _timed(timings: dict[str, float], stage: str, within: str = '') -> Iterator[None]:
+    """Add to the seconds of a stage; of one within another, that other does not have them."""
     start = perf_counter()
     try:
         yield
     finally:
-        timings[stage] = timings.get(stage, 0.0) + perf_counter() - start
+        spent = perf_counter() - start
+        timings[stage] = timings.get(stage, 0.0) + spent
+        if within:
+            timings[within] = timings.get(within, 0.0) - spent

@@ -114,8 +114,10 @@ class _Pipeline:
         self._view = view
 
     def stages_ms(self) -> dict[str, float]:
-        return {stage: 1e3 * float(np.median([t[stage] for t in self._timings if stage in t]))
-                for stage in (self._timings[0] if self._timings else {})}
+        """Means over all pairs, so that stages which some pairs do without add up to the whole."""
+        stages = dict.fromkeys(stage for timings in self._timings for stage in timings)
+        return {stage: 1e3 * float(np.mean([timings.get(stage, 0.0) for timings in self._timings]))
+                for stage in stages}
 
 
 class _PlainChain:

@@ -43,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(figures: dict[str, Any]) -> Table:
     both = (figures, figures['all_cores'])
-    table = new_table(f"{figures['pairs']} pairs, medians", '', 'one thread', 'all cores')
+    title = f"{figures['pairs']} pairs: ratios of medians, mean times"
+    table = new_table(title, '', 'one thread', 'all cores')
     table.add_row('pipeline over OpenCV chain',
                   *(f"{run['pipeline_over_opencv']:.2f}" for run in both))
     table.add_row('the same, preset fast', *(f"{run['fast_over_opencv']:.2f}" for run in both))
