@@ -154,6 +154,23 @@ def test_a_camera_stands_for_what_stood_before_it_while_lorries_hide_nearly_all(
     assert all(result.stationary for result in results[1:])
 
 
+@pytest.mark.parametrize('seed', [102, 106])
+def test_depths_of_a_lorry_do_not_speak_against_the_motion_that_a_gyro_confirms(seed: int) -> None:
+    scene = make_scene('moving_object', seed)
+    poses = scene.trajectory(18)
+    for result, (one, other) in zip(gone(scene, poses, seed)[1:], pairwise(poses), strict=True):
+        assert result.status is Status.OK
+        assert angles_off(result.motion, np.linalg.inv(one) @ other)[1] < 2
+
+
+def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands() -> None:
+    scene = make_scene('road', 31, (620, 188))
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 2, 3] = 0.5 * np.arange(6)
+    results = gone(scene, poses, 31)
+    assert [result.status for result in results[1:]] == [Status.OK] * 5
+
+
 def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
     scene = make_scene('traffic', 70, (620, 188))
     results = gone(scene, scene.trajectory(16), 70, first=22)

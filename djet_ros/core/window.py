@@ -234,11 +234,13 @@ class Window:
             return 0, 0
         in_units, sigma = inverse_depths(pose.R, pose.t, rays(self._K, x[match]),
                                          rays(self._K, y[match]))
-        length = _weighted_median(in_units / known, known / sigma)
+        ratios = in_units / known
+        # By what is near, which tells most but may be another body, or by all alike.
+        lengths = np.array([[_weighted_median(ratios, known / sigma)], [np.median(ratios)]])
         noise = self._tuning.matched / self._K[0, 0] * sigma
-        off = np.abs(in_units - length * known)
-        agree = off < self._tuning.outlier * noise + self._tuning.known * abs(length) * known
-        return int(agree.sum()), len(known)
+        off = np.abs(in_units - lengths * known)
+        agree = off < self._tuning.outlier * noise + self._tuning.known * np.abs(lengths) * known
+        return int(agree.sum(1).max()), len(known)
 
     def _choose_keyframe(self) -> None:
         """Make the newest frame a keyframe where landmarks moved since the last, or are gone."""

@@ -31,7 +31,7 @@ class Standstill:
     """
 
     def __init__(self) -> None:
-        self.stood = True
+        self._stood: bool | None = None
         self._world = np.empty(0, np.complex128)
 
     def refer(self) -> None:
@@ -40,11 +40,22 @@ class Standstill:
 
     def moved(self) -> None:
         """Take that the camera moved."""
-        self.stood = False
+        self._stood = False
+
+    def may_stand(self, relative: RelativePose, most: float) -> bool:
+        """
+        Tell whether a camera that feels nothing is more likely to stand than to have set off.
+
+        Where nobody knows yet whether it stood, some things have to be where they were.
+        """
+        if self._stood is not None:
+            return self._stood
+        still, hardly = _still_and_hardly(relative, most)
+        return bool(still.sum() >= max(_WITNESSES, hardly.sum()))
 
     def stay(self, relative: RelativePose, most: float) -> None:
         """Take that the camera stood; most: pixels by which what stands is displaced at most."""
-        self.stood = True
+        self._stood = True
         features = _named(relative.x)
         still = _displacements(relative.x, relative.y) < most
         self._world = np.union1d(np.setdiff1d(self._world, features), features[still])
@@ -72,7 +83,7 @@ class Standstill:
         still, hardly = _still_and_hardly(relative, most)
         cells = np.floor_divide(relative.x, _CELL)
         spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
-        least = _STILL_AS_BEFORE if self.stood else _STILL
+        least = _STILL if self._stood is False else _STILL_AS_BEFORE
         return bool(still.mean() > least and spread > least and still.sum() > hardly.sum())
 
     def _world_stands(self, relative: RelativePose, most: float) -> bool:

@@ -237,8 +237,9 @@ class VisualOdometry:
         It stood, and something that fills the image moves. Whatever drives, flies or is held
         turns a little as it starts; on a rail it may not, and is believed in the end.
         """
-        if (relative.status is Status.OK and self._standstill.stood and self._gyro is not None
+        if (relative.status is Status.OK and self._gyro is not None
                 and frame.stamp_ns - self._known_ns < _NOT_FELT_NS
+                and self._standstill.may_stand(relative, self._config.standstill)
                 and self._gyro.at_rest(self._since_ns, frame.stamp_ns)):
             return replace(relative, status=Status.AMBIGUOUS)
         return relative
