@@ -2,7 +2,15 @@
 
 from dataclasses import replace
 
-from djet_ros.core.bundle import eliminate, in_frame, Landmarks, linearise, Poses, projected
+from djet_ros.core.bundle import (
+    eliminate,
+    in_frame,
+    Landmarks,
+    linearise,
+    noise_scale,
+    Poses,
+    projected,
+)
 from djet_ros.core.geometry import rotation_exp
 import numpy as np
 import pytest
@@ -135,3 +143,18 @@ def test_noise_of_the_patch_where_a_landmark_was_found_does_not_shorten_steps():
         poses, landmarks = poses.moved(step), landmarks.moved(reduced.change(step))
     found = np.linalg.norm(poses.t[2] - poses.R[2] @ poses.R[1].T @ poses.t[1])
     assert found == pytest.approx(length, rel=3e-3)
+
+
+@pytest.mark.parametrize('frames', [2, 3, 6])
+def test_noise_is_told_whatever_landmarks_make_up_for(frames):
+    rng = np.random.default_rng(15)
+    poses, landmarks = scene(rng, frames, 3000)
+    landmarks = landmarks.of(landmarks.anchors == 0)
+    landmarks.roots[:], landmarks.held[:] = np.eye(2), np.eye(2)
+    landmarks.found = landmarks.found + rng.normal(size=(1500, 2)) * 0.3
+    landmarks.minima += rng.normal(size=landmarks.minima.shape) * 0.3
+    for _ in range(4):
+        linear = linearise(K, poses, landmarks)
+        reduced = eliminate(linear, np.ones(len(linear.residuals)), 1.0, frames)
+        landmarks = landmarks.moved(reduced.change(np.zeros(6 * frames)))
+    assert noise_scale(linearise(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)

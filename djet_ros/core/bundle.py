@@ -245,6 +245,25 @@ def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
         landmarks.held)
 
 
+def noise_scale(linear: Linearised) -> float:
+    """
+    Tell the standard deviation of observations in the unit of their roots, robustly.
+
+    A landmark that m frames saw beside its anchor has 2 m + 2 residuals, and its inverse depth and
+    point make up for three of them: what is left over has the squares of 2 m - 1 degrees of
+    freedom. Without that, landmarks that were just found, which can make up for nearly all, would
+    let the noise seem to be little more than half of what it is, and what errs by no more than
+    usual be taken for false. What poses make up for is neglected. At least one observation.
+    """
+    count = np.bincount(linear.landmark, minlength=len(linear.off))
+    squares = (linear.off**2).sum(1) + np.bincount(
+        linear.landmark, (linear.residuals**2).sum(1), minlength=len(linear.off))
+    seen = count > 0
+    # Wilson and Hilferty's median of the chi-square distribution.
+    freedom = 2 * count[seen] - 1
+    return float(np.sqrt(np.median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
+
+
 @dataclass(frozen=True)
 class Reduced:
     """

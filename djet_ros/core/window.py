@@ -20,6 +20,7 @@ from djet_ros.core.bundle import (
     Landmarks,
     linearise,
     Linearised,
+    noise_scale,
     PosePrior,
     Poses,
     projected,
@@ -67,9 +68,6 @@ class WindowTuning:
     cell: float = 0.75
     # octaves of depth that count as equally near, when landmarks are chosen
     classes: float = 2.0
-    # what a pair's matches add to landmarks, which are some of them, as a share of what they tell
-    # of its rotation and direction: 0.1 drifts less than 1 on rendered and real streets
-    pair: float = 0.1
     # chosen: Gauss-Newton steps for each frame; four come to the same
     steps: int = 2
     # robust standard deviations beyond which an observation is false, and where the loss bends
@@ -77,8 +75,6 @@ class WindowTuning:
     bend: float = 3.0
     # pixels; chosen, below the noise of rendered streets, which is 0.04
     least_scale: float = 0.02
-    # factor on the variances of observations: neighbours and later frames err alike
-    inflation: float = 2.0
     # chosen: pixels between a landmark and a match of a pair that are taken for one another
     beside: float = 1.5
     # pixels; chosen: what a match is off at most, but for false ones; and the share by which the
@@ -101,9 +97,6 @@ _UNIT = 1e8
 
 # Information about the rotation of a pair without parallax, which has no covariance: 1 mrad.
 _ROTATION_ALONE = 1e6
-
-# Median norm of a residual of two numbers, each with a standard deviation of one.
-_MEDIAN_NORM = 1.1774
 
 
 @dataclass(frozen=True)
@@ -284,9 +277,7 @@ class Window:
             information = J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
         else:
             information = J[:3].T @ J[:3] * _ROTATION_ALONE
-        if not first:
-            information *= self._tuning.pair
-        else:
+        if first:
             along = relative.t @ J[3:] / length
             information += _UNIT * np.outer(along, along)
         H = np.zeros_like(self._prior.H)
@@ -408,15 +399,14 @@ class Window:
         """All observations; their scale is told anew."""
         linear = linearise(self._K, self._poses, self._landmarks)
         if len(linear.residuals):
-            typical = float(np.median(np.linalg.norm(linear.residuals, axis=1))) / _MEDIAN_NORM
-            self._scale = max(typical, self._tuning.least_scale)
+            self._scale = max(noise_scale(linear), self._tuning.least_scale)
         return linear
 
     def _reduced(self, linear: Linearised) -> Reduced:
         """Weigh observations robustly, and eliminate the depths."""
         _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
             (linear.residuals**2).sum(1))
-        weight = 1 / (self._scale**2 * self._tuning.inflation)
+        weight = self._scale**-2
         return eliminate(linear, weights * weight, weight, len(self._images))
 
     def _addition(self, H: Array) -> Addition:

@@ -1,0 +1,127 @@
+"""The window on exact numbers: a known way and world, and places that err by a known noise."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from djet_ros.core.bundle import in_frame, projected
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.types import RelativePose, Status
+from djet_ros.core.window import TUNING, Window
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Numbers = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
+WIDTH, HEIGHT = 1200, 360
+
+# Pixels from the border within which nothing is seen, and how sure a pair is, in rad.
+_BORDER, _SURE = 15, 1e-4
+
+
+class Street:
+    """
+    Points (N, 3) beside and on a street, seen from a camera that goes a metre ahead each frame.
+
+    noise: pixels, of each place in each frame.
+    """
+
+    def __init__(self, seed: int, frames: int, noise: float) -> None:
+        self.rng, self.noise = np.random.default_rng(seed), noise
+        count = 14 * (frames + 70)
+        ahead = self.rng.uniform(0, frames + 70, count)
+        road = self.rng.uniform(size=count) < 0.25
+        side = self.rng.uniform(5, 12, count) * self.rng.choice([-1, 1], count)
+        self.points = np.stack([
+            np.where(road, self.rng.uniform(-5, 5, count), side),
+            np.where(road, 1.65, self.rng.uniform(-6, 1.6, count)), ahead], axis=1)
+
+    def seen(self, frame: int) -> tuple[Numbers, NDArray[np.bool_]]:
+        """Noisy places (N, 2) of all points in a frame, and which of them are in sight."""
+        ahead = self.points - [0, 0, frame]
+        near = (ahead[:, 2] > 2) & (ahead[:, 2] < 70)
+        places = projected(K, np.where(near[:, None], ahead, [0.0, 0.0, 1.0]))
+        places += self.rng.normal(size=places.shape) * self.noise
+        return places, near & inside(places)
+
+    def pair(self, frame: int, count: int = 700) -> tuple[NDArray[np.int64], RelativePose]:
+        """Points (M,) that a frame and the next have matched, and what they tell: the truth."""
+        (x, here), (y, there) = self.seen(frame), self.seen(frame + 1)
+        which = self.rng.permutation(np.flatnonzero(here & there))[:count]
+        return which, RelativePose(
+            Status.OK, np.eye(3), np.array([0.0, 0, -1]), np.eye(5) * _SURE**2, x=x[which],
+            y=y[which], y_opt=y[which], inliers=np.ones(len(which), bool))
+
+
+class NumbersWindow(Window):
+    """A window that is told where points are, instead of looking at images."""
+
+    def __init__(self, street: Street) -> None:
+        super().__init__(EstimatorConfig())
+        self._distances: Any = SimpleNamespace(
+            describable=lambda points, shape, radius=0: inside(points))
+        self._street, self._which = street, dict[tuple[float, ...], int]()
+        self._frame, self.told, self.taken, self.thrown = 0, list[float](), 0, 0
+        self.start(blank())
+
+    def go(self) -> float:
+        """Go on by a frame, and give the length that the window tells of it."""
+        which, pair = self._street.pair(self._frame)
+        self._which.update(zip(map(tuple, pair.x.tolist()), which.tolist()))
+        self._frame += 1
+        return self.add(blank(), pair, 1.0).length
+
+    def _measure(self) -> None:
+        found, newest = self._landmarks, len(self._images) - 1
+        places, seen = self._street.seen(self._frame)
+        mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
+        wanted = seen[mine] & inside(projected(K, in_frame(K, self._poses, found, newest)))
+        wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
+        found.minima[wanted, -1], found.seen[wanted, -1] = places[mine[wanted]], True
+        found.roots[wanted, -1] = np.eye(2)
+
+    def _refine(self) -> Numbers:
+        before = int(self._landmarks.seen[:, -1].sum())
+        H = super()._refine()
+        self.told.append(self._scale)
+        self.taken += before
+        self.thrown += before - int(self._landmarks.seen[:, -1].sum())
+        return H
+
+
+def inside(places: Numbers) -> NDArray[np.bool_]:
+    return np.asarray(((places > _BORDER) & (places < [WIDTH - _BORDER, HEIGHT - _BORDER])).all(1))
+
+
+def blank() -> Any:
+    image: Image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    return SimpleNamespace(K=K, tested=image, floating=image, mask=None)
+
+
+@pytest.mark.parametrize('noise', [0.05, 0.3])
+def test_the_window_tells_the_noise_of_its_observations_and_keeps_the_right_ones(
+        noise: float) -> None:
+    window = NumbersWindow(Street(0, 60, noise))
+    for _ in range(60):
+        window.go()
+    # Those of the newest frame too, before poses follow them.
+    assert np.median(window.told) == pytest.approx(noise, rel=0.1)
+    # Beyond 4 standard deviations in two numbers lie 3 of 10 000, and some leave with the sign of
+    # their depth.
+    assert window.thrown < 0.015 * window.taken
+    assert window.taken > 30 * TUNING.landmarks
+
+
+def test_noise_does_not_change_the_scale() -> None:
+    lengths = []
+    for seed in range(4):
+        window = NumbersWindow(Street(seed, 150, 0.3))
+        lengths.append([window.go() for _ in range(150)])
+    first, last = np.array(lengths)[:, :15].mean(1), np.array(lengths)[:, -15:].mean(1)
+    drifts = np.log(last / first)
+    assert abs(drifts.mean()) < 0.01
+    assert drifts.std() < 0.01
