@@ -9,6 +9,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose
 from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
+from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
@@ -273,3 +274,15 @@ def test_near_is_told_by_what_is_beyond_a_patch():
     expected = [values[mask].mean() if mask.any() else values.mean() for mask in apart == 2]
     assert _around_patches(points, values) == pytest.approx(expected)
     assert not len(_around_patches(points[:0], values[:0]))
+
+
+@pytest.mark.parametrize('seed', [1, 3])
+def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(seed: int) -> None:
+    """In the hand it rests, and what landmarks there are is told by next to no parallax."""
+    scene = make_scene('handheld', seed, (480, 360))
+    poses, odometry = scene.trajectory(80), VisualOdometry(EstimatorConfig(max_features=1000))
+    told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
+            for i, pose in enumerate(poses)][1:]
+    lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
+    moved = (lengths > 0) & (ways > 0.005)
+    assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)

@@ -70,6 +70,10 @@ class WindowTuning:
     classes: float = 2.0
     # chosen: Gauss-Newton steps for each frame; four come to the same
     steps: int = 2
+    # chosen: factor on the noise that a step must not reach, and how often it is halved: where
+    # the camera hardly moved, depths are told so badly that a full one may lead anywhere
+    astray: float = 1.5
+    halvings: int = 6
     # robust standard deviations beyond which an observation is false, and where the loss bends
     outlier: float = 4.0
     bend: float = 3.0
@@ -371,18 +375,28 @@ class Window:
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
         self._equalise()
+        linear = self._linearised()
         for _ in range(self._tuning.steps):
-            reduced = self._reduced(self._linearised())
+            reduced = self._reduced(linear)
             H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            self._poses = self._poses.moved(step)
-            self._landmarks = self._landmarks.moved(reduced.change(step))
-        linear = self._linearised()
+            linear = self._moved(step, reduced.change(step))
         false = np.linalg.norm(linear.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[linear.landmark[false], linear.frame[false]] = False
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
         return H
+
+    def _moved(self, step: Array, change: Array) -> Linearised:
+        """Go a step of the poses and its change of the landmarks, or as little as does no harm."""
+        poses, landmarks, scale = self._poses, self._landmarks, self._scale
+        for _ in range(self._tuning.halvings + 1):
+            self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
+            linear = self._linearised()
+            if self._scale < self._tuning.astray * scale:
+                break
+            step, change = step / 2, change / 2
+        return linear
 
     def _equalise(self) -> None:
         """Scale the roots in the newest frame so that a typical one is of a pixel."""
