@@ -96,13 +96,13 @@ def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
 
 
 def test_the_best_preset_finds_exact_motion_to_a_fraction_of_a_degree(evaluated):
-    best = {row['method']: row for row in rows(evaluated / 'table1.csv')
-            if row['preset'] == 'best'}
+    best, paper = ({row['method']: row for row in rows(evaluated / 'table1.csv')
+                    if row['preset'] == preset} for preset in ('best', 'paper'))
     for method in ('djet', 'rpe', 'pjet'):
         assert float(best[method]['rotation_median_deg']) < 0.2
         assert float(best[method]['translation_median_deg']) < 5
-    # Descriptors are what D-JET minimises.
-    assert float(best['djet']['hamming_mean']) < float(best['rpe']['hamming_mean'])
+    # Descriptors at whole pixels are what D-JET minimises, as the paper has it.
+    assert float(paper['djet']['hamming_mean']) < float(paper['rpe']['hamming_mean'])
 
 
 def test_all_methods_but_whole_chains_are_given_the_same_matches_of_a_preset(evaluated):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.features import detect_orb, match_close, match_everywhere, match_nearby
+from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.types import Features
 import numpy as np
 import pytest
@@ -61,20 +61,18 @@ def scores(previous, current, radius):
     return np.where(octaves <= 1, apart, np.inf), ways
 
 
-@pytest.mark.parametrize('match', [match_nearby, match_close])
 @pytest.mark.parametrize('radius', [0.5, 15.0, 60.0, 400.0])
-def test_nearby_matches_are_mutual_best_within_the_search_radius(pair, radius, match):
+def test_nearby_matches_are_mutual_best_within_the_search_radius(pair, radius):
     score, ways = scores(*pair, radius)
-    rows, columns = match(*pair, radius).T
+    rows, columns = match_nearby(*pair, radius).T
     assert (ways[rows, columns] <= radius).all()
     near = np.where(ways <= radius, score, np.inf)
     assert (near[rows, columns] <= near[rows].min(1) + 1e-3).all()
     assert (near[rows, columns] <= near[:, columns].min(0) + 1e-3).all()
 
 
-@pytest.mark.parametrize('match', [match_nearby, match_close])
 @pytest.mark.parametrize('radius', [15.0, 60.0, 400.0])
-def test_no_mutual_best_match_is_missing(pair, radius, match):
+def test_no_mutual_best_match_is_missing(pair, radius):
     score, ways = scores(*pair, radius)
     best, back = score.argmin(1), score.argmin(0)
     second = np.partition(score, 1, axis=1)[:, 1], np.partition(score, 1, axis=0)[1]
@@ -83,16 +81,7 @@ def test_no_mutual_best_match_is_missing(pair, radius, match):
                 # rounding may decide where two are equally good
                 and second[0][i] > score[i, j] + 1e-3 and second[1][j] > score[i, j] + 1e-3}
     assert len(expected) > 50
-    assert expected <= {(i, j) for i, j in match(*pair, radius).tolist()}
-
-
-def test_close_matches_differ_in_no_more_bits_than_they_may(pair):
-    every, sure = match_close(*pair, 60.0), match_close(*pair, 60.0, 40)
-    bits = distances(*pair)
-    assert bits[tuple(every.T)].max() > 40 >= bits[tuple(sure.T)].max()
-    # What may be matched at all comes first: nothing that is left out keeps others from it.
-    assert {tuple(m) for m in every[bits[tuple(every.T)] <= 40].tolist()} <= {
-        tuple(m) for m in sure.tolist()}
+    assert expected <= {(i, j) for i, j in match_nearby(*pair, radius).tolist()}
 
 
 def test_of_two_that_look_alike_the_nearer_is_taken(pair):
@@ -104,16 +93,14 @@ def test_of_two_that_look_alike_the_nearer_is_taken(pair):
     assert (columns < len(wall)).mean() > 0.95
 
 
-@pytest.mark.parametrize('match', [match_nearby, match_close])
-def test_twins_do_not_both_match_the_same_feature(pair, match):
+def test_twins_do_not_both_match_the_same_feature(pair):
     one = some(pair[0], slice(0, 1))
     twins = some(pair[0], [0, 0, 0])
-    assert len(match(twins, one, 60.0)) == len(match(one, twins, 60.0)) == 1
+    assert len(match_nearby(twins, one, 60.0)) == len(match_nearby(one, twins, 60.0)) == 1
 
 
-@pytest.mark.parametrize('match', [match_nearby, match_close])
-def test_matches_are_one_to_one_and_the_most_similar_come_first(pair, match):
-    rows, columns = match(*pair, 50.0).T
+def test_matches_are_one_to_one_and_the_most_similar_come_first(pair):
+    rows, columns = match_nearby(*pair, 50.0).T
     score, _ = scores(*pair, 50.0)
     assert (np.diff(score[rows, columns]) > -1e-3).all()
     assert len(set(rows.tolist())) == len(set(columns.tolist())) == len(columns) > 100
@@ -130,7 +117,6 @@ def test_every_feature_finds_itself(pair):
 def test_few_or_no_features_give_few_or_no_matches(pair, ours, theirs):
     previous, current = some(pair[0], ours), some(pair[1], theirs)
     assert len(match_nearby(previous, current, 1e4)) <= min(len(previous), len(current))
-    assert len(match_close(previous, current, 30.0)) <= min(len(previous), len(current))
     matches = match_everywhere(previous, current)
     assert matches.shape[1:] == (2,)
     assert len(matches) <= min(len(previous), len(current))
@@ -138,21 +124,3 @@ def test_few_or_no_features_give_few_or_no_matches(pair, ours, theirs):
     too_far = Features(current.points + 1e5, current.octaves, current.angles, current.responses,
                        current.descriptors)
     assert len(match_nearby(previous, too_far, search_radius=100.0)) == 0
-
-
-@pytest.mark.parametrize('reach', [3.0, 17.0, 400.0])
-def test_those_that_are_close_are_found_on_whichever_side_they_are(reach):
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-50, 250, (300, 2))  # some are foreseen beyond the image
-    angle = rng.uniform(0, 2 * np.pi, 300)
-    away = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    descriptors = rng.integers(0, 256, (300, 32), np.uint8)
-
-    def at(places):
-        return Features(places, np.zeros(300, np.int32), np.zeros(300, np.float32),
-                        np.ones(300, np.float32), descriptors)
-
-    near, far = (match_close(at(points), at(points + share * reach * away), reach, 0)
-                 for share in (0.999, 1.001))
-    assert np.array_equal(near[np.argsort(near[:, 0])], np.stack([np.arange(300)] * 2, axis=1))
-    assert len(far) == 0

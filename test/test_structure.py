@@ -197,7 +197,7 @@ def test_the_window_keeps_few_images(cards):
 
 def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards):
     drive, depths = Drive(cards), []
-    for number in range(24):
+    for number in range(36):
         result, = drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03)])
         here = result.pose[:3, :3] @ drive.odometry.landmarks(settled=True).T
         depths.append((here.T + result.pose[:3, 3])[:, 2] * np.hypot(0.32, 0.03))

@@ -85,7 +85,7 @@ class EstimatorConfig:
     step_share: float = parameter(
         0.3, "share of the way that a keypoint moves with step 'share'", minimum=0.01, maximum=1.0)
     max_iterations: int = parameter(
-        3, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
+        2, 'rounds of surfaces and pose (Algorithm 1)', minimum=1, maximum=100)
     epsilon: float = parameter(
         3e-4, 'Algorithm 1 has converged when rotation and direction both move by less, in rad',
         minimum=1e-12, maximum=1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import reduce
 
 import cv2
 from djet_ros.core.masks import Mask
@@ -20,10 +19,6 @@ _OCTAVES = 1
 
 # Bits that a feature at the search radius has to agree in beyond one that has not moved.
 _DISTANCE_BITS = 32
-
-# How many bits are set in each number of 16.
-_BITS = np.unpackbits(np.arange(2**16, dtype=np.uint16).view(np.uint8).reshape(-1, 2),
-                      axis=1).sum(1, dtype=np.uint8)
 
 
 def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20,
@@ -94,60 +89,6 @@ def match_nearby(previous: Features, current: Features,
     return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))
 
 
-def match_close(previous: Features, current: Features, reach: float,
-                most_bits: int = 256) -> NDArray[np.int64]:
-    """
-    Match as `match_nearby` does, pair by pair: for a reach of few pixels, which leaves few pairs.
-
-    most_bits: in which descriptors may differ at most. Gives (M, 2) indices, likewise.
-    """
-    rows, columns, squared = _within(previous.points, current.points, reach)
-    # Whole arrays are taken from in a third of the time of a mask.
-    like = np.flatnonzero(np.abs(
-        previous.octaves.take(rows) - current.octaves.take(columns)) <= _OCTAVES)
-    rows, columns = rows.take(like), columns.take(like)
-    differing = _differing(previous.descriptors, rows, current.descriptors, columns)
-    alike = np.flatnonzero(differing <= most_bits)
-    rows, columns = rows.take(alike), columns.take(alike)
-    badness = differing.take(alike) + _DISTANCE_BITS / reach**2 * squared.take(like.take(alike))
-    least_there, least_here = np.full(len(previous), np.inf), np.full(len(current), np.inf)
-    np.minimum.at(least_there, rows, badness)
-    np.minimum.at(least_here, columns, badness)
-    mutual = (badness == least_there[rows]) & (badness == least_here[columns])
-    matches = np.stack([rows, columns], axis=1)[mutual]
-    return _one_to_one(matches[np.argsort(badness[mutual], kind='stable')])
-
-
-def _within(there: Array, here: Array, reach: float
-            ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """
-    Give the pairs of points (N, 2) and (M, 2), by their indices, that are at most a reach apart.
-
-    Also gives the squares of how far apart they are. In rows as high as the reach, points come one
-    after the other: those of three rows are near.
-    """
-    if not len(there) or not len(here):
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    # Numbers that grow along one row after the other; all in a row are less than `after` apart.
-    after = 4 * (max(np.abs(there).max(), np.abs(here).max()) + reach)
-    along, others = (np.floor(points[:, 1] / reach) * after + points[:, 0]
-                     for points in (there, here))
-    orders = np.argsort(along), np.argsort(others)
-    along, others = along[orders[0]], others[orders[1]]
-    middles = np.concatenate([along + row * after for row in (-1, 0, 1)])
-    start = np.searchsorted(others, middles - reach)
-    counts = np.searchsorted(others, middles + reach, 'right') - start
-    rows = np.tile(orders[0], 3).repeat(counts)
-    columns = orders[1].take(np.arange(len(rows)) + (start - np.cumsum(counts) + counts).repeat(
-        counts))
-    # Coordinate by coordinate, in half the time.
-    dx, dy = (one.take(rows) - other.take(columns)
-              for one, other in zip(there.T.copy(), here.T.copy()))
-    squared = dx * dx + dy * dy
-    near = np.flatnonzero(squared <= reach**2)
-    return rows.take(near), columns.take(near), squared.take(near)
-
-
 def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
     """Keep the first of matches (M, 2) that share a feature, as twins do."""
     for side in (0, 1):
@@ -155,19 +96,6 @@ def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
         np.minimum.at(first, matches[:, side], np.arange(len(matches)))
         matches = matches[first[matches[:, side]] == np.arange(len(matches))]
     return matches
-
-
-def _differing(there: NDArray[np.uint8], rows: NDArray[np.int64], here: NDArray[np.uint8],
-               columns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count the bits (M,) in which descriptors (N, 32) of two images differ, pair by pair."""
-    words = [np.ascontiguousarray(descriptors).view(np.uint64) for descriptors in (there, here)]
-    apart = words[0].take(rows, 0) ^ words[1].take(columns, 0)
-    # Word by word, as NumPy takes many times as long to add up few along the last axis.
-    if hasattr(np, 'bitwise_count'):  # NumPy 2
-        parts = np.bitwise_count(apart).T
-    else:
-        parts = _BITS.take(apart.view(np.uint16)).T
-    return np.asarray(reduce(np.add, parts.astype(np.uint16)), np.int64)
 
 
 def _compare(left: NDArray[np.float32], right: NDArray[np.float32],

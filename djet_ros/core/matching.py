@@ -1,8 +1,8 @@
 """
 Which places of two views are the same: where the motion before foresees them, or anywhere near.
 
-Features are found again by their descriptors; of the others, where these are few, the flow of the
-image tells.
+Features are followed by the flow of the image. Where nothing foresees them, they are also found
+again by their descriptors, among those of the other view.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
-from djet_ros.core.features import match_close, match_everywhere, match_nearby
+from djet_ros.core.features import match_everywhere, match_nearby
+from djet_ros.core.flow import follow, REACH
+from djet_ros.core.hamming import match_distances
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Pose, RelativePose, View
@@ -25,23 +26,18 @@ RIGID = 0.55
 # Share of the inliers of the pair before that near matches have to come to.
 _ENOUGH = 0.8
 
-# Pixels around where the motion before foresees them in which features are sought first (19 of 20
-# lie there, on streets and in the hand), and bits in which the sure ones differ at most: others
-# differ by some 100, the best of ten.
-_FORESEEN, _SURE_BITS = 24.0, 64
-
-# Share of the matches that have to be within half of that.
+# Share of the matches that lie within half of the flow's reach of where they are foreseen.
 _NEARLY_ALL = 0.9
 
 # chosen: fewer matches than these leave a choice of motions, so that all are sought widely.
 _MANY = 200
 
-# chosen: fewer matches than these come of images with little texture, where each of them counts.
-_FEW = 600
+# Pixels between a corner and the same place followed there: corners are that far off.
+_SAME = 2.0
 
-# Pixels in which the flow is sought; levels of the pyramid, which are few, as the turn is known;
-# chosen: pixels by which it may miss on the way back.
-_FLOW_WINDOW, _FLOW_LEVELS, _THERE_AND_BACK = (11, 11), 3, 1.0
+# Bits by which one of two places has to look more alike to be taken: about two standard
+# deviations of the distance between descriptors of one place.
+_CLEARLY = 10
 
 
 class Matches(NamedTuple):
@@ -54,7 +50,7 @@ class Matches(NamedTuple):
 def match_foreseen(previous: View, current: View, prior: RelativePose | None, known: Known,
                    search_radius: float) -> tuple[Matches, Pose] | None:
     """
-    Match features where the motion before foresees them; None where too few are there.
+    Follow features from where the motion before foresees them; None where too few are near.
 
     Nor where other things move: a gyro is asked to tell these from the world. search_radius: as a
     share of the longer side. Gives the motion too, where the camera turns otherwise than before
@@ -63,12 +59,12 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     if (prior is None or known.turn is not None or search_radius >= 1
             or prior.inliers.sum() < _MANY or prior.inliers.mean() < RIGID):
         return None
-    reach = min(_FORESEEN, search_radius * max(current.gray.shape))
+    reach = min(REACH, search_radius * max(current.gray.shape))
     R = prior.R if known.guess is None else known.guess.R
-    matched = _match_close(previous, current, prior, R, reach)
+    matched = _follow_on(previous, current, prior, R, reach)
     if matched is None:
         R = likely_rotation(previous.features, current.features, current.K, [R], reach)
-        matched = _match_close(previous, current, prior, R, reach)
+        matched = _follow_on(previous, current, prior, R, reach)
     return None if matched is None else (matched, Pose(R, prior.t))
 
 
@@ -77,7 +73,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     """
     Match features that lie near where a turn alone would bring them, or anywhere.
 
-    search_radius: as a share of the longer side; 1 matches all with all.
+    search_radius: as a share of the longer side; 1 matches all with all, by descriptors alone.
     """
     there, here = previous.features, current.features
     if search_radius >= 1:
@@ -86,29 +82,24 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
     turned = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
+    y, bits = follow(previous, current, turned, radius)
     pairs = _match_turned(previous, current, turned, prior, radius)
-    found = Matches(there.points[pairs[:, 0]], here.points[pairs[:, 1]])
-    if len(pairs) >= _FEW:
-        return found
-    left = np.ones(len(there), bool)
-    left[pairs[:, 0]] = False
-    x, y = _followed(previous.gray, current.gray, there.points[left], turned[left], radius)
-    return Matches(np.concatenate([found.x, x]), np.concatenate([found.y, y]))
+    return _surest(there.points, *_settled(previous, current, y, bits, pairs))
 
 
-def _match_close(previous: View, current: View, prior: RelativePose, R: Array, reach: float
-                 ) -> Matches | None:
-    """Match features next to where they are seen after a turn R (3, 3) and a way as before."""
-    there = previous.features
-    foreseen = replace(there, points=foresee(there, current.K, R, prior))
-    pairs = match_close(foreseen, current.features, reach, _SURE_BITS)
-    y = current.features.points[pairs[:, 1]]
-    off = np.linalg.norm(y - foreseen.points[pairs[:, 0]], axis=1)
-    # Where many are far off, as after a step twice as long, others are farther than the reach.
-    if (len(pairs) < max(_ENOUGH * prior.inliers.sum(), _MANY)
-            or np.quantile(off, _NEARLY_ALL) > reach / 2):
+def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float
+               ) -> Matches | None:
+    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
+    foreseen = foresee(previous.features, current.K, R, prior)
+    y, bits = follow(previous, current, foreseen, reach)
+    found = np.isfinite(bits)
+    if found.sum() < max(_ENOUGH * prior.inliers.sum(), _MANY):
         return None
-    return Matches(there.points[pairs[:, 0]], y)
+    # Where many are far off, as after a step twice as long, others are farther than the reach.
+    off = np.linalg.norm((y - foreseen)[found], axis=1)
+    if np.quantile(off, _NEARLY_ALL) > reach / 2:
+        return None
+    return _surest(previous.features.points, y, bits)
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,
@@ -122,28 +113,28 @@ def _match_turned(previous: View, current: View, places: Array, prior: RelativeP
     return pairs
 
 
-def _followed(there: NDArray[np.uint8], here: NDArray[np.uint8], points: Array, turned: Array,
-              radius: float) -> Matches:
+def _settled(previous: View, current: View, y: Array, bits: Array, pairs: NDArray[np.int64]
+             ) -> tuple[Array, Array]:
     """
-    Follow points (N, 2) by the flow of the image from where a turn alone would bring them.
+    Settle where features are that were followed to one place, and matched with another.
 
-    Lucas and Kanade's, by pyramids, there and back. A corner that is not found again, for its
-    surroundings look otherwise or many are better, is often still where the flow leads.
+    y (N, 2), bits (N,): as from ``follow``; pairs (M, 2): indices of matches. The place that looks
+    clearly more alike is taken; where neither does, none is, and of the same place the exact one.
     """
-    if not len(points):
-        return Matches(np.empty((0, 2)), np.empty((0, 2)))
-    x, start = (places.astype(np.float32)[:, None] for places in (points, turned))
-    y, seen = _flow(there, here, x, start)
-    back, seen_back = _flow(here, there, y, x)
-    good = (seen & seen_back & (np.linalg.norm(back - x, axis=2).ravel() < _THERE_AND_BACK)
-            & (np.linalg.norm(y - start, axis=2).ravel() < radius))
-    return Matches(points[good], y[good, 0].astype(np.float64))
+    there, here = pairs.T
+    matched, y, bits = current.features.points[here], y.copy(), bits.copy()
+    alike = match_distances(previous.smoothed, previous.features.points[there], current.smoothed,
+                            matched)
+    lost = np.isinf(bits[there])
+    elsewhere = ~lost & (np.linalg.norm(y[there] - matched, axis=1) > _SAME)
+    better = lost | (elsewhere & (alike < bits[there] - _CLEARLY))
+    neither = elsewhere & ~better & ~(alike > bits[there] + _CLEARLY)
+    y[there[better]], bits[there[better]] = matched[better], alike[better]
+    bits[there[neither]] = np.inf
+    return y, bits
 
 
-def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32],
-          start: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Follow points (N, 1, 2) from where they may be: where they are, and (N,) whether seen."""
-    found, seen, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, points, start.copy(), winSize=_FLOW_WINDOW, maxLevel=_FLOW_LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    return np.asarray(found, np.float32), np.asarray(seen).ravel() > 0
+def _surest(x: Array, y: Array, bits: Array) -> Matches:
+    """Give the places x, y (N, 2) that are not lost, those first that look most alike."""
+    order = np.argsort(bits, kind='stable')[:np.isfinite(bits).sum()]
+    return Matches(x[order], y[order])
