@@ -17,6 +17,7 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
+from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.posegraph.keyframe_images import frame_finder
 from djet_ros.posegraph.steps import Step
@@ -634,3 +635,12 @@ def test_the_documented_call_is_understood():
     for flag in ('--output', '--method', '--preset', '--overwrite', '--config', '--image-topic',
                  '--info-topic', '--poses', '--scale'):
         assert flag in parsed
+
+
+def test_what_was_of_no_use_beside_the_images_is_told(tmp_path):
+    folder = render_sequence('road', tmp_path, 8, size=(480, 160))
+    for told in (False, True):
+        if told:
+            (folder / 'imu.csv').write_text('')
+        run = djet('replay', folder, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
+        assert ('djet: warning: no imu in time: ' in run.stderr) is told

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterable
 import math
 from pathlib import Path
+import sys
 from typing import Any
 
 from djet_ros.cli.options import add_output, add_topics
@@ -63,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
         print(f'results: {args.output}')
         if (args.output / PLOT).exists():
             print(f'plot: {args.output / PLOT}')
+    for line in outcome.advice:
+        print(f'djet: warning: {line}', file=sys.stderr)
     if outcome.problem:
         raise DjetError(outcome.problem)
     return 0

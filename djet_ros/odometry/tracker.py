@@ -267,9 +267,12 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        frame = self.last.frame_id if self.last else ''
-        return [*self._health.complaints(self._scale, self.mounted),
-                *self._beside.complaints(frame)]
+        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside]
+
+    @property
+    def complaints_beside(self) -> list[Complaint]:
+        """Say what there is to mend of what comes beside the images."""
+        return self._beside.complaints(self.last.frame_id if self.last else '')
 
     def diagnosis(self) -> Diagnosis:
         """Say how the odometry is doing."""

@@ -37,10 +37,15 @@ _PATIENCE_NS = 10**9
 
 
 class Outcome(NamedTuple):
-    """The summary as it was written, and in one line what the user must know of, if anything."""
+    """
+    The summary as it was written, and in one line what the user must know of, if anything.
+
+    advice: lines on what came beside the images and was of no use.
+    """
 
     summary: dict[str, Any]
     problem: str | None
+    advice: tuple[str, ...] = ()
 
 
 class Replay:
@@ -92,7 +97,8 @@ class Replay:
             self._folder.finish(summary)
         self._evaluate(summary)
         self._folder.finish(summary)
-        return Outcome(summary, problem or None)
+        return Outcome(summary, problem or None, tuple(
+            f'{one.name}: {one.text}' for one in self._tracker.complaints_beside))
 
     def _take(self, message: BagMessage) -> int:
         """Hand one message on; give how many images were worked on."""
