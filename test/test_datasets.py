@@ -215,3 +215,11 @@ def test_a_wrong_euroc_folder_is_named(asl, file, old, new, said):
     with pytest.raises(DjetError, match=said) as caught:
         euroc(asl)
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('left', ['', '%YAML:1.0\n', '%YAML:1.0\n---\n', '%YAML:1.0\n---\nsens'])
+def test_a_camera_description_that_is_cut_at_its_head_is_one_line(asl, left):
+    (asl / 'mav0/cam0/sensor.yaml').write_text(left)
+    with pytest.raises(DjetError, match='no intrinsics and no T_BS') as caught:
+        euroc(asl)
+    assert '\n' not in str(caught.value)

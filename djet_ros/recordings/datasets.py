@@ -185,6 +185,9 @@ def _camera_beside(folder: Path, published: Sequence[float]) -> tuple[Array, Seq
 def _asl_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
     """Camera matrix, distortion and its model, and the camera in the body (4, 4)."""
     sensor = read_yaml(path)
+    if not isinstance(sensor, dict):
+        raise DjetError(f'{path} is no ASL camera description: no intrinsics and no T_BS are in '
+                        'it; replace the file, which may have been cut')
     try:
         named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
