@@ -40,7 +40,15 @@ def rotation_exp(omega: Array) -> Array:
 
 def rotation_log(R: Array) -> Array:
     """Rotation vectors (…, 3) in radians of rotation matrices, (3, 3) or (N, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+    cosines = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
+    # Up to a quarter turn a rotation's odd part tells its axis, in a tenth of the time.
+    if not (cosines > 0).all():
+        return np.asarray(Rotation.from_matrix(R).as_rotvec())
+    odd = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0],
+                    R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
+    sines = np.sqrt((odd * odd).sum(-1))
+    angles = np.arctan2(sines, cosines)
+    return np.asarray(odd * (angles / np.where(sines > 0, sines, 1.0))[..., None])
 
 
 def unit(v: Array) -> Array:

@@ -29,6 +29,7 @@ from djet_ros.core.paraboloid import (
     fit_paraboloids,
     indefinite,
     largest,
+    median,
     Paraboloids,
     project_to_positive,
     times,
@@ -182,8 +183,8 @@ class DescriptorDistances:
         some, tests = thinned(len(x), _MEASURED), self._tests[:_MEASURED_TESTS]
         sums = [np.abs(np.subtract(*intensities(image, points[some], tests))).sum(0, dtype=float)
                 for image, points in ((here, y), (there, x))]
-        ratio = float(np.median((sums[0] + 1) / (sums[1] + 1)))
-        return float(np.clip(ratio, 1 / _MOST_CONTRAST, _MOST_CONTRAST))
+        ratio = median((sums[0] + 1) / (sums[1] + 1))
+        return min(max(ratio, 1 / _MOST_CONTRAST), _MOST_CONTRAST)
 
     def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
