@@ -263,7 +263,7 @@ class Wall:
         self.tracks, self.keypoints = [], []
         for rounds in range(1, 6):
             config = replace(whole, step=step, step_share=0.2, max_iterations=rounds,
-                             epsilon=1e-12, cull_outside=False)
+                             epsilon=1e-12, cull_outside=False, join_matches=False)
             surface = WatchedSurface(*views, x, config)
             self.tracks.append(track_jointly(surface, camera, x, [sideways], config))
             self.keypoints.append(surface.asked[-1])

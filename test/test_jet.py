@@ -12,8 +12,10 @@ from djet_ros.core.jet import (
     minimise,
     moved,
     robust_scale,
+    with_places,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
+from djet_ros.core.types import Pose
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
@@ -292,3 +294,73 @@ def test_matches_that_determine_nothing_leave_the_pose_finite():
         problem = jet_problem(K, x, circles(y + 3))
         found = minimise(problem, one.R, one.t, Loss())
         assert np.isfinite(found.R).all() and np.linalg.norm(found.t) == pytest.approx(1)
+
+
+def ellipses(rng, places, sigma):
+    """Surfaces that are good to sigma pixels, along some way to a third of that; and their S."""
+    turn = Rotation.from_rotvec(rng.uniform(0, np.pi, (len(places), 1)) * [0, 0, 1])
+    axes = turn.as_matrix()[:, :2, :2]
+    S = axes @ (sigma**2 * np.diag([1, 1 / 9])) @ axes.transpose(0, 2, 1)
+    off = np.einsum('nij,nj->ni', np.linalg.cholesky(S), rng.normal(size=places.shape))
+    return Paraboloids(places + off, np.linalg.inv(S), np.zeros_like(places),
+                       np.zeros(len(places)), np.ones(len(places), bool)), S
+
+
+def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
+    rng = np.random.default_rng(20)
+    views = two_views(rng, 400)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    surfaces, S = ellipses(rng, y, 0.3)
+    found = y + rng.normal(0, 0.2, y.shape)
+    found[::40] += 30  # these were found elsewhere
+    alone = jet_problem(K, x, surfaces)
+    joined = with_places(alone, K, found, Pose(R, t))
+    # How exact each is, in pixels: from its distances to the true lines.
+    lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
+    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    sigma = core_scale(((found - y) * normals).sum(1))
+    of_lines = np.sqrt(np.einsum('ni,nij,nj->n', normals, S, normals))
+    S = S * core_scale(((surfaces.centres - y) * normals).sum(1) / of_lines)**2
+    precision = np.linalg.inv(S) + np.eye(2) / (2 * sigma**2)
+    expected = np.linalg.solve(precision, (
+        np.linalg.solve(S, surfaces.centres[..., None]) + found[..., None] / (2 * sigma**2)))
+    joined_at = (joined.rays_y.T @ K.T)[:, :2]
+    together = np.linalg.norm(joined_at - expected[..., 0], axis=1) < 1e-6
+    kept = np.linalg.norm(joined_at - surfaces.centres, axis=1) < 1e-6
+    assert (together ^ kept).all()
+    assert together.mean() > 0.8 and kept[::40].all()
+    # Covariances, but for their common unit.
+    C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
+    ratio = C[together] / np.linalg.inv(precision[together])
+    assert np.ptp(ratio) < 1e-6 * ratio.max()
+
+
+@pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
+def test_a_pose_of_surfaces_and_matches_is_no_less_exact_than_that_of_either(sigma):
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        views = two_views(rng, 150)
+        x, y, R, t = views.x, views.y, views.R, views.t
+        surfaces, _ = ellipses(rng, y, 0.3)
+        found = y + rng.normal(0, sigma, y.shape)
+        problems = [jet_problem(K, x, surfaces), jet_problem(K, x, circles(found))]
+        poses = [minimise(problem, R, t, Loss()).pose for problem in problems]
+        joined = with_places(problems[0], K, found, poses[0])
+        poses.append(minimise(joined, R, t, Loss()).pose)
+        errors.append([rotation_angle(R, pose.R) for pose in poses])
+    surface, match, both = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert both < 1.05 * min(surface, match)
+
+
+def test_where_a_surface_has_no_minimum_or_nothing_was_found_right_surfaces_count_alone():
+    rng = np.random.default_rng(21)
+    views = two_views(rng, 60)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    problem = jet_problem(K, x, random_surfaces(rng, y, 'indefinite'))
+    joined = with_places(problem, K, y, Pose(R, t))
+    saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
+    saddles |= problem.spread[0] <= 0
+    assert saddles.sum() > 10
+    assert np.array_equal(joined.rays_y[:, saddles], problem.rays_y[:, saddles])
+    assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()

@@ -73,6 +73,9 @@ class EstimatorConfig:
         True, 'leave out matches whose surface has its minimum outside the sampled window')
     weigh_by_fit: bool = parameter(
         True, 'take the noise of a match from what is left of its residual at its best place')
+    join_matches: bool = parameter(
+        True, 'count where a match was found beside what its surface tells, each as exact as it '
+        'shows itself to be; never for rpe, which is that alone')
     loss: str = parameter(
         'geman_mcclure', 'robust loss over matches',
         choices=('none', 'huber', 'cauchy', 'geman_mcclure'))
@@ -106,7 +109,7 @@ _PAPER: dict[str, Any] = {
     'window': 7, 'window_sigma': 0.0,
     'grading': 0.0, 'binary_tests': 256, 'patch_scale': 1.0, 'warp_reference': False,
     'indefinite': 'drop', 'cull_outside': False,
-    'weigh_by_fit': False, 'loss': 'none',
+    'weigh_by_fit': False, 'join_matches': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20, 'epsilon': 1e-4,
 }
 

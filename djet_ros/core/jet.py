@@ -13,7 +13,7 @@ R is moved on SO(3) from the left, t on the unit sphere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from djet_ros.core.geometry import (
     inverse_of,
@@ -22,7 +22,7 @@ from djet_ros.core.geometry import (
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import median, middle, Paraboloids
+from djet_ros.core.paraboloid import inverse_2x2, median, middle, Paraboloids, times
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,13 @@ _NORMAL = 1.4826
 
 # What is left over at a minimum is noise itself: a match has at least this share of the usual.
 _LEAST_LEFT = 0.25
+
+# Squared Mahalanobis distance, over two degrees of freedom, that one of ten exceeds.
+_ONE_PLACE = 4.6
+
+# chosen: matches are taken to be this much less exact than they look, in squares, for neighbours
+# err alike where the image grows, which whoever found them may not have seen.
+_ALIKE = 2.0
 
 
 @dataclass(frozen=True)
@@ -156,6 +163,43 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
     blur = epipole_blur**2 * np.linalg.det(G) * np.abs(spread[0] + spread[2]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, minima).T.copy(), spread, blur)
+
+
+def with_places(problem: JetProblem, K: Array, y: Array, pose: Pose) -> JetProblem:
+    """
+    Join what residual surfaces tell of places with where these were found, pixels y (N, 2).
+
+    The sum of two residuals of the paper: that of the surface, and the re-projection error. Both
+    measure one place, with covariances S and T = sigma^2 I; how exact each is, it shows by its
+    distances from the epipolar lines of a pose. Of two Gaussians that is the place
+
+        y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
+
+    Where both are farther apart than nine of ten that are right, the match began at a wrong place,
+    and the surface counts alone; so it does where it has no minimum.
+    """
+    G = inverse_of(K)[:2, :2]
+    pixel = G @ G.T
+    width = np.trace(pixel) / 2
+    found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)), spread=np.repeat(
+        pixel[[0, 0, 1], [0, 1, 1]][:, None], len(y), axis=1))
+    # In square pixels.
+    S, T = (much / width * core_scale(epipolar_residuals(measured, pose.R, pose.t).r)**2
+            * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
+            for measured, much in ((problem, 1.0), (found, _ALIKE)))
+    apart = (problem.rays_y - found.rays_y)[:2].T / np.sqrt(width)
+    inverse = inverse_2x2(S + T)
+    has_minimum = (S[:, 0, 0] > 0) & (S[:, 0, 0] * S[:, 1, 1] > S[:, 0, 1]**2)
+    joined = has_minimum & ((apart * times(inverse, apart)).sum(1) < _ONE_PLACE)
+    gain = S @ inverse * joined[:, None, None]
+    rays_y = problem.rays_y.copy()
+    rays_y[:2] -= np.sqrt(width) * times(gain, apart).T
+    S = S - gain @ S
+    widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
+    spread = S.reshape(-1, 4).T[[0, 1, 3]] * (width / max(median(widths), 1e-12))
+    blur = problem.blur * (np.abs(spread[0] + spread[2])
+                           / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
+    return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
 
 
 def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:

@@ -33,6 +33,8 @@ from djet_ros.core.jet import (
     Loss,
     minimise,
     Residuals,
+    Solution,
+    with_places,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
@@ -149,7 +151,7 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
                          np.ones(len(y), bool))
             if led is not None and turn.prefers(led[0].pose.R, track.pose.R):
                 track = led[0]
-    second = second_motion(begun.problem, begun.places, track.pose, track.scale(),
+    second = second_motion(begun.problem, begun.places, track.pose, begun.scale,
                            config.min_matches)
     if second is None:
         return track
@@ -166,13 +168,14 @@ class _Begun(NamedTuple):
     """
     The first round: its problem, the pixels (M, 2) of its matches, and (N,) bool which.
 
-    rivals: the poses of other basins.
+    rivals: the poses of other basins; scale: noise of the surfaces alone, at the end.
     """
 
     problem: JetProblem
     places: Array
     voting: NDArray[np.bool_]
     rivals: tuple[Pose, ...]
+    scale: float
 
 
 def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
@@ -203,7 +206,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
         basin = _basin(problem, places, poses, config, prior, turn, ahead)
-        begun = begun or _Begun(problem, places, voting, basin.rivals)
+        begun = begun or _Begun(problem, places, voting, basin.rivals, basin.scale)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
@@ -212,6 +215,10 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         if last and rival_poses:
             # Judge again between the basins, on the last surfaces.
             solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
+        begun = begun._replace(scale=_scale(solution.residuals.r))
+        if last and config.join_matches and config.method != 'rpe':
+            # Step 2 once more: where matches were found is a measurement of its own.
+            solution, loss = _joined(problem, K, y[voting], solution, loss, config)
         pose = solution.pose
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
@@ -230,6 +237,16 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
     assert begun is not None  # there is at least one iteration
     return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
                  no_minimum, iteration, rivals), begun
+
+
+def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
+            config: EstimatorConfig) -> tuple[Solution, Loss]:
+    """Optimise the pose by surfaces and by where matches were found, y (N, 2), together."""
+    problem = with_places(problem, K, y, solution.pose)
+    agreeing = np.abs(solution.residuals.r) < loss.scale
+    residuals = epipolar_residuals(problem, solution.R, solution.t).r
+    loss = replace(loss, scale=config.loss_scale * _scale(residuals[agreeing]))
+    return minimise(problem, solution.R, solution.t, loss), loss
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:

@@ -51,6 +51,8 @@ def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
                   Change('128 tests', {'binary_tests': 128})],
         'warp': [Change('patches not warped', {'warp_reference': False}),
                  Change('patches warped', {'warp_reference': True})],
+        'joining': [Change('surfaces alone', {'join_matches': False}),
+                    Change('surfaces and matches', {'join_matches': True})],
         'recentring': [Change('window not re-centred', {'max_iterations': 1})],
         'indefinite': [Change(f'indefinite fits: {word}', {'indefinite': name})
                        for name, word in (('keep', 'kept'), ('drop', 'dropped'),
