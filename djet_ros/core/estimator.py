@@ -83,10 +83,9 @@ class TwoViewEstimator:
         """
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
-        found, tested = both(
-            lambda: self.features(gray, mask, smoothed) if features is None else features,
-            lambda: DescriptorDistances(self.config).seen(gray))
-        return View(gray, K, found, smoothed, tested, mask)
+        if features is None:
+            features = self.features(gray, mask, smoothed)
+        return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None,
                  smoothed: NDArray[np.uint8] | None = None) -> Features:
@@ -241,9 +240,9 @@ class TwoViewEstimator:
         sign = facing(R, track.pose.t, rays_x, rays_y)
         t = sign * track.pose.t
 
-        covariances, hamming = both(
-            lambda: pose_covariance(track.residuals, track.loss, x[track.voting], t, sign < 0),
-            lambda: match_distances(previous.smoothed, x, current.smoothed, track.y_opt))
+        covariances = pose_covariance(
+            track.residuals, track.loss, x[track.voting], t, sign < 0)
+        hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
         status = Status.OK
         if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()
                 or _by_chance(hamming[inliers])):

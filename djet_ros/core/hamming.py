@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 from djet_ros.core.geometry import inverses
 from djet_ros.core.orb_pattern import reach, TESTS
-from djet_ros.core.parallel import both, each
+from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -160,17 +160,12 @@ def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels
     sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
     # As many at once as can be summed in the type of the differences.
     at_once = min(_TESTS_AT_ONCE, np.iinfo(f'u{reference.itemsize}').max // most)
-
-    def sum_up(start: int) -> None:
-        block = slice(start, start + size)
+    for start in range(0, len(centres), _BLOCK):
+        block = slice(start, start + _BLOCK)
         patches = gather_patches(image, centres[block], reach(tests) + radius)
         # What a mask has chosen comes points first, which is three times slower to compare.
         chosen = np.ascontiguousarray(reference[:, block])
         sums[:, :, block] = _summed(chosen, patches, radius, tests, outcome, differ, at_once)
-
-    # Half as many in two threads; each call costs something.
-    size = min(_BLOCK, max(1, -(-len(centres) // 2))) if cv2.getNumThreads() > 1 else _BLOCK
-    each(sum_up, range(0, len(centres), size))
     return sums
 
 
@@ -201,8 +196,8 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array) ->
     x_pixels, y_pixels = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
     inside = describable(x_pixels, smoothed_a.shape) & describable(y_pixels, smoothed_b.shape)
     distances = np.full(len(x), np.nan)
-    differing = np.not_equal(*both(lambda: descriptor_bits(smoothed_a, x_pixels[inside]),
-                                   lambda: descriptor_bits(smoothed_b, y_pixels[inside])))
+    differing = (descriptor_bits(smoothed_a, x_pixels[inside])
+                 != descriptor_bits(smoothed_b, y_pixels[inside]))
     distances[inside] = differing.view(np.uint8).sum(0, dtype=np.uint16)
     return distances
 
