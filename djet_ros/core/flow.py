@@ -16,9 +16,13 @@ from numpy.typing import NDArray
 # Side of the window in pixels: the smaller the more exact, and at this one OpenCV is fastest.
 _WINDOW = 9
 
-# Levels of the pyramid on the way there, each twice as coarse; steps at each of them at most, and
-# pixels of a step that is the last. Surfaces refine it: more of them add nothing.
-_LEVELS, _STEPS, _LAST_STEP = 3, 6, 0.03
+# Levels of the pyramid on the way there, each twice as coarse, for places that are foreseen, and for
+# others.
+NEAR, FAR = 2, 3
+
+# Steps at each level at most, and pixels of a step that is the last. Surfaces refine it: more of
+# them add nothing.
+_STEPS, _LAST_STEP = 6, 0.03
 
 # The way back only has to tell whether it leads near the beginning, by as many pixels.
 _STEPS_BACK, _LAST_STEP_BACK, _THERE_AND_BACK = 3, 0.1, 1.0
@@ -27,15 +31,18 @@ _STEPS_BACK, _LAST_STEP_BACK, _THERE_AND_BACK = 3, 0.1, 1.0
 # by 128.
 _ALIKE = 80
 
-# Pixels that the flow leads to from where it starts.
-REACH = _WINDOW / 2 * 2**_LEVELS
+
+def reach_of_levels(levels: int) -> float:
+    """Tell to how many pixels from where it starts the flow leads."""
+    return _WINDOW / 2 * float(2**levels)
 
 
-def follow(previous: View, current: View, start: Array, reach: float) -> tuple[Array, Array]:
+def follow(previous: View, current: View, start: Array, reach: float, levels: int = FAR
+           ) -> tuple[Array, Array]:
     """
     Follow the features of the previous view from where they may be seen, pixels `start` (N, 2).
 
-    Gives the pixels (N, 2) where they are, and the bits (N,) in which descriptors differ there:
+    levels: of the pyramid, NEAR or FAR. Gives the pixels (N, 2) where they are, and the bits (N,) in which descriptors differ there:
     infinitely many for those that are lost, which are farther than `reach` from the start, do not
     lead back, or look otherwise.
     """
@@ -44,7 +51,7 @@ def follow(previous: View, current: View, start: Array, reach: float) -> tuple[A
     if not len(points):
         return points, bits
     x, at_first = (places.astype(np.float32)[:, None] for places in (points, start))
-    y, seen = _flow(previous.gray, current.gray, x, at_first, _LEVELS, _STEPS, _LAST_STEP)
+    y, seen = _flow(previous.gray, current.gray, x, at_first, levels, _STEPS, _LAST_STEP)
     back, seen_back = _flow(current.gray, previous.gray, y, x, 0, _STEPS_BACK, _LAST_STEP_BACK)
     good = np.flatnonzero(
         seen & seen_back & (np.linalg.norm(back - x, axis=2).ravel() < _THERE_AND_BACK)

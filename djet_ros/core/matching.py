@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from djet_ros.core.features import match_everywhere, match_nearby
-from djet_ros.core.flow import follow, REACH
+from djet_ros.core.flow import FAR, follow, NEAR, reach_of_levels
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.starts import Known
@@ -59,12 +59,13 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     if (prior is None or known.turn is not None or search_radius >= 1
             or prior.inliers.sum() < _MANY or prior.inliers.mean() < RIGID):
         return None
-    reach = min(REACH, search_radius * max(current.gray.shape))
+    near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
+                 for levels in (NEAR, FAR))
     R = prior.R if known.guess is None else known.guess.R
-    matched = _follow_on(previous, current, prior, R, reach)
+    matched = _follow_on(previous, current, prior, R, near, NEAR)
     if matched is None:
-        R = likely_rotation(previous.features, current.features, current.K, [R], reach)
-        matched = _follow_on(previous, current, prior, R, reach)
+        R = likely_rotation(previous.features, current.features, current.K, [R], far)
+        matched = _follow_on(previous, current, prior, R, far, FAR)
     return None if matched is None else (matched, Pose(R, prior.t))
 
 
@@ -87,11 +88,11 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     return _surest(there.points, *_settled(previous, current, y, bits, pairs))
 
 
-def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float
-               ) -> Matches | None:
+def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
+               levels: int) -> Matches | None:
     """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
     foreseen = foresee(previous.features, current.K, R, prior)
-    y, bits = follow(previous, current, foreseen, reach)
+    y, bits = follow(previous, current, foreseen, reach, levels)
     found = np.isfinite(bits)
     if found.sum() < max(_ENOUGH * prior.inliers.sum(), _MANY):
         return None
