@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 # Side of the window in pixels: the smaller the more exact, and at this one OpenCV is fastest.
 _WINDOW = 9
 
-# Levels of the pyramid on the way there, each twice as coarse, for places that are foreseen, and for
-# others.
+# Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and where
+# they are not.
 NEAR, FAR = 2, 3
 
 # Steps at each level at most, and pixels of a step that is the last. Surfaces refine it: more of
@@ -42,9 +42,9 @@ def follow(previous: View, current: View, start: Array, reach: float, levels: in
     """
     Follow the features of the previous view from where they may be seen, pixels `start` (N, 2).
 
-    levels: of the pyramid, NEAR or FAR. Gives the pixels (N, 2) where they are, and the bits (N,) in which descriptors differ there:
-    infinitely many for those that are lost, which are farther than `reach` from the start, do not
-    lead back, or look otherwise.
+    levels: of the pyramid, NEAR or FAR. Gives the pixels (N, 2) where they are, and the bits (N,)
+    in which descriptors differ there: infinitely many for those that are lost, which are farther
+    than `reach` from the start, do not lead back, or look otherwise.
     """
     points = previous.features.points
     bits = np.full(len(points), np.inf)
