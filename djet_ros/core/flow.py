@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 # Side of the window in pixels: the smaller the more exact, and at this one OpenCV is fastest.
 _WINDOW = 9
 
-# Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and where
-# they are not.
+# Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and
+# where they are not.
 NEAR, FAR = 2, 3
 
 # Steps at each level at most, and pixels of a step that is the last. Surfaces refine it: more of
