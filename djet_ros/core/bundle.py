@@ -125,9 +125,9 @@ class Landmarks:
 
     anchors: (N,) frames that saw them first; found: (N, 2) pixels there, around which their
     patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
-    where they are taken to be; rho: (N,) inverse depths there; minima: (N, F, 2) pixels y*; roots:
-    (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F) where the
-    last two mean anything.
+    where they are taken to be; rho: (N,) inverse depths there; slopes: (N, 2) by which share these
+    change around them, a pixel; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their
+    precision, so that ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
     """
 
     anchors: NDArray[np.int64]
@@ -135,6 +135,7 @@ class Landmarks:
     held: Array
     points: Array
     rho: Array
+    slopes: Array
     minima: Array
     roots: Array
     seen: NDArray[np.bool_]
@@ -143,12 +144,13 @@ class Landmarks:
         return len(self.rho)
 
     @classmethod
-    def at(cls, points: Array, rho: Array, anchor: int, frames: int) -> Landmarks:
-        """Make landmarks that no other frame has seen yet."""
+    def at(cls, points: Array, rho: Array, anchor: int, frames: int,
+           slopes: Array | None = None) -> Landmarks:
+        """Make landmarks that no other frame has seen yet; without slopes they face the camera."""
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), points, np.zeros((n, 2, 2)), points, rho,
-                   np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),
-                   np.zeros((n, frames), bool))
+                   np.zeros((n, 2)) if slopes is None else slopes, np.zeros((n, frames, 2)),
+                   np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
         """Give some of the landmarks."""
@@ -176,7 +178,7 @@ class Landmarks:
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
 
     def _by_anchor(self) -> tuple[Any, ...]:
-        return self.anchors, self.found, self.held, self.points, self.rho
+        return self.anchors, self.found, self.held, self.points, self.rho, self.slopes
 
     def _by_frame(self) -> tuple[Any, ...]:
         return self.minima, self.roots, self.seen

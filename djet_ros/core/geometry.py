@@ -203,6 +203,19 @@ def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     return np.asarray(growth[:, None, None] * (M[:2, :2] - y[:, :, None] * M[2, :2]))
 
 
+def slant_warp(K: Array, t: Array, y: Array, growth: Array, slope: Array) -> Array:
+    """
+    (N, 2, 2) what `patch_warp` lacks of dy/dx where patches do not face the camera.
+
+    t: (3,) translation to B; slope: (N, 2) how inverse depth in A, over the unit of t, changes a
+    pixel. Of y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is
+    Z_A / Z_B ((K t)_12 - y t_3).
+    """
+    shift = K @ t
+    return np.asarray((growth[:, None] * (shift[:2] - y * shift[2]))[:, :, None]
+                      * slope[:, None])
+
+
 def inverses(A: Array) -> Array:
     """Invert matrices (N, 2, 2) that are not singular: six times as fast as one by one."""
     a, b, c, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1]

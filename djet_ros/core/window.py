@@ -3,7 +3,9 @@ A window of frames and of the landmarks that they share: what ties the lengths o
 
 A landmark keeps the descriptor of the frame that saw it first, its anchor, and its inverse depth
 there. Each later frame samples the landmark's surface anew where pose and depth let it be
-expected, seen through the warp that they imply: nothing is detected again, so nothing wanders.
+expected, seen through the warp that they imply: nothing is detected again, so nothing wanders. The
+warp is that of a surface that leans as depths around the landmark say (`core.slants`): were all
+taken to face the camera, a road's places would be off by up to half a pixel, alike in all.
 `djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
 what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
 al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015).
@@ -33,12 +35,14 @@ from djet_ros.core.geometry import (
     patch_warp,
     rays,
     skew,
+    slant_warp,
     sphere_tangents,
     unit,
 )
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
+from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
     comparable,
@@ -84,6 +88,8 @@ class WindowTuning:
     # pixels; chosen: what a match is off at most, but for false ones; and the share by which the
     # depth of a landmark may be
     matched: float = 0.4
+    # pixels; chosen: what right matches are off, where surfaces are fitted to them
+    off: float = 0.1
     known: float = 0.15
     # chosen: inverse depth, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
@@ -293,7 +299,9 @@ class Window:
         tuning, anchor = self._tuning, len(self._images) - 2
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        rho, _ = inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
+        rho, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
+        ahead, off = rho > 0, tuning.off / self._K[0, 0] * sigma
+        surfaces = x[ahead], rho[ahead], off[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._images[anchor].shape)
         x, rho = x[usable], rho[usable]
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
@@ -306,7 +314,8 @@ class Window:
         x, rho = x[nearest], rho[nearest]
         chosen = _spread(x, present, side, tuning.landmarks - len(here))
         self._landmarks = self._landmarks.joined(Landmarks.at(
-            x[chosen], rho[chosen] / length, anchor, len(self._images)))
+            x[chosen], rho[chosen] / length, anchor, len(self._images),
+            slopes(*surfaces, x[chosen])))
 
     def _measure(self) -> None:
         """Sample the surfaces of landmarks in the newest frame, where they are expected."""
@@ -319,10 +328,13 @@ class Window:
         # One that neither of the last two frames saw is gone.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
         warps = np.empty((len(landmarks), 2, 2))
+        R, t = (motions[newest] for motions in self._poses.between())
+        lean = landmarks.rho[:, None] * landmarks.slopes
         for anchor in np.unique(landmarks.anchors[wanted]):
             mine = wanted & (landmarks.anchors == anchor)
-            turn = self._poses.R[newest] @ self._poses.R[anchor].T
-            warps[mine] = patch_warp(self._K, turn, expected[mine], 1 / places[mine, 2])
+            seen = expected[mine], 1 / places[mine, 2]
+            warps[mine] = patch_warp(self._K, R[anchor], *seen) + slant_warp(
+                self._K, t[anchor], *seen, lean[mine])
         mine = np.argsort(landmarks.anchors, kind='stable')
         mine = mine[wanted[mine]]
         mine = mine[comparable(warps[mine])]

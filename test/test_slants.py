@@ -1,0 +1,57 @@
+"""How surfaces lean: exact planes are told, and what is beyond an edge does not bend them."""
+
+from __future__ import annotations
+
+from djet_ros.core.geometry import patch_warp, rotation_exp, slant_warp
+from djet_ros.core.slants import slopes
+import numpy as np
+import pytest
+
+K = np.array([[700.0, 0, 600], [0, 650, 180], [0, 0, 1]])
+
+
+def test_the_warp_of_a_plane_is_the_derivative_of_where_its_points_are_seen() -> None:
+    R, t = rotation_exp(np.array([0.02, -0.05, 0.03])), np.array([0.3, -0.1, -0.8])
+    x, rho, lean = np.array([710.0, 260.0]), 0.12, np.array([-2e-4, 6e-4])
+
+    def seen(off: np.ndarray) -> tuple[np.ndarray, float]:
+        ray = np.linalg.inv(K) @ [*(x + off), 1.0]
+        place = R @ ray + (rho + lean @ off) * t
+        return (K @ place)[:2] / place[2], place[2]
+
+    y, z = seen(np.zeros(2))
+    y, growth = y[None], np.array([1 / z])
+    warp = patch_warp(K, R, y, growth) + slant_warp(K, t, y, growth, lean[None])
+    steps = np.eye(2) * 1e-4
+    numeric = np.stack([(seen(step)[0] - seen(-step)[0]) / 2e-4 for step in steps], axis=1)
+    assert warp[0] == pytest.approx(numeric, rel=1e-6)
+
+
+def test_a_road_is_told_from_its_points() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.uniform((0, 230), (1200, 370), (600, 2))
+    rho = (x[:, 1] - 180) / (650 * 1.65)  # exact, for a camera 1.65 m above it
+    sigma = 0.005 * rho
+    inner = (np.abs(x - [600, 300]) < [500, 30]).all(1)
+    found = slopes(x, rho, sigma, x[inner])
+    assert found[:, 0] == pytest.approx(0, abs=3e-4)
+    assert found[:, 1] == pytest.approx(1 / (x[inner, 1] - 180), rel=0.05)
+    noisy = slopes(x, rho + rng.normal(size=600) * sigma, sigma, x[inner])
+    assert np.median(np.abs(noisy - found).max(1)) < 1e-3
+
+
+def test_what_is_beyond_an_edge_does_not_lean() -> None:
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 300, (900, 2))
+    behind = x[:, 0] > 150
+    rho = np.where(behind, 0.05, 0.2)
+    before = np.abs(x - [130, 150]) < [5, 120]
+    found = slopes(x, rho, 0.01 * rho, x[before.all(1)])
+    assert np.median(np.abs(found)) < 1e-3
+
+
+def test_points_without_neighbours_face_the_camera() -> None:
+    x = np.arange(20.0)[:, None] * [200.0, 0.0]
+    assert not slopes(x, np.ones(20), np.full(20, 0.01), x).any()
+    assert slopes(x[:3], np.ones(3), np.ones(3), x).shape == (20, 2)
+    assert slopes(x, np.ones(20), np.ones(20), x[:0]).shape == (0, 2)
