@@ -12,10 +12,10 @@ from djet_ros.core.jet import (
     minimise,
     moved,
     robust_scale,
+    Solution,
     with_places,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.types import Pose
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
@@ -306,6 +306,11 @@ def ellipses(rng, places, sigma):
                        np.zeros(len(places)), np.ones(len(places), bool)), S
 
 
+def at(problem, R, t):
+    """Take a pose as the solution of a problem."""
+    return Solution(R, t, 0.0, epipolar_residuals(problem, R, t))
+
+
 def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
     rng = np.random.default_rng(20)
     views = two_views(rng, 400)
@@ -314,7 +319,7 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
     found = y + rng.normal(0, 0.2, y.shape)
     found[::40] += 30  # these were found elsewhere
     alone = jet_problem(K, x, surfaces)
-    joined = with_places(alone, K, found, Pose(R, t))
+    joined = with_places(alone, at(alone, R, t), K, found)
     # How exact each is, in pixels: from its distances to the true lines.
     lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
     normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
@@ -345,8 +350,9 @@ def test_a_pose_of_surfaces_and_matches_is_no_less_exact_than_that_of_either(sig
         surfaces, _ = ellipses(rng, y, 0.3)
         found = y + rng.normal(0, sigma, y.shape)
         problems = [jet_problem(K, x, surfaces), jet_problem(K, x, circles(found))]
-        poses = [minimise(problem, R, t, Loss()).pose for problem in problems]
-        joined = with_places(problems[0], K, found, poses[0])
+        solutions = [minimise(problem, R, t, Loss()) for problem in problems]
+        poses = [solution.pose for solution in solutions]
+        joined = with_places(problems[0], solutions[0], K, found)
         poses.append(minimise(joined, R, t, Loss()).pose)
         errors.append([rotation_angle(R, pose.R) for pose in poses])
     surface, match, both = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -358,7 +364,7 @@ def test_where_a_surface_has_no_minimum_or_nothing_was_found_right_surfaces_coun
     views = two_views(rng, 60)
     x, y, R, t = views.x, views.y, views.R, views.t
     problem = jet_problem(K, x, random_surfaces(rng, y, 'indefinite'))
-    joined = with_places(problem, K, y, Pose(R, t))
+    joined = with_places(problem, at(problem, R, t), K, y)
     saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
     saddles |= problem.spread[0] <= 0
     assert saddles.sum() > 10

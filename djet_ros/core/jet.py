@@ -22,7 +22,14 @@ from djet_ros.core.geometry import (
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import inverse_2x2, median, middle, Paraboloids, times
+from djet_ros.core.paraboloid import (
+    inverse_2x2,
+    median,
+    medians,
+    middles,
+    Paraboloids,
+    times,
+)
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +58,7 @@ _ONE_PLACE = 4.6
 
 # chosen: matches are taken to be this much less exact than they look, in squares, for neighbours
 # err alike where the image grows, which whoever found them may not have seen.
-_ALIKE = 2.0
+_LESS_EXACT = 2.0
 
 
 @dataclass(frozen=True)
@@ -165,13 +172,14 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     return JetProblem(rays(K, x).T.copy(), rays(K, minima).T.copy(), spread, blur)
 
 
-def with_places(problem: JetProblem, K: Array, y: Array, pose: Pose) -> JetProblem:
+def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> JetProblem:
     """
     Join what residual surfaces tell of places with where these were found, pixels y (N, 2).
 
     The sum of two residuals of the paper: that of the surface, and the re-projection error. Both
     measure one place, with covariances S and T = sigma^2 I; how exact each is, it shows by its
-    distances from the epipolar lines of a pose. Of two Gaussians that is the place
+    distances from the epipolar lines of the solution, which is that of the surfaces alone. Of two
+    Gaussians that is the place
 
         y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
 
@@ -183,10 +191,11 @@ def with_places(problem: JetProblem, K: Array, y: Array, pose: Pose) -> JetProbl
     width = np.trace(pixel) / 2
     found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)), spread=np.repeat(
         pixel[[0, 0, 1], [0, 1, 1]][:, None], len(y), axis=1))
+    off = epipolar_residuals(found, solution.R, solution.t).r
     # In square pixels.
-    S, T = (much / width * core_scale(epipolar_residuals(measured, pose.R, pose.t).r)**2
-            * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
-            for measured, much in ((problem, 1.0), (found, _ALIKE)))
+    S, T = (much / width * core_scale(r)**2 * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
+            for measured, r, much in ((problem, solution.residuals.r, 1.0),
+                                      (found, off, _LESS_EXACT)))
     apart = (problem.rays_y - found.rays_y)[:2].T / np.sqrt(width)
     inverse = inverse_2x2(S + T)
     has_minimum = (S[:, 0, 0] > 0) & (S[:, 0, 0] * S[:, 1, 1] > S[:, 0, 1]**2)
@@ -278,11 +287,9 @@ def robust_scale(residuals: Array) -> float:
 
 def robust_scales(residuals: Array) -> Array:
     """Give the same (S,) of each row of (S, N)."""
-    half, odd = divmod(residuals.shape[1], 2)
-    if not half:
-        return np.array([robust_scale(row) for row in residuals])
-    middle = np.partition(np.abs(residuals), (half - 1, half), axis=1)[:, half - 1:half + 1]
-    return _NORMAL * (middle[:, 1] if odd else (middle[:, 0] + middle[:, 1]) / 2)
+    if not residuals.shape[1]:
+        return np.ones(len(residuals))
+    return _NORMAL * medians(np.abs(residuals))
 
 
 def core_scale(residuals: Array) -> float:
@@ -296,7 +303,7 @@ def core_scale(residuals: Array) -> float:
     ordered = np.sort(np.abs(residuals))
     count = len(ordered)
     for _ in range(1 + _CORE_ROUNDS):
-        scale = _NORMAL * middle(ordered[:count]) if count else 1.0
+        scale = _NORMAL * float(middles(ordered[:count])) if count else 1.0
         before, count = count, int(ordered.searchsorted(_CORE * scale))
         if count == before:
             break

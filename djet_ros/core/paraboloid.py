@@ -91,16 +91,20 @@ def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Par
 
 def median(values: Array) -> float:
     """Median of (N,) values, at a third of the price of ``np.median``."""
-    half = len(values) // 2
-    return middle(np.partition(values, half if len(values) % 2 else (half - 1, half)))
+    return float(medians(values))
 
 
-def middle(ordered: Array) -> float:
-    """Median of (N,) values that are ordered, at least at their middle."""
-    half = len(ordered) // 2
-    if len(ordered) % 2:
-        return float(ordered[half])
-    return float(ordered[half - 1] + ordered[half]) / 2
+def medians(values: Array) -> Array:
+    """Medians (...,) of (..., N) values."""
+    half, odd = divmod(values.shape[-1], 2)
+    return middles(np.partition(values, half if odd else (half - 1, half)))
+
+
+def middles(ordered: Array) -> Array:
+    """Medians (...,) of (..., N) values that are ordered, at least at their middle."""
+    half, odd = divmod(ordered.shape[-1], 2)
+    return np.asarray(
+        ordered[..., half] if odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
 
 
 def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:

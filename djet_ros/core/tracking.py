@@ -215,7 +215,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         if last and rival_poses:
             # Judge again between the basins, on the last surfaces.
             solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
-        begun = begun._replace(scale=_scale(solution.residuals.r))
+        if last:
+            begun = begun._replace(scale=_scale(solution.residuals.r))
         if last and config.join_matches and config.method != 'rpe':
             # Step 2 once more: where matches were found is a measurement of its own.
             solution, loss = _joined(problem, K, y[voting], solution, loss, config)
@@ -242,7 +243,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
 def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
             config: EstimatorConfig) -> tuple[Solution, Loss]:
     """Optimise the pose by surfaces and by where matches were found, y (N, 2), together."""
-    problem = with_places(problem, K, y, solution.pose)
+    problem = with_places(problem, solution, K, y)
     agreeing = np.abs(solution.residuals.r) < loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t).r
     loss = replace(loss, scale=config.loss_scale * _scale(residuals[agreeing]))

@@ -88,9 +88,9 @@ class WindowTuning:
     # pixels; chosen: what a match is off at most, but for false ones; and the share by which the
     # depth of a landmark may be
     matched: float = 0.4
+    known: float = 0.15
     # pixels; chosen: what right matches are off, where surfaces are fitted to them
     off: float = 0.1
-    known: float = 0.15
     # chosen: inverse depth, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length

@@ -68,10 +68,16 @@ class Standstill:
         """
         if not len(relative.x):
             return False
-        return _nothing_moved(relative, most) or (at_rest and (
-            self._only_others_moved(relative, most) or self._world_stands(relative, most)))
+        if _nothing_moved(relative, most):
+            return True
+        if not at_rest:
+            return False
+        still, hardly = _still_and_hardly(relative, most)
+        return (self._only_others_moved(relative, still, hardly)
+                or self._world_stands(relative, still, hardly))
 
-    def _only_others_moved(self, relative: RelativePose, most: float) -> bool:
+    def _only_others_moved(self, relative: RelativePose, still: NDArray[np.bool_],
+                           hardly: NDArray[np.bool_]) -> bool:
         """
         Tell traffic from a motion of the camera: much did not move.
 
@@ -80,13 +86,13 @@ class Standstill:
         move a little; before one that stands, things move or do not. Slow motion does not pass for
         standstill for long, as the reference view stays and displacements add up.
         """
-        still, hardly = _still_and_hardly(relative, most)
         cells = np.floor_divide(relative.x, _CELL)
         spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
         least = _STILL if self._stood is False else _STILL_AS_BEFORE
         return bool(still.mean() > least and spread > least and still.sum() > hardly.sum())
 
-    def _world_stands(self, relative: RelativePose, most: float) -> bool:
+    def _world_stands(self, relative: RelativePose, still: NDArray[np.bool_],
+                      hardly: NDArray[np.bool_]) -> bool:
         """
         Tell whether what stood before still does, however little is seen of it behind a lorry.
 
@@ -94,7 +100,6 @@ class Standstill:
         that moved, all but the furthest of what stood would be displaced a little, or agree with
         the motion that the pair tells; so more has to be where it was than either.
         """
-        still, hardly = _still_and_hardly(relative, most)
         world = np.isin(_named(relative.x), self._world)
         moved = np.zeros(len(world), bool)
         if len(relative.inliers):
