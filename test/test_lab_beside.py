@@ -11,18 +11,13 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import rotation_angle
 from djet_ros.core.starts import Known
-from djet_ros.core.types import Array, Status
+from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.lab.beside import GYRO, is_wrong, MASK, Moment, NOTHING, trial_rows
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import (
-    camera_motion,
-    OdometryResult,
-    TRACKED,
-    VisualOdometry,
-)
+from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult, VisualOdometry
 from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 import pytest

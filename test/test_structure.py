@@ -7,13 +7,13 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.types import Pose
+from djet_ros.core.types import Pose, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
-from djet_ros.odometry.visual_odometry import TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 from djet_ros.core.features import factor
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.types import Array, Features, RelativePose
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 # Features of the largest size that are compared with all of their size, wherever they are.
 _COMPARED = 250
@@ -22,10 +22,6 @@ _NEARLY_ALL = 0.98
 
 # Inverse depth, in units of the motion before, of what is as near as can be seen again.
 _NEAREST = 0.5
-
-# chosen: side in pixels of the cells in which the nearest match is looked for; corners that have
-# room are as far apart.
-_CELL = 6.0
 
 # Pixels by which the predicted turn may be off.
 _ROOM = 20.0
@@ -61,27 +57,7 @@ def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Arr
     # With z = 1 of x: of the same length as rho, whatever the depth.
     there = (seen @ before.R.T + step) @ R.T
     shift = _seen(K, there + step) - _seen(K, there)
-    return np.asarray(_seen(K, turned) + shift[_next_to(previous.points, y)])
-
-
-def _next_to(points: Array, places: Array) -> NDArray[np.int64]:
-    """Tell which (N,) of places (M, 2) is next to points (N, 2), or next but for some pixels."""
-    # A tree of the places, which would tell exactly, takes five times as long.
-    columns, rows = (((along - along.min()) / _CELL).astype(np.int64)
-                     for along in np.concatenate([places, points]).T.copy())
-    free, count = np.ones((rows.max() + 1, columns.max() + 1), np.uint8), len(places)
-    free[rows[:count], columns[:count]] = 0
-    labels = cv2.distanceTransformWithLabels(
-        free, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)[1]
-    label = labels[rows, columns]
-    # The first and the last place of each cell: hardly any has more than two.
-    ends = np.zeros((2, labels.max() + 1), np.int64)
-    ends[0, label[:count][::-1]] = np.arange(count)[::-1]
-    ends[1, label[:count]] = np.arange(count)
-    first, last = ends.take(label[count:], axis=1)
-    nearer_first, nearer_last = (((places.take(one, 0) - points)**2) @ (1, 1)
-                                 for one in (first, last))
-    return np.asarray(np.where(nearer_first <= nearer_last, first, last))
+    return np.asarray(_seen(K, turned) + shift[cKDTree(y).query(previous.points)[1]])
 
 
 def _seen(K: Array, places: Array) -> Array:

@@ -30,6 +30,17 @@ class Status(StrEnum):
     SIZE_CHANGED = 'SIZE_CHANGED'
 
 
+# Statuses under which the motion of a pair was estimated.
+TRACKED = (Status.OK, Status.NO_PARALLAX)
+
+# Statuses of pairs whose images are good, and tell two motions: from the newest image on it may be
+# told again, while over two steps what the bodies have in common is gone.
+UNDECIDED = (Status.AMBIGUOUS, Status.TWO_MOTIONS)
+
+# Statuses of a frame at which the odometry started or restarted, without a pair.
+STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
+
+
 @dataclass(frozen=True)
 class Features:
     """

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_log
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, TRACKED
 from djet_ros.lab.pairs import has_failed
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
@@ -23,7 +23,7 @@ from djet_ros.lab.scenes.panel import World
 from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
 from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 from numpy.typing import NDArray

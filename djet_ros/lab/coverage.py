@@ -17,12 +17,12 @@ import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_log, sphere_tangents, unit
-from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.lab.sequences import Dataset, opened, plain_name
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.visual_odometry import camera_motion, TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 from scipy.stats import beta, chi2

@@ -16,13 +16,13 @@ import cv2
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_log
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, TRACKED
 from djet_ros.lab.scenes import make_scene
 from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Common
 from djet_ros.odometry.uncertainty import PathCovariance
-from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
 from djet_ros.replay.drift import drift, one_factor, scale_change
 import numpy as np
 from numpy.typing import NDArray

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from djet_ros.config.sections import Config
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, TRACKED
 from djet_ros.lab.imu_offset import VisualTurns
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Tracker
-from djet_ros.odometry.visual_odometry import TRACKED
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.recording import Recording
 import numpy as np

@@ -6,10 +6,10 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 from djet_ros.config.sections import OdometryConfig
-from djet_ros.core.types import Status
+from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_and_rest
 from djet_ros.odometry.scale import Scale, ScaleSource
-from djet_ros.odometry.visual_odometry import OdometryResult, TRACKED
+from djet_ros.odometry.visual_odometry import OdometryResult
 
 # Images over which shares are taken, and of which they say nothing yet.
 _WINDOW, _FEW = 100, 20

@@ -15,12 +15,12 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import NODE_NAME, OdometryConfig
-from djet_ros.core.types import Array, Status
+from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
 from djet_ros.odometry.scale import Scale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
-from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED
+from djet_ros.odometry.visual_odometry import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

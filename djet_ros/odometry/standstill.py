@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 import numpy as np
 from numpy.typing import NDArray
-
-# Statuses of pairs that a camera may have stood still in without any help; two equal images are
-# DEGENERATE to most estimators, for want of any residual.
-_NOTHING_WRONG = (Status.OK, Status.NO_PARALLAX, Status.DEGENERATE)
 
 # Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
 # that are where they were if the camera stands in front of traffic; chosen: and if it has stood
@@ -110,7 +106,8 @@ class Standstill:
 
 
 def _nothing_moved(relative: RelativePose, most: float) -> bool:
-    if relative.status not in _NOTHING_WRONG:
+    # Two equal images are DEGENERATE to most estimators, for want of any residual.
+    if relative.status not in (*TRACKED, Status.DEGENERATE):
         return False
     refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
     y = relative.y_opt if refined else relative.y

@@ -12,7 +12,7 @@ import math
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config, NODE_NAME
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, STARTED, TRACKED
 from djet_ros.odometry.beside import Beside
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
@@ -23,7 +23,7 @@ from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
-from djet_ros.odometry.visual_odometry import OdometryResult, STARTED, TRACKED, VisualOdometry
+from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
 import numpy as np
 from numpy.typing import NDArray
 

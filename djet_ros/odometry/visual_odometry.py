@@ -9,7 +9,15 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import agrees, fused, Turn
 from djet_ros.core.starts import Known
-from djet_ros.core.types import Array, Pose, RelativePose, Status, View
+from djet_ros.core.types import (
+    Array,
+    Pose,
+    RelativePose,
+    Status,
+    TRACKED,
+    UNDECIDED,
+    View,
+)
 from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
@@ -23,16 +31,6 @@ from djet_ros.odometry.uncertainty import (
     UNKNOWN_MOTION,
 )
 import numpy as np
-
-# Statuses under which the motion of a pair was estimated.
-TRACKED = (Status.OK, Status.NO_PARALLAX)
-
-# Statuses of pairs whose images are good, and tell two motions: from the newest image on it may be
-# told again, while over two steps what the bodies have in common is gone.
-UNDECIDED = (Status.AMBIGUOUS, Status.TWO_MOTIONS)
-
-# Statuses of a frame at which the odometry started or restarted, without a pair.
-STARTED = (Status.FIRST_FRAME, Status.TIME_JUMP, Status.SIZE_CHANGED)
 
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4

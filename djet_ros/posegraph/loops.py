@@ -12,12 +12,12 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rays, unit
 from djet_ros.core.masks import blocked
-from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.core.types import Array, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
-from djet_ros.odometry.visual_odometry import camera_motion, TRACKED
+from djet_ros.odometry.visual_odometry import camera_motion
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.places import PlaceIndex
 from djet_ros.posegraph.pose_graph import Edge

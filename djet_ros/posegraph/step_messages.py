@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, STARTED, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import (
     frame_status,
@@ -20,7 +20,6 @@ from djet_ros.odometry.messages import (
 )
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
-from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.steps import Step
 import numpy as np
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from djet_ros.core.types import Array, Status
+from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
-from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 import numpy as np
 

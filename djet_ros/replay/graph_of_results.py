@@ -11,12 +11,11 @@ from typing import NamedTuple
 from djet_ros.config.safe_files import read_text
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
-from djet_ros.core.types import Array, Status
+from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
-from djet_ros.odometry.visual_odometry import STARTED, TRACKED
 from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.bags import Bag
