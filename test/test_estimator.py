@@ -411,11 +411,13 @@ def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
     a, b = (estimator.view(scene.render(pose, i), scene.K)
             for i, pose in enumerate(scene.trajectory(2)))
     alone = estimator.estimate(a, b)
-    # A motion ahead that is none, of a camera that flies sideways and looks up.
+    # A motion ahead that is none, of a camera that flies sideways and looks up; and matches too
+    # few to be clearly for one basin.
     astray = Pose(Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix(), np.array([1.0, 0.0, 0.0]))
+    x, y = alone.x[:60], alone.y[:60]
     began = perf_counter()
     stages: dict[str, float] = {}
-    estimator.estimate_matched(a, b, alone.x, alone.y, timings=stages, ahead=astray)
+    estimator.estimate_matched(a, b, x, y, timings=stages, ahead=astray)
     took = perf_counter() - began
     assert stages['starts'] > 0
     assert 0.8 * took < sum(stages.values()) < took

@@ -154,7 +154,7 @@ class TwoViewEstimator:
             with _timed(timings, 'starts', within='jet'):
                 return self._starts(K, x, y, before, known)
 
-        # Where it is known how the camera goes on, so is at once how patches are seen.
+        # Where it is known how the camera goes on, so is where features were followed from.
         likely = None if starts or ahead is None else Ahead(ahead, others)
         track = self._track(surface, K, y, starts, before, observe, known, likely, timings)
         if track is None:

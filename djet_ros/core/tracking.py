@@ -38,7 +38,7 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
-from djet_ros.core.surfaces import comparable, ResidualSurface, with_minimum
+from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -135,8 +135,8 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     motion. Without any starts they are looked for around the pose ahead. Where two bodies move, it
     is the camera's motion, as far as that can be told. None where too few matches have a usable
     surface. observe: is called at the end of each round; turn: a rotation that was measured, which
-    tells basins and bodies apart; ahead: if one is likely, a pose by which patches are seen from
-    the first round on.
+    tells basins and bodies apart; ahead: a pose that is likely, from which the keypoints were
+    followed: exactly enough for the first round to go by them alone.
     """
     found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool),
                    ahead)
@@ -185,14 +185,17 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, losses = y.copy(), np.full(len(y), np.nan)
     poses, begun = starts, None
-    warp = (None if ahead is None or not config.warp_reference
-            else _warps(ahead.pose, K, surface.x, y)[0])
+    # Places that were followed tell the pose well enough to sample surfaces only once: around them
+    # on its lines, as it stretches the patches.
+    first = (surface if ahead is None or config.max_iterations == 1
+             else ReprojectionSurface(surface.x, y))
+    warp: Array | None = None
     rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
-        fits = surface.around(keypoints, warp)
+        fits = (first if iteration == 1 else surface).around(keypoints, warp)
         paraboloids, no_minimum = with_minimum(fits, config.indefinite)
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive = alive & paraboloids.usable
