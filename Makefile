@@ -8,6 +8,7 @@ SEQUENCE ?=
 FRAMES ?= 21
 REAL_FRAMES ?=
 ONLY ?=
+TABLES ?= dds soak outvoted links loops 'camera height'
 SEEDS ?= 0,1,2,3,4
 # in the order of their names: files of few tests, some of them long, would come last
 PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
@@ -17,7 +18,7 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 	$$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
 	2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test lint lowest fuzz audit results pages clean
+.PHONY: demo test lint lowest fuzz audit results recorded pages clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
@@ -46,6 +47,11 @@ audit: $(AUDIT)/.installed
 results: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/measure.py --frames $(FRAMES) --seeds $(SEEDS) \
 		$(if $(REAL_FRAMES),--real-frames $(REAL_FRAMES)) $(if $(ONLY),--only '$(ONLY)')
+	$(VENV)/bin/python doc/pages.py
+
+# tables beside those: TABLES of node, dds, soak, outvoted, links, loops and 'camera height'
+recorded: $(VENV)/.installed-test,peers
+	$(VENV)/bin/python doc/record.py $(TABLES)
 	$(VENV)/bin/python doc/pages.py
 
 # what stands between generated marks in the README and in doc/

@@ -1,0 +1,435 @@
+"""
+Measures figures of doc/recorded.yaml: what takes minutes, a pose graph or processes of its own.
+
+Real frames are those of $DJET_DATA. What a node does is told by processes on a ROS graph: one
+plays a recording, one is the node, and this one listens; it needs djet_ros[dds,slam]. The node may
+be any command, such as one that brings its own ROS along.
+
+    python doc/record.py links outvoted soak 'camera height' loops dds
+    python doc/record.py node --node '. install/setup.sh; ros2 run djet_ros vo_node --ros-args'
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack, suppress
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import shlex
+import signal
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Any
+
+import djet_ros
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.config.yaml_files import load_yaml
+from djet_ros.core.types import Array
+from djet_ros.dds.graph import Graph
+from djet_ros.lab.scenes import render_sequence
+from djet_ros.lab.sequences import open_datasets, opened, Selection
+from djet_ros.live.middleware import Profile
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.posegraph.backend import optimise
+from djet_ros.posegraph.offline import run_slam
+from djet_ros.posegraph.pose_graph import Edge
+from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.recording import open_recording
+from djet_ros.replay.alignment import aligned, position_rmse
+from djet_ros.replay.graph_of_results import read_steps
+from djet_ros.replay.ground_truth import GroundTruth
+import numpy as np
+from scipy.spatial.transform import Rotation
+import yaml
+
+OUTPUT = Path(__file__).with_name('recorded.yaml')
+HEAD = """\
+# Figures that `make results` cannot make: they need a ROS graph, a pose graph or hours. Each table
+# says with which version of the package it was measured, and how; doc/record.py measures most.
+
+"""
+DJET = (sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())')
+
+# Not the graph of a robot that happens to be near.
+GRAPH = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'OMP_NUM_THREADS': '1',
+         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
+PATIENCE = 60.0
+
+# As which djet play publishes what a KITTI folder holds.
+IMAGE = '/camera/image_rect'
+
+HEIGHT = 1.65
+LINKS = (1, 2, 3)
+WRONG, PLACES = (360.0, 2000.0), 8
+MANY, MARKS = 10_000, (6_000, 10_000)
+
+
+def main() -> int:
+    args = arguments()
+    tables = yaml.safe_load(OUTPUT.read_text())
+    for name in args.tables:
+        with TemporaryDirectory() as place:
+            table = MEASURED[name](Path(place), args)
+        tables[name] = {'version': djet_ros.__version__, **table}
+        text = yaml.safe_dump(tables, sort_keys=False, allow_unicode=True, width=10**6,
+                              default_flow_style=None)
+        write_whole(OUTPUT, HEAD + text)
+        print(name, flush=True)
+    return 0
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=str(__doc__).split('\n\n')[0])
+    parser.add_argument('tables', nargs='+', choices=MEASURED, metavar='TABLE',
+                        help=f'of {", ".join(MEASURED)}')
+    parser.add_argument('--node', default='exec ros2 run djet_ros vo_node --ros-args',
+                        metavar='COMMAND',
+                        help='what a shell is to run as the node, parameters come after it '
+                             '(default: %(default)s)')
+    data = os.environ.get('DJET_DATA')
+    parser.add_argument('--data', type=Path, default=data and Path(data), required=not data,
+                        metavar='DIR', help='folder of real sequences (default: $DJET_DATA)')
+    return parser.parse_args()
+
+
+def djet(*words: Any) -> None:
+    """Run a djet command to its end, or raise what it said."""
+    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f'djet {" ".join(map(str, words))}: {done.stderr}')
+
+
+def kitti(args: argparse.Namespace, *names: str) -> dict[str, Path]:
+    """Folders of KITTI's sequences, by what tables call them."""
+    found = {}
+    for name in names:
+        folder = args.data / 'kitti' / 'sequences' / name
+        frames = len([*folder.glob('image_0/*')])
+        found[f'KITTI {name} (frames 0–{frames - 1})'] = folder
+    return found
+
+
+# Pose graphs
+
+
+def links(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Link each keyframe to more of those before it, on real frames."""
+    sources = kitti(args, '00', '03', '06')
+    rows = []
+    for number in LINKS:
+        errors = []
+        for source in sources.values():
+            result = slam(place, source, '--links', number, '--keyframe-distance', 0.2,
+                          *exact_lengths(0.01))['errors']['after']
+            errors.append(f"{result['evo_ape_m']:.3f} / {result['evo_rpe_deg']:.4f}")
+        rows.append([str(number), *errors])
+    return {'how': '`djet slam SEQUENCE --links N --keyframe-distance 0.2 --scale ground_truth '
+                   '--scale-uncertainty 0.01`: lengths known to 1 %. APE in m / RPE in deg, by '
+                   'evo.', 'header': ['N', *sources], 'rows': rows}
+
+
+def loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Drive round a block twice, in several sizes of images."""
+    images = (('1241x376', 0), ('1241x376', 1), ('620x188', 0), ('620x188', 1), ('416x128', 0))
+    runs: list[tuple[str, int, tuple[Any, ...]]] = [
+        *((*one, ()) for one in images),
+        ('1241x376', 0, ('--scale', 'camera_height', '--camera-height', HEIGHT)),
+        *((*one, exact_lengths(0.01)) for one in images)]
+    rows = []
+    for size, seed, scale in runs:
+        result = slam(place, block(place, size, seed), *scale)
+        before, after = result['errors']['before'], result['errors']['after']
+        rows.append([
+            f"{size.replace('x', '×')}, seed {seed}",
+            {'structure': 'structure', 'camera_height': 'camera height',
+             'ground_truth': 'ground truth, 1 %'}[result['scale']],
+            f"{result['edges'].get('loop', 0)} ({result['rejected'].get('loop', 0)})",
+            f"{before['ape_m']:.3f} m", f"{after['ape_m']:.3f} m",
+            f"{before['ape_m'] / after['ape_m']:.1f}",
+            f"{1e3 * before['evo_rpe_m']:.1f} → {1e3 * after['evo_rpe_m']:.1f} mm, "
+            f"{before['evo_rpe_deg']:.3f} → {after['evo_rpe_deg']:.3f}°"])
+    return {'how': '`djet lab render loop DIR --frames 427 --seed S --size WxH` (362 m) and '
+                   '`djet slam DIR/sequences/02 --scale SCALE`; a ratio is APE before over APE '
+                   'after. Lengths by structure alone have no metres: APE after alignment with '
+                   'scale.',
+            'header': ['images', 'lengths by', 'loops (not trusted)', 'APE before', 'APE after',
+                       'ratio', 'RPE before → after'], 'rows': rows}
+
+
+def outvoted(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Put one odometry edge wrong, which no robust kernel covers, and optimise."""
+    source, results = block(place, '620x188', 0), place / 'slam' / 'replay'
+    slam(place, source, *exact_lengths(0.01))
+    recording = open_recording(source)
+    try:
+        found = run_slam(read_steps(results), recording, load_yaml(results / 'config.yaml'),
+                         scratch=place)
+        truth = GroundTruth.of(recording)
+    finally:
+        recording.close()
+    graph = found.optimised.graph
+    true = truth.at(graph.stamps_ns)[:, :3, 3]
+
+    def error(edges: tuple[Edge, ...]) -> float:
+        places = optimise(replace(graph, edges=edges)).graph.poses[:, :3, 3]
+        return position_rmse(aligned(places, true, found.metric), true)
+
+    chain = [number for number, edge in enumerate(graph.edges) if edge.kind == 'odometry']
+    chosen = [chain[i] for i in np.linspace(0, len(chain) - 1, PLACES + 2).astype(int)[1:-1]]
+    random, rows = np.random.default_rng(0), []
+    for square in WRONG:
+        after = [error((*graph.edges[:number], put_wrong(graph.edges[number], square, random),
+                        *graph.edges[number + 1:])) for number in chosen]
+        rows.append([f'{square:.0f}', f'{min(after):.3f} to {max(after):.3f} m'])
+    return {'how': f'One of {len(chain)} odometry edges of the loop (620×188, seed 0; ground '
+                   'truth, 1 %) off by a given χ², in a direction drawn at random, at eight '
+                   f'places round the block. APE of keyframes after; {error(graph.edges):.3f} m '
+                   'without a wrong edge.',
+            'header': ['χ² of the wrong edge', 'APE after'], 'rows': rows}
+
+
+def put_wrong(edge: Edge, square: float, random: np.random.Generator) -> Edge:
+    """Put an edge off by a squared Mahalanobis distance, in a direction drawn at random."""
+    direction = random.normal(size=6)
+    direction *= np.sqrt(square / (direction @ direction))
+    off = np.linalg.cholesky(edge.covariance_in_target()) @ direction
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = Rotation.from_rotvec(off[3:]).as_matrix(), off[:3]
+    return replace(edge, motion=edge.motion @ moved)
+
+
+def exact_lengths(share: float) -> tuple[str | float, ...]:
+    return '--scale', 'ground_truth', '--scale-uncertainty', share
+
+
+def block(place: Path, size: str, seed: int) -> Path:
+    """Render the drive round a block, once."""
+    folder = place / f'{size}-{seed}'
+    if not folder.exists():
+        djet('lab', 'render', 'loop', folder, '--frames', 427, '--seed', seed, '--size', size)
+    return next((folder / 'sequences').iterdir())
+
+
+def slam(place: Path, source: Path, *words: Any) -> dict[str, Any]:
+    """Give the summary of ``djet slam``."""
+    djet('slam', source, '--output', place / 'slam', '--overwrite', *words)
+    summary: dict[str, Any] = json.loads((place / 'slam' / 'slam.json').read_text())
+    return summary
+
+
+# Odometry
+
+
+def soak(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Run many frames through the odometry."""
+    djet('lab', 'soak', '--output', place / 'soak.json')
+    found = json.loads((place / 'soak.json').read_text())
+    statuses, stretches = found['status'], found['stretches']
+    tracked = sum(statuses.get(name, 0) for name in ('OK', 'NO_PARALLAX'))
+    jumps = statuses.get('TIME_JUMP', 0)
+    other = found['frames'] - tracked - jumps - statuses.get('FIRST_FRAME', 0)
+    return {'how': f"`djet lab soak`, {found['frames']:,} frames of 416×128, {other:,} of them "
+                   f'that could not be tracked, {jumps} time jumps.',
+            'header': [f"resident memory at {stretches[0]['frames']:,} frames",
+                       f"at {found['frames']:,} frames"],
+            'rows': [[f"{stretches[0]['memory_mb']:.1f} MB", f"{found['memory_mb']:.1f} MB"]]}
+
+
+def camera_height(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Hold lengths by the camera's height against the truth."""
+    rows = []
+    for name, folder in kitti(args, '00', '03', '06').items():
+        found = lengths(folder, None)
+        rows.append(row_of(name, found))
+        if ' 00 ' in name:
+            rows.append(row_of(name.replace('0–', '15–'), found[15:]))
+    for scene, frames in (('road', 150), ('loop', 427)):
+        folder = render_sequence(scene, place / scene, frames)
+        rows.append(row_of(f'rendered `{scene}`, {frames} frames', lengths(folder, frames)))
+    return {'how': 'Steps of `djet replay SEQUENCE --scale camera_height --camera-height 1.65`.',
+            'header': ['sequence', 'pairs',
+                       'length / truth of a pair: median (spread, 1.48 MAD), extremes',
+                       'of the path', 'normalised error, rms'], 'rows': rows}
+
+
+def lengths(folder: Path, frames: int | None) -> Array:
+    """Length, true length and standard deviation (N, 3) of each step whose length is known."""
+    dataset, = open_datasets([folder], Selection(end=frames), folder.parent)
+    sequence, rows = opened(dataset), []
+    assert sequence.poses is not None
+    odometry = VisualOdometry(odometry=OdometryConfig(scale='camera_height', camera_height=HEIGHT))
+    for index in dataset.frames:
+        result = odometry.process(Frame(sequence.image(index), sequence.K,
+                                        int(sequence.stamps_ns[index])))
+        way = result.motion[:3, 3]
+        length = float(np.linalg.norm(way))
+        if not length or not result.scale_known or result.previous_stamp_ns is None:
+            continue
+        previous = np.searchsorted(sequence.stamps_ns, result.previous_stamp_ns)
+        true = np.linalg.norm((np.linalg.inv(sequence.poses[previous])
+                               @ sequence.poses[index])[:3, 3])
+        sigma = np.sqrt(way @ result.motion_covariance[:3, :3] @ way) / length
+        rows.append((length, float(true), float(sigma)))
+    return np.array(rows)
+
+
+def row_of(name: str, found: Array) -> list[str]:
+    length, true, sigma = found.T
+    ratio = length / true
+    middle = np.median(ratio)
+    spread = 1.4826 * np.median(np.abs(ratio - middle))
+    error = np.sqrt(np.mean(((length - true) / sigma)**2))
+    return [name, str(len(found)), f'{middle:.3f} ({spread:.3f}), {ratio.min():.2f} to '
+            f'{ratio.max():.2f}', f'{length.sum() / true.sum():.3f}', f'{error:.2f}']
+
+
+# Processes on a graph
+
+
+def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Measure a node of ROS."""
+    rows = at_pace(args, args.node) + many_frames(place, args.node)
+    return {'how': 'ROS 2 Jazzy, Cyclone DDS on loopback, 2 cores; `djet play`, `vo_node` and a '
+                   'listener as processes of their own.', 'header': ['', ''], 'rows': rows}
+
+
+def dds(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Measure the node that needs no ROS."""
+    command = 'exec ' + shlex.join([*DJET, 'live'])
+    return {'how': '`djet play` and `djet live` on the same two cores.', 'header': ['', ''],
+            'rows': at_pace(args, command)}
+
+
+def at_pace(args: argparse.Namespace, command: str) -> list[list[str]]:
+    """Play KITTI 06 at its own pace."""
+    source = args.data / 'kitti' / 'sequences' / '06'
+    sent = len([*source.glob('image_0/*')])
+    with started(command, 'latest') as node, playing(node, source):
+        node.wait_for(sent)
+        said, spent = node.said, node.cpu_ms_an_image()
+        memory, took = node.memory_mb(), node.end()
+    return [
+        ['KITTI 06 (1226×370) at its 10 Hz, `queue_policy: latest`',
+         f"{said['frames processed']} of {sent} images processed, {said['frames dropped']} "
+         'dropped'],
+        ['from receipt to publication, by its diagnostics',
+         f"median {said['latency, median (ms)']} ms, 95 % {said['latency, 95 % (ms)']} ms"],
+        ['CPU time an image, with all that is published', f'{spent:.0f} ms'],
+        ['resident memory', f'{memory:.0f} MB'],
+        ['SIGINT to the end of the process', f'{took:.1f} s']]
+
+
+def many_frames(place: Path, command: str) -> list[list[str]]:
+    """Play small images without end, each of which is worked on."""
+    source = render_sequence('road', place, 200, size=(320, 240))
+    memory = []
+    with started(command, 'every') as node, playing(node, source, '--loop', '--rate', 100):
+        for mark in MARKS:
+            node.wait_for(mark)
+            memory.append(f'{node.memory_mb():.1f} MB at {mark:,}')
+        dropped = node.said['frames dropped']
+    return [[f'{MANY:,} images of 320×240, `queue_policy: every`, with path and tf',
+             f"{dropped} dropped; resident memory {', '.join(memory)}"]]
+
+
+class Node:
+    """A node in processes of its own, and what its diagnostics say."""
+
+    def __init__(self, command: str, graph: Graph) -> None:
+        self._process = subprocess.Popen(
+            command, shell=True, env=GRAPH, start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self._graph = graph
+        self.said: dict[str, str] = {}
+        self._spent: list[tuple[int, float]] = []
+        graph.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', self._take,
+                     Profile(depth=10))
+
+    def _take(self, message: Any) -> None:
+        self.said = {pair.key: pair.value for pair in message.status[0].values}
+        processed = int(self.said['frames processed'])
+        if processed:
+            self._spent.append((processed, self._cpu_ms()))
+
+    def wait_for(self, processed: int) -> None:
+        """Wait until so many images are done; no diagnostics for a while is an error."""
+        alive = monotonic()
+        while int(self.said.get('frames processed', 0)) < processed:
+            before = len(self._spent)
+            self._graph.spin(0.2)
+            alive = monotonic() if len(self._spent) > before else alive
+            if monotonic() - alive > PATIENCE:
+                raise RuntimeError(f'the node says no more; last {self.said}')
+
+    def cpu_ms_an_image(self) -> float:
+        """Slope of CPU time over images, from the first diagnostics after some were done."""
+        (first, before), *_, (last, after) = self._spent
+        return (after - before) / (last - first)
+
+    def memory_mb(self) -> float:
+        """Resident memory of the largest of its processes."""
+        pages = max(int((process / 'statm').read_text().split()[1])
+                    for process in self._processes())
+        return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+    def end(self) -> float:
+        """Interrupt it; gives the seconds until it has ended."""
+        began = monotonic()
+        os.killpg(self._process.pid, signal.SIGINT)
+        self._process.wait(PATIENCE)
+        return monotonic() - began
+
+    def close(self) -> None:
+        """End it if it has not ended."""
+        if self._process.poll() is None:
+            self.end()
+
+    def _cpu_ms(self) -> float:
+        ticks = 0
+        for process in self._processes():
+            fields = (process / 'stat').read_text().rsplit(')', 1)[1].split()
+            ticks += int(fields[11]) + int(fields[12])
+        return 1e3 * ticks / os.sysconf('SC_CLK_TCK')
+
+    def _processes(self) -> Iterator[Path]:
+        for process in Path('/proc').glob('[0-9]*'):
+            with suppress(ProcessLookupError):  # one that has ended meanwhile
+                if os.getpgid(int(process.name)) == self._process.pid:
+                    yield process
+
+
+@contextmanager
+def started(command: str, policy: str) -> Iterator[Node]:
+    """Start a node with a queue policy, and listen to it; end both."""
+    with ExitStack() as stack:
+        graph = stack.enter_context(Graph(GRAPH))
+        node = Node(f'{command} -r image:={IMAGE} -p ros.queue_policy:={policy}', graph)
+        stack.callback(node.close)
+        yield node
+
+
+@contextmanager
+def playing(node: Node, source: Path, *words: Any) -> Iterator[None]:
+    """Play a recording while it lasts."""
+    process = subprocess.Popen([*DJET, 'play', str(source), *map(str, words)], env=GRAPH,
+                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(PATIENCE)
+
+
+MEASURED: dict[str, Callable[[Path, argparse.Namespace], dict[str, Any]]] = {
+    'node': node, 'dds': dds, 'soak': soak, 'outvoted': outvoted, 'links': links, 'loops': loops,
+    'camera height': camera_height}
+
+
+if __name__ == '__main__':
+    sys.exit(main())
