@@ -25,6 +25,7 @@ from djet_ros.core.hamming import match_distances, smooth
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
+from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.parallel import both
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
@@ -72,6 +73,7 @@ class TwoViewEstimator:
 
     def __init__(self, config: EstimatorConfig | None = None) -> None:
         self.config = config or EstimatorConfig()
+        keep_freed_memory()
 
     def view(self, gray: NDArray[np.uint8], K: Array, features: Features | None = None,
              left_out: Mask | None = None) -> View:

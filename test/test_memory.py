@@ -1,0 +1,41 @@
+"""Memory is asked for once, and not anew with each pair."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+from djet_ros.lab.scenes import make_scene
+import numpy as np
+import pytest
+
+# Page faults of twenty pairs, after as many that have asked for all that is needed.
+ESTIMATES = """
+from resource import getrusage, RUSAGE_SELF
+import sys
+from djet_ros.core.estimator import TwoViewEstimator
+import numpy as np
+
+a, b, K = (np.load(path) for path in sys.argv[1:])
+estimator = TwoViewEstimator()
+for _ in range(2):
+    before = getrusage(RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        estimator.estimate(estimator.view(a, K), estimator.view(b, K))
+print(getrusage(RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='of the GNU C library alone')
+def test_pairs_do_not_ask_for_their_memory_anew(tmp_path):
+    # Not rendered where pages are counted: to render takes, and frees, larger blocks.
+    scene = make_scene('road')
+    images = [scene.render(pose, i) for i, pose in enumerate(scene.trajectory(2))]
+    paths = [str(tmp_path / f'{i}.npy') for i in range(3)]
+    for path, array in zip(paths, (*images, scene.K)):
+        np.save(path, array)
+    faults = int(subprocess.run([sys.executable, '-c', ESTIMATES, *paths], check=True,
+                                capture_output=True, text=True).stdout)
+    # As many pages as one image of floating point numbers has; a pair writes to a dozen of them.
+    assert faults < 456
