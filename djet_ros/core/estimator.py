@@ -59,9 +59,9 @@ _SURPRISING = 20.5
 # chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
 _TRUSTED = 0.5
 
-# rad; chosen: no ellipsoid spans two motions that are further from one another, as the sphere of
-# directions is bent.
-_FAR = 0.17
+# rad; no ellipsoid spans two motions that are further from one another, as the sphere of directions
+# is bent: up to here chord and arc agree to a twentieth.
+_FAR = 0.5
 
 
 class TwoViewEstimator:
