@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 from djet_ros.core.features import detect_orb, match_everywhere, match_nearby
 from djet_ros.core.types import Features
@@ -86,7 +88,7 @@ def test_no_mutual_best_match_is_missing(pair, radius):
 
 def test_of_two_that_look_alike_the_nearer_is_taken(pair):
     wall = pair[0]
-    twice = Features(*(np.concatenate([getattr(wall, name)] * 2) for name in (
+    twice = Features.described(*(np.concatenate([getattr(wall, name)] * 2) for name in (
         'points', 'octaves', 'angles', 'responses', 'descriptors')))
     twice.points[len(wall):] += (0.0, 20.0)
     _, columns = match_nearby(wall, twice, 60.0).T
@@ -121,6 +123,5 @@ def test_few_or_no_features_give_few_or_no_matches(pair, ours, theirs):
     assert matches.shape[1:] == (2,)
     assert len(matches) <= min(len(previous), len(current))
     assert (len(matches) == 0) == (len(previous) == 0 or len(current) == 0)
-    too_far = Features(current.points + 1e5, current.octaves, current.angles, current.responses,
-                       current.descriptors)
+    too_far = replace(current, points=current.points + 1e5)
     assert len(match_nearby(previous, too_far, search_radius=100.0)) == 0

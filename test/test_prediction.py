@@ -9,7 +9,7 @@ from djet_ros.core.prediction import foresee, likely_rotation, predict
 from djet_ros.core.types import RelativePose, Status
 import numpy as np
 import pytest
-from two_view import textured
+from two_view import some, textured
 
 K = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
 
@@ -47,8 +47,7 @@ def test_where_there_is_nothing_to_match_nothing_turns():
 
 def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
     _, _, previous, _ = turned_pair((0, 0, 0))
-    none = replace(previous, descriptors=previous.descriptors[:0], points=previous.points[:0],
-                   octaves=previous.octaves[:0])
+    none = some(previous, slice(0, 0))
     behind = predict(previous, none, K, [rotation_exp(np.array([0.0, 3.0, 0.0]))], 30.0)
     assert np.isfinite(behind).all()
 

@@ -80,8 +80,9 @@ def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
 
 def some(features: Features, chosen: np.ndarray | slice) -> Features:
     """Give some of the features, by index or slice."""
-    return Features(features.points[chosen], features.octaves[chosen], features.angles[chosen],
-                    features.responses[chosen], features.descriptors[chosen])
+    return Features.described(
+        features.points[chosen], features.octaves[chosen], features.angles[chosen],
+        features.responses[chosen], features.descriptors[chosen])
 
 
 def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:

@@ -8,6 +8,7 @@ beside the larger one there is an edge, whose stair steps pass for corners at on
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -56,13 +57,16 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     sizes = [(octave, scale, round(share * max_features))
              for octave, (scale, share) in enumerate(_SIZES)
              if min(gray.shape) > 2 * scale * (REACH + 1)]
-    found = each(lambda size: _of_size(gray, *size, contrast, mask, smoothed), sizes)
+    found = each(lambda size: _of_size(gray, *size, contrast, mask), sizes)
     if not found:
         none = np.empty(0, np.float32)
-        return Features(np.empty((0, 2)), np.empty(0, np.int32), none, none,
-                        np.empty((0, 32), np.uint8))
-    points, octaves, responses, descriptors = (np.concatenate(part) for part in zip(*found))
-    return Features(points, octaves, np.zeros(len(points), np.float32), responses, descriptors)
+        return Features.described(np.empty((0, 2)), np.empty(0, np.int32), none, none,
+                                  np.empty((0, 32), np.uint8))
+    points, octaves, responses, pixels = zip(*found)
+    places = [(scale, there) for (_, scale, _), there in zip(sizes, pixels)]
+    return Features(np.concatenate(points), np.concatenate(octaves),
+                    np.zeros(sum(map(len, points)), np.float32), np.concatenate(responses),
+                    lambda: _descriptors(gray, places, smoothed))
 
 
 def corner_slopes(image: Image) -> NDArray[np.float32]:
@@ -129,27 +133,44 @@ def _short(numbers: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
-             mask: Mask | None, smoothed: Image | None,
-             ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float32], Image]:
-    """Points, octaves, responses and descriptors of the corners of one size."""
-    width, height = (max(1, round(side / scale)) for side in gray.shape[::-1])
-    image = gray if scale == 1 else np.asarray(cv2.resize(gray, (width, height)), np.uint8)
+             mask: Mask | None,
+             ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float32], Pixels]:
+    """Points, octaves and responses of the corners of one size; their pixels in its image."""
+    image = _made_smaller(gray, scale)
     slopes = corner_slopes(image)
     lonely, peaks = (slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8))
                      for side in (2 * _APART + 1, 2 * _AT_LEAST_APART + 1))
     # Of a flat array, five times as fast.
     rows, columns = np.divmod(np.flatnonzero(peaks & (slopes > contrast**2)), slopes.shape[1])
     points = _exact_peaks(slopes, rows, columns)
-    zoom = np.array(gray.shape[::-1]) / (width, height)
+    zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
     inside = describable(_pixels(points), image.shape) & ~at(mask, (points + 0.5) * zoom - 0.5)
     points, rows, columns = points[inside], rows[inside], columns[inside]
     strengths = slopes[rows, columns]
     chosen = spread_out(_pixels(points), strengths, most, lonely[rows, columns])
     points, strengths = points[chosen], strengths[chosen]
-    seen = smooth(image) if smoothed is None or scale != 1 else smoothed
-    descriptors = dense_descriptors(seen, _pixels(points))
     return ((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
-            np.sqrt(strengths), descriptors)
+            np.sqrt(strengths), _pixels(points))
+
+
+def _descriptors(gray: Image, places: Sequence[tuple[float, Pixels]],
+                 smoothed: Image | None) -> Image:
+    """Descriptors (N, 32) at pixels of the image made smaller by a scale, for some scales."""
+    def of_size(place: tuple[float, Pixels]) -> Image:
+        scale, pixels = place
+        seen = (smoothed if scale == 1 and smoothed is not None
+                else smooth(_made_smaller(gray, scale)))
+        return dense_descriptors(seen, pixels)
+
+    return np.concatenate(each(of_size, places))
+
+
+def _made_smaller(gray: Image, scale: float) -> Image:
+    """Image so many times smaller."""
+    if scale == 1:
+        return gray
+    width, height = (max(1, round(side / scale)) for side in gray.shape[::-1])
+    return np.asarray(cv2.resize(gray, (width, height)), np.uint8)
 
 
 def _exact_peaks(slopes: NDArray[np.float32], rows: NDArray[np.int64],

@@ -38,7 +38,7 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
             gray, None if mask is None else np.where(mask, 0, 255).astype(np.uint8))
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
-    return Features(
+    return Features.described(
         points=np.array(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2),
         octaves=np.array([k.octave for k in keypoints], np.int32),
         angles=np.array([k.angle for k in keypoints], np.float32),

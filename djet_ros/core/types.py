@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from functools import cached_property
@@ -47,17 +48,29 @@ class Features:
     Features of one image.
 
     points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) sizes;
-    angles: (N,) degrees; responses: (N,); descriptors: (N, 32) uint8 (for matching only).
+    angles: (N,) degrees; responses: (N,); describe: gives the descriptors, which are made when
+    they are first asked for, as pairs that go on like the one before do without.
     """
 
     points: Array
     octaves: NDArray[np.int32]
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
+    describe: Callable[[], NDArray[np.uint8]]
+
+    @classmethod
+    def described(cls, points: Array, octaves: NDArray[np.int32], angles: NDArray[np.float32],
+                  responses: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:
+        """Give features whose descriptors are known already."""
+        return cls(points, octaves, angles, responses, lambda: descriptors)
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def descriptors(self) -> NDArray[np.uint8]:
+        """Descriptors (N, 32), for matching only."""
+        return self.describe()
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, MutableMapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, NamedTuple
@@ -45,7 +45,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
         """Make the file."""
         # What is no array is small, and stays in memory.
         self._kept: dict[int, _Kept] = {}
-        self._features = [field.name for field in fields(Features)]
+        self._features = 'points', 'octaves', 'angles', 'responses', 'descriptors'
         try:
             self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by close)
         except OSError as error:
@@ -76,7 +76,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
                                         for _ in range(3 + len(self._features)))
         return KeyframeImage(replace(frame, gray=gray, K=K,
                                      left_out=left_out if left_out.size else None),
-                             Features(**dict(zip(self._features, features))))
+                             Features.described(**dict(zip(self._features, features))))
 
     def __contains__(self, number: object) -> bool:
         """Tell whether there is such a keyframe, without reading it."""
