@@ -100,6 +100,27 @@ def test_keyframes_come_by_length_and_by_turn(keyframes):
         assert [(edge.source, edge.target) for edge in kept.edges] == [(0, 1), (1, 2)]
 
 
+def test_keyframes_are_those_of_the_odometry_where_it_has_them(keyframes):
+    chosen = [replace(step, keyframe=i in {0, 1, 6})
+              for i, step in enumerate(steps(np.array([pose(z=0.5 * i) for i in range(9)])))]
+    for slam, expected in ({}, [0, 1, 6]), ({'keyframes': 'distance'}, [0, 4, 8]):
+        kept, offsets = keyframes(chosen, **slam)
+        assert [one.stamp_ns for one in kept.keyframes] == [10**9 + i * 10**8 for i in expected]
+        assert [np.searchsorted(expected, i, 'right') - 1 for i in range(9)] == [
+            one.keyframe for one in offsets]
+
+
+def test_where_the_image_of_a_keyframe_is_missing_the_next_frame_takes_its_place():
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.posegraph.keyframe_map import KeyframeMap
+    kept, lost = KeyframeMap(Config()), 10**9 + 2 * 10**8
+    for i, step in enumerate(steps(np.array([pose(z=0.5 * i) for i in range(6)]))):
+        kept.extend(replace(step, keyframe=i in {0, 2}), lambda stamp: None if stamp == lost
+                    else Frame(np.zeros((64, 64), np.uint8), K, stamp))
+    assert [one.stamp_ns for one in kept.keyframes] == [10**9, lost + 10**8]
+    assert kept.imageless == 1
+
+
 def test_all_frames_have_offsets_from_their_keyframes(keyframes):
     _, poses = twice_round()
     kept, offsets = keyframes(steps(poses), keyframe_distance=3.0)
@@ -507,7 +528,7 @@ def drive(tmp_path_factory):
     return folder
 
 
-FLAGS = ('--keyframe-distance', 0.5, '--loop-gap', 0.5)
+FLAGS = ('--keyframes', 'distance', '--keyframe-distance', 0.5, '--loop-gap', 0.5)
 
 
 @pytest.fixture(scope='module')
@@ -569,6 +590,26 @@ def test_the_command_takes_results_too_and_wherever_their_recording_went(
     refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
     assert '--source' in refused.stderr
     djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
+
+
+def test_the_odometry_tells_its_keyframes_alike_in_messages_and_in_results(closed, tmp_path):
+    from djet_ros.posegraph.step_messages import StepMessages
+    from djet_ros.recordings.bags import Bag
+    from djet_ros.replay.graph_of_results import read_steps
+    results, words = read_steps(closed / 'replay'), StepMessages('optical')
+    take = {'relative_pose_cov': words.relative_pose, 'relative_pose_status': words.status,
+            'odometry': words.odometry}
+    with Bag(closed / 'replay' / 'bag') as bag:
+        heard = [step for topic, _, message in bag.messages({f'/vo_node/{name}' for name in take})
+                 for step in take[topic.rpartition('/')[2]](message)]
+    assert [(step.stamp_ns, step.keyframe) for step in heard] == [
+        (step.stamp_ns, step.keyframe) for step in results]
+    chosen = [step.stamp_ns for step in results if step.keyframe]
+    assert 3 <= len(chosen) < len(results)
+    djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--keyframes', 'odometry',
+         *FLAGS[2:])
+    said = json.loads((tmp_path / 'slam' / 'slam.json').read_text())
+    assert said['keyframes'] == len(chosen)
 
 
 def test_the_command_keeps_earlier_results_and_parameters(closed, tmp_path):

@@ -11,7 +11,7 @@ from djet_ros.core.types import Pose, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.scale import Scale, SpeedScale, Unmeasured
+from djet_ros.odometry.scale import Scale, scale_source, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
@@ -62,6 +62,20 @@ def test_the_first_step_is_the_unit_of_all_that_follow(cards):
     assert lengths(results)[0] == pytest.approx(1)
     assert lengths(results) * WAYS[0] == pytest.approx(np.array(WAYS), rel=0.03)
     assert all(result.scale_kind is Scale.RELATIVE for result in results)
+
+
+def test_structure_takes_over_from_another_scale_on_the_way(cards):
+    drive = Drive(cards, scale='constant')
+    drive.go(steps()[:2])
+    for scale in ('structure', 'none', 'structure'):
+        config = OdometryConfig(scale=scale)
+        drive.odometry.configure(ESTIMATOR, config, scale_source(config))
+        results = drive.go(steps(WAYS[:4]))
+        assert all(result.status in TRACKED for result in results)
+        assert all((result.keyframe is None) == (scale == 'none') for result in results)
+        if scale == 'structure':
+            ratios = lengths(results) / WAYS[:4]
+            assert ratios == pytest.approx(np.full(4, ratios[0]), rel=0.03)
 
 
 def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards):

@@ -1,5 +1,7 @@
 """Drift of the unit of lengths, as loops see it: circles that come out too large, and mended."""
 
+from dataclasses import replace
+
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.posegraph.loops import unit_change
@@ -90,6 +92,32 @@ def pair(points, R, t, K):
     x, y = ((p @ K.T)[:, :2] / p[:, 2:] for p in (points, there))
     return RelativePose(Status.OK, R=R, t=unit(t), x=x, y=y, y_opt=y,
                         inliers=np.ones(len(x), bool)), there
+
+
+def test_the_units_at_both_ends_are_compared_where_no_point_is_seen_by_all():
+    """Half of a loop's points are those of the step at its one end, half at the other."""
+    rng = np.random.default_rng(1)
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    points = rng.uniform((-6, -3, 8), (6, 3, 30), (200, 3))
+    turn, still = rotation_exp(np.array([0.0, -0.05, 0.01])), np.eye(3)
+    ways = np.array([[0.1, 0, 1.0], [0.4, 0.1, -0.9], [-0.1, 0, 1.2]])
+    lengths = np.linalg.norm(ways, axis=1)
+    loop, there = pair(points, turn, ways[1], K)
+    near, far = 0.5, 0.6
+    errors = []
+    for noise in (0.0, *[0.2] * 40):
+        step, _ = pair(points[:100], still, ways[0], K)
+        other, _ = pair(there[100:], still, ways[2], K)
+        noisy = [replace(one, y_opt=one.y + noise * rng.normal(size=one.y.shape))
+                 for one in (step, loop, other)]
+        ratio, sigma = unit_change(noisy[0], lengths[0] / near, noisy[1], lengths[1] / near,
+                                   noisy[2], lengths[2] / far, K)
+        if noise:
+            errors.append((ratio - np.log(far / near)) / sigma)
+        else:
+            assert ratio == pytest.approx(np.log(far / near), abs=1e-6)
+    # Points here err independently, which those of images do not.
+    assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
 
 def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():

@@ -116,6 +116,16 @@ def test_the_window_tells_the_noise_of_its_observations_and_keeps_the_right_ones
     assert window.taken > 30 * TUNING.landmarks
 
 
+def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
+    window, chosen = NumbersWindow(Street(0, 30, 0.05)), [True]
+    for _ in range(30):
+        window.go()
+        chosen.append(window.is_keyframe)
+        held = min(sum(chosen[:-1]), TUNING.keyframes) + 1
+        assert len(window._images) == held
+    assert 5 < sum(chosen) < 25
+
+
 def test_noise_does_not_change_the_scale() -> None:
     lengths = []
     for seed in range(4):

@@ -26,11 +26,11 @@ from djet_ros.replay.results import SUMMARY as REPLAY_SUMMARY
 from rich.table import Table
 
 DESCRIPTION = """\
-Close loops offline: choose keyframes, propose places seen before by their ORB descriptors, verify
-them with the two-view estimator, and optimise the graph of odometry and loops with GTSAM. Writes
-the trajectory before and after, the graph (g2o, csv), a plot and slam.json. Loops get their
-length from the depths that the odometry gives to the points they share; how well the odometry's
-own lengths are known (--scale, --scale-uncertainty) decides what loops may change.
+Close loops offline: take the odometry's keyframes, propose places seen before by their ORB
+descriptors, verify them with the two-view estimator, and optimise the graph of odometry and loops
+with GTSAM. Writes the trajectory before and after, the graph (g2o, csv), a plot and slam.json.
+Loops get their length from the depths that the odometry gives to the points they share; how well
+the odometry's own lengths are known (--scale, --scale-uncertainty) decides what loops may change.
 """
 
 _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',

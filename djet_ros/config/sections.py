@@ -118,10 +118,13 @@ class OdometryConfig:
 class SlamConfig:
     """How loops are closed, offline and live. Raises ValueError like its sisters."""
 
+    keyframes: str = parameter(
+        'odometry', 'odometry (those by which it carries its scale; by distance where it has '
+        'none) or distance (by the two parameters below)',
+        choices=('odometry', 'distance'))
     keyframe_distance: float = parameter(
         2.0, 'distance after which a frame becomes a keyframe, in metres or in units of the '
-        'trajectory',
-        minimum=1e-6, maximum=1e6)
+        'trajectory', minimum=1e-6, maximum=1e6)
     keyframe_turn: float = parameter(
         10.0, 'turn after which a frame becomes a keyframe, in degrees', minimum=0.1, maximum=180)
     links: int = parameter(

@@ -152,6 +152,11 @@ class Window:
         """Whether there is one frame alone, so that the next pair makes the unit."""
         return len(self._images) == 1
 
+    @property
+    def is_keyframe(self) -> bool:
+        """Whether the newest frame stays as a keyframe when others come."""
+        return self._is_keyframe[-1]
+
     def add(self, view: View, relative: RelativePose, guess: float) -> Addition:
         """
         Take the next frame and the pair of the newest one with it.
@@ -162,7 +167,6 @@ class Window:
         # What the pair says, in a length by depths that the window knows.
         first = self.is_new
         length = guess if first else self._length(relative, guess)
-        self._choose_keyframe()
         self._append(view, relative, length)
         self._add_pair(relative, length, first)
         # Landmarks, old and new, are measured in the frame; then all is refined together.
@@ -181,6 +185,7 @@ class Window:
             self.settled = self._places(self._landmarks.anchors == 0)
             self._take_along(0)
             self._forget(0)
+        self._choose_keyframe()
         return addition
 
     def landmarks(self) -> Array:

@@ -119,6 +119,11 @@ def mounted_frame(config: OdometryConfig, image_frame: str) -> tuple[str, Array]
     return config.camera_frame or image_frame, axes
 
 
+# What is said of a frame that may be a keyframe; nothing where none are chosen.
+KEYFRAME_WORDS = {True: 'true', False: 'false', None: ''}
+IS_KEYFRAME = {word: chosen for chosen, word in KEYFRAME_WORDS.items()}
+
+
 class MessageFactory:
     """Makes messages of arrays; message_type gives the class for a type name."""
 
@@ -233,7 +238,8 @@ class FrameStatus(NamedTuple):
 
     reference_ns: stamp of the frame that it was related to, or None; scale: what the length of
     the translation is in; stationary: whether the camera stood still, so that the next frame
-    is related to the same reference.
+    is related to the same reference; keyframe: whether the odometry took the frame for a keyframe,
+    None where it takes none or does not say.
     """
 
     stamp_ns: int
@@ -241,6 +247,7 @@ class FrameStatus(NamedTuple):
     reference_ns: int | None
     scale: Scale
     stationary: bool
+    keyframe: bool | None = None
 
 
 def frame_status(message: Any) -> FrameStatus:
@@ -250,7 +257,8 @@ def frame_status(message: Any) -> FrameStatus:
         values = {pair.key: pair.value for pair in message.status[0].values}
         reference = values['reference_stamp_ns']
         return FrameStatus(stamp, Status(values['status']), int(reference) if reference else None,
-                           Scale(values['length']), values['stationary'] == 'true')
+                           Scale(values['length']), values['stationary'] == 'true',
+                           IS_KEYFRAME[values.get('keyframe', '')])
     except (IndexError, KeyError, ValueError) as error:
         raise DjetError(f'the status of {stamp} ns lacks something: {error}') from None
 
@@ -290,8 +298,8 @@ class Messages(MessageFactory):
         One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
         frame that the relative poses of the same stamp start from, empty where there is none;
         'length' is metric, relative (to the first step of the track) or unknown; 'stationary' is
-        true or false. Level OK: there is a relative pose; WARN: the odometry started or restarted
-        here; ERROR: a bad pair.
+        true or false, and so is 'keyframe', or empty where none are chosen. Level OK: there is a
+        relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
         """
         tracked = result.status in TRACKED
         level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
@@ -301,7 +309,8 @@ class Messages(MessageFactory):
                 'status': result.status.value,
                 'reference_stamp_ns': str(result.previous_stamp_ns) if tracked else '',
                 'length': (result.scale_kind if tracked else Scale.UNKNOWN).value,
-                'stationary': str(result.stationary).lower()}, result.frame_id, frame)
+                'stationary': str(result.stationary).lower(),
+                'keyframe': KEYFRAME_WORDS[result.keyframe]}, result.frame_id, frame)
 
     def odometry(self, result: OdometryResult) -> Any:
         """

@@ -55,18 +55,18 @@ class OneScale:
 
     def __init__(self) -> None:
         self._estimator: EstimatorConfig | None = None
-        self._share = 0.0
+        self._share, self._carried = 0.0, False
         self.reset()
 
     def configure(self, estimator: EstimatorConfig, source: ScaleSource, share: float) -> bool:
         """Take other parameters; tells whether the track has to begin anew for them."""
         if share != self._share:
             self._kept[1] = 0.0
-        self._source, self._share = source, share
-        if estimator == self._estimator:
-            return False
-        self._estimator, self._window = estimator, Window(estimator)
-        return True
+        anew = estimator != self._estimator or (source.carried and not self._carried)
+        self._source, self._share, self._carried = source, share, source.carried
+        if estimator != self._estimator:
+            self._estimator, self._window = estimator, Window(estimator)
+        return anew
 
     def reset(self) -> None:
         """Forget the factor; the next step makes a new unit."""
@@ -77,9 +77,14 @@ class OneScale:
         # had in common with others.
         self._was_metric, self._kept = False, np.ones(2)
 
+    @property
+    def keyframe(self) -> bool | None:
+        """Whether the newest frame of the track is a keyframe; None where none are chosen."""
+        return self._window.is_keyframe if self._carried else None
+
     def begin(self, view: View) -> None:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
-        if not self._source.carried:
+        if not self._carried:
             return
         self._window.start(view)
         if self._speed is not None:
@@ -88,7 +93,7 @@ class OneScale:
     def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Length:
         """Length of a step whose motion was estimated, from the newest frame of the track on."""
         measured = self._source.between(*span_ns)
-        if not self._source.carried:
+        if not self._carried:
             return measured
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
@@ -124,7 +129,7 @@ class OneScale:
     def of_rest(self, span_ns: tuple[int, int]) -> Length:
         """Length that a step would have had where the camera stands, or the motion is unknown."""
         measured = self._source.between(*span_ns)
-        if measured.known or not self._source.carried or self._speed is None:
+        if measured.known or not self._carried or self._speed is None:
             return measured
         usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * float(np.exp(self._log))
         return Length(usual, usual, True, self._metric, False)
@@ -135,7 +140,7 @@ class OneScale:
 
         settled: of those that it was the last step to refine, instead of those in the window.
         """
-        if self._speed is None or not self._source.carried:
+        if self._speed is None or not self._carried:
             return np.empty((0, 3))
         places = self._window.settled if settled else self._window.landmarks()
         return places * float(np.exp(self._log))
@@ -148,7 +153,7 @@ class OneScale:
         False where so few landmarks agree as by chance in one of a thousand right motions; None
         where there are too few to tell.
         """
-        if not self._source.carried or self._window.is_new:
+        if not self._carried or self._window.is_new:
             return None
         agree, asked = self._window.agreement(pose, x, y)
         if asked < _FEW:

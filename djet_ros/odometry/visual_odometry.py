@@ -59,6 +59,9 @@ class OdometryResult:
     where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
     sure it is that this frame was there.
 
+    keyframe: whether the frame is a keyframe of the window that carries the scale; None where
+    there is no window, or the motion to the frame is not known.
+
     common: of the length, what of its error other steps have too. It is in pose_covariance, from
     the first frame on: also by how much a relative scale may have wandered since.
     """
@@ -80,6 +83,7 @@ class OdometryResult:
     metric: bool = True
     measured: bool = True
     common: Common | None = None
+    keyframe: bool | None = None
 
     @property
     def scale_kind(self) -> Scale:
@@ -178,6 +182,7 @@ class VisualOdometry:
             self._pose, motion, motion_covariance(relative, length.own), length.common)
         result = self._result(frame, relative.status, relative, length, motion,
                               motion_covariance(relative, length), path)
+        result = replace(result, keyframe=self._one_scale.keyframe)
         self._pose, self._path = result.pose, path
         self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
@@ -264,7 +269,7 @@ class VisualOdometry:
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
-            UNKNOWN_MOTION, self._path.pose, 0.0, False)
+            UNKNOWN_MOTION, self._path.pose, 0.0, False, keyframe=self._one_scale.keyframe)
 
     def _carried(self, frame: Frame) -> tuple[Array, Array]:
         """Motion (4, 4) and covariance (6, 6) where the images tell none: the gyro's rotation."""
@@ -283,6 +288,8 @@ class VisualOdometry:
         covariance = standstill_covariance(relative, length)
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
                               self._path.moved(self._pose, np.eye(4), covariance), stationary=True)
+        if self._one_scale.keyframe is not None:  # the reference frame may be one, and serves both
+            result = replace(result, keyframe=False)
         if self._gyro is not None:
             self._gyro.learn(self._since_ns, frame.stamp_ns, np.eye(3),
                              np.eye(3) * _STILL_TO_WITHIN**2)

@@ -64,7 +64,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
         except OSError as error:
             raise DjetError('the images of keyframes could not be written to a temporary file: '
                             f'{error.strerror}; make room, or take fewer keyframes '
-                            '(--keyframe-distance)') from error
+                            '(--keyframes distance --keyframe-distance)') from error
         nothing = np.empty((0, 0), np.uint8)
         self._kept[number] = _Kept(offset, replace(frame, gray=nothing, left_out=None))
 

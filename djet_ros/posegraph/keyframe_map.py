@@ -55,11 +55,10 @@ class KeyframeOffset(Motion):
                               self.scale_known and scale_known, self.known and known)
 
     def is_far(self, config: SlamConfig) -> bool:
-        """Tell whether the frame should be a keyframe itself."""
+        """Tell whether the frame is so far away that it should be a keyframe itself."""
         turn = np.degrees(Rotation.from_matrix(self.motion[:3, :3]).magnitude())
         length = np.linalg.norm(self.motion[:3, 3])
-        return bool(not self.known or length >= config.keyframe_distance
-                    or turn >= config.keyframe_turn)
+        return bool(length >= config.keyframe_distance or turn >= config.keyframe_turn)
 
     def edge(self, target: int) -> Edge:
         """Give the edge to the frame, as the keyframe with a number."""
@@ -103,6 +102,8 @@ class KeyframeMap:
         self._offsets: dict[int | None, KeyframeOffset] = {}
         self._chain: list[Edge] = []
         self._found: list[Edge] = []
+        # Whether a frame that should have been a keyframe could not be.
+        self._due = False
         self._unsought: deque[_Unsought] = deque()
         self._sought = 0
         # Whether all lengths so far are in metres, so that no unit of them drifts.
@@ -132,10 +133,12 @@ class KeyframeMap:
         offset = self._offset(step)
         self._metric = self._metric and (step.metric or not step.scale_known)
         frame = None
-        if (offset is None or offset.is_far(self._slam)) and len(self._unsought) < _WAITING:
+        self._due = self._due or self._is_keyframe(step, offset)
+        if self._due and len(self._unsought) < _WAITING:
             frame = image(step.stamp_ns)
             self.imageless += frame is None
         if frame is not None:
+            self._due = False
             offset = self._add(step, frame, offset)
         if offset is None:
             return False
@@ -148,6 +151,14 @@ class KeyframeMap:
                 KeyframeOffset(offset.keyframe, np.asarray(np.linalg.inv(step.motion)))
         self.newest, self._newest_step = offset, step
         return frame is not None
+
+    def _is_keyframe(self, step: Step, offset: KeyframeOffset | None) -> bool:
+        """Tell whether a step's frame should be a keyframe."""
+        if offset is None or not offset.known:
+            return True
+        if step.keyframe is None or self._slam.keyframes == 'distance':
+            return offset.is_far(self._slam)
+        return step.keyframe
 
     def _offset(self, step: Step) -> KeyframeOffset | None:
         """Offset of a step's frame; if the odometry restarted, its frame moves in the map."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
+from typing import NamedTuple
 
 from djet_ros.config.sections import SlamConfig
 from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
@@ -55,6 +56,8 @@ class EdgeFinder:
         # The neighbour before each keyframe: the motion to it has a length.
         self._before: dict[int, Edge] = {}
         self._first = 0
+        # The newest keyframe that was asked, and its motion back to its neighbour.
+        self._newest: tuple[int, RelativePose] | None = None
 
     def add(self, frame: Frame, before: Edge | None = None) -> None:
         """Take the next keyframe, later than all others, and the edge from its neighbour."""
@@ -118,7 +121,7 @@ class EdgeFinder:
             return
         relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_sure(relative):
-            length = self._length(current, view, relative)
+            length = self._length(current, relative)
             edge = _edge(current, place, relative, length, 'loop')
             yield edge if not units else replace(
                 edge, stretch=self._stretch(current, place, relative, length))
@@ -126,22 +129,30 @@ class EdgeFinder:
     def _stretch(self, current: int, place: int, loop: RelativePose,
                  length: Length) -> tuple[float, float] | None:
         """Compare the units at both ends of a loop, by points that the steps to both saw too."""
-        depths = [self._depths(number) for number in (current, place)]
-        if not length.known or depths[0] is None or depths[1] is None:
+        near, far = self._depths(current), self._depths(place)
+        if not length.known or near is None or far is None:
             return None
-        return unit_change(*depths[0], loop, length.value, *depths[1],
-                           self._view(current).K)
+        return unit_change(*near, loop, length.value, *far, self._kept[current].frame.K)
 
     def _depths(self, number: int) -> tuple[RelativePose, float] | None:
         """Motion from a keyframe back to its neighbour, and its length; None if not known."""
         step = self._before.get(number)
         if step is None or step.source not in self._kept or not step.scale_known:
             return None
-        back = self._near.estimate(self._view(number), self._view(step.source))
+        back = self._back(number, step.source)
         length = float(np.linalg.norm(step.motion[:3, 3]))
         return (back, length) if back.status is Status.OK and length else None
 
-    def _length(self, current: int, view: View, relative: RelativePose) -> Length:
+    def _back(self, number: int, neighbour: int) -> RelativePose:
+        """Estimate a keyframe's motion back to its neighbour; several loops may ask the newest."""
+        if self._newest is not None and self._newest[0] == number:
+            return self._newest[1]
+        back = self._near.estimate(self._view(number), self._view(neighbour))
+        if number == self._first + len(self._stamps) - 1:
+            self._newest = number, back
+        return back
+
+    def _length(self, current: int, relative: RelativePose) -> Length:
         """Length of a loop's translation, by the points that the last odometry edge saw too."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
@@ -150,11 +161,12 @@ class EdgeFinder:
         if relative.status is Status.NO_PARALLAX:
             # The same place again: nearer than any step, in whatever direction.
             return Length(guess, guess, True)
-        back = self._near.estimate(view, self._view(step.source))
-        if back.status is not Status.OK:
+        depths = self._depths(current)
+        if depths is None:
             return unknown(guess)
         share = np.sqrt(_variance_along(step)) / guess
-        return transferred_length(back, relative, Length(guess, guess * share, True), view.K)
+        return transferred_length(depths[0], relative, Length(guess, guess * share, True),
+                                  self._kept[current].frame.K)
 
     def _is_sure(self, relative: RelativePose) -> bool:
         inliers = int(relative.inliers.sum())
@@ -174,21 +186,10 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
     A point that both pairs saw has one depth, so that its inverse depths in units of the two
     translations are as the lengths of these. Unknown where too few points are shared.
     """
-    _, here, there = np.intersect1d(_pixels(step), _pixels(other), return_indices=True)
-    depths, parallax = _inverse_depths(step, K)
-    others, _ = _inverse_depths(other, K)
-    sure = parallax[here] > _LEAST_PARALLAX
-    ratios = others[there][sure] / depths[here][sure]
-    ratios = ratios[np.isfinite(ratios)]
-    if len(ratios) < _LEAST_SHARED:
+    told = _ratio(_Depths.here(step, K), _Depths.here(other, K))
+    if told is None:
         return unknown(length.value)
-    ratio = float(np.median(ratios))
-    if ratio <= 0:
-        return unknown(length.value)
-    # Standard deviation of a median, if places apart err independently, and more than that.
-    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    places = len(np.unique(step.x[step.inliers][here][sure] // CELL, axis=0))
-    sigma = 1.2533 * spread * np.sqrt(CAUTIOUS_INFLATION / places)
+    ratio, sigma = told
     return Length(length.value * ratio,
                   float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
 
@@ -199,33 +200,77 @@ def unit_change(step: RelativePose, step_length: float, loop: RelativePose, loop
     Tell how much larger the unit of lengths is at the far end of a loop than at the near one.
 
     step: from the loop's first view to another, other: from its second view to another, with
-    their lengths, each in the unit of its place; the loop's is in the first one's. A point that
-    all three saw has two depths in the second view. Gives the logarithm of the ratio of the units
-    and its standard deviation; None where too few points are shared.
+    their lengths, each in the unit of its place; the loop's is in the first one's. Gives the
+    logarithm of the ratio of the units and its standard deviation, by what is surer; None where
+    too few points are shared.
+    * Points that all three saw have two depths in the second view. Few are found so often, above
+      all in small images.
+    * Points that the loop shares with one of the others tell its length, once in either unit.
+      There are many, but of a loop with hardly any length they tell little.
     """
-    _, here, there = np.intersect1d(_pixels(step), _pixels(loop), return_indices=True)
-    depths, parallax = _inverse_depths(step, K)
-    depths, parallax = depths[here] / step_length, parallax[here]
-    x, y = (points[loop.inliers][there] for points in (loop.x, loop.y))
-    # Depth at the far end, times the inverse depth at the near one.
-    ahead = (rays(K, x) @ loop.R.T)[:, 2] + depths * loop_length * loop.t[2]
-    _, seen, again = np.intersect1d(_numbers(y), _pixels(other), return_indices=True)
-    others, far_parallax = _inverse_depths(other, K)
-    sure = (np.minimum(parallax[seen], far_parallax[again]) > _LEAST_PARALLAX) & (
-        depths[seen] > 0) & (ahead[seen] > 0) & (others[again] > 0)
-    if sure.sum() < _LEAST_SHARED:
+    near, far = _Depths.here(step, K), _Depths.here(other, K)
+    here, there = _Depths.here(loop, K), _Depths.there(loop, K)
+    ways = []
+    at_near, at_far = _ratio(near, here), _ratio(far, there)
+    if at_near is not None and at_far is not None:
+        ways.append((np.log(at_near[0] * step_length / (at_far[0] * other_length)),
+                     np.hypot(at_near[1] / at_near[0], at_far[1] / at_far[0])))
+    mine, others = _shared(near, here)
+    inverse = _from(near.inverse[mine] / step_length, here.x[others], loop.R,
+                    loop_length * loop.t, K)
+    both = _ratio(_Depths(there.x[others], inverse, near.parallax[mine]),
+                  far.of(far.parallax > _LEAST_PARALLAX))
+    if both is not None:
+        ways.append((np.log(both[0] / other_length), both[1] / both[0]))
+    if not ways:
         return None
-    there, near, far = others[again][sure], depths[seen][sure], ahead[seen][sure]
-    ratios = np.log(there / other_length * far / near)
-    ratio = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    places = len(np.unique(x[seen][sure] // CELL, axis=0))
-    return ratio, max(1.2533 * spread * float(np.sqrt(CAUTIOUS_INFLATION / places)), 1e-3)
+    change, sigma = min(ways, key=lambda way: float(way[1]))
+    return float(change), max(float(sigma), 1e-3)
 
 
-def _pixels(relative: RelativePose) -> NDArray[np.int64]:
-    """Numbers (M,) for the inliers, equal where the pixels in the first view are."""
-    return _numbers(relative.x[relative.inliers])
+class _Depths(NamedTuple):
+    """
+    What a pair tells of M points in one of its views.
+
+    x: (M, 2) pixels; inverse: (M,) inverse depths in units of the translation; parallax: (M,) rad.
+    """
+
+    x: Array
+    inverse: Array
+    parallax: Array
+
+    @classmethod
+    def here(cls, pair: RelativePose, K: Array) -> _Depths:
+        """Of the inliers in the pair's first view."""
+        x = pair.x[pair.inliers]
+        m, y = rays(K, x) @ pair.R.T, rays(K, pair.y_opt[pair.inliers])
+        # y x (m + rho t) = 0, by least squares: linear, so that noise about zero stays about zero
+        shift, lever = np.cross(y, m), np.cross(y, pair.t)
+        inverse = -(shift * lever).sum(1) / np.maximum((lever**2).sum(1), 1e-12)
+        return cls(x, inverse, np.linalg.norm(shift, axis=1) / (y**2).sum(1))
+
+    @classmethod
+    def there(cls, pair: RelativePose, K: Array) -> _Depths:
+        """Of the inliers in the pair's second view."""
+        here = cls.here(pair, K)
+        return cls(pair.y[pair.inliers], _from(here.inverse, here.x, pair.R, pair.t, K),
+                   here.parallax)
+
+    def of(self, chosen: NDArray[np.bool_]) -> _Depths:
+        """Give some of the points."""
+        return _Depths(*(values[chosen] for values in self))
+
+
+def _from(inverse: Array, x: Array, R: Array, t: Array, K: Array) -> Array:
+    """Inverse depths (M,) in a view to which R, t lead, of pixels x (M, 2); NaN behind it."""
+    ahead = (rays(K, x) @ R.T)[:, 2] + inverse * t[2]
+    return np.asarray(inverse / np.where(ahead > 0, ahead, np.nan))
+
+
+def _shared(first: _Depths, second: _Depths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give indices (S,) of the points that are the same pixels of a view."""
+    _, mine, others = np.intersect1d(_numbers(first.x), _numbers(second.x), return_indices=True)
+    return mine, others
 
 
 def _numbers(points: Array) -> NDArray[np.int64]:
@@ -234,14 +279,26 @@ def _numbers(points: Array) -> NDArray[np.int64]:
     return np.asarray(columns + (rows << 20))
 
 
-def _inverse_depths(relative: RelativePose, K: Array) -> tuple[Array, Array]:
-    """Inverse depths in units of the translation, and parallaxes in rad, (M,) of the inliers."""
-    m = rays(K, relative.x[relative.inliers]) @ relative.R.T
-    y = rays(K, relative.y_opt[relative.inliers])
-    # y x (m + rho t) = 0, by least squares: linear, so that noise about zero stays about zero
-    shift, lever = np.cross(y, m), np.cross(y, relative.t)
-    inverse = -(shift * lever).sum(1) / np.maximum((lever**2).sum(1), 1e-12)
-    return inverse, np.linalg.norm(shift, axis=1) / (y**2).sum(1)
+def _ratio(sure: _Depths, others: _Depths) -> tuple[float, float] | None:
+    """
+    Tell by what factor others have larger inverse depths of the same points, and its sigma.
+
+    By points of which the former are sure; None where they are too few.
+    """
+    mine, theirs = _shared(sure, others)
+    x, parallax = sure.x[mine], sure.parallax[mine]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        ratios = others.inverse[theirs] / sure.inverse[mine]
+    told = (parallax > _LEAST_PARALLAX) & np.isfinite(ratios)
+    if told.sum() < _LEAST_SHARED:
+        return None
+    ratio = float(np.median(ratios[told]))
+    if ratio <= 0:
+        return None
+    # Standard deviation of a median, if places apart err independently, and more than that.
+    spread = 1.4826 * float(np.median(np.abs(ratios[told] - ratio)))
+    places = len(np.unique(x[told] // CELL, axis=0))
+    return ratio, 1.2533 * spread * float(np.sqrt(CAUTIOUS_INFLATION / places))
 
 
 def _edge(source: int, target: int, relative: RelativePose, length: Length, kind: str) -> Edge:

@@ -20,8 +20,8 @@ import numpy as np
 
 # What the offline SLAM goes by, of the section slam; the rest is for live use.
 PARAMETERS = tuple(f'slam.{name}' for name in (
-    'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap', 'loop_votes',
-    'loop_candidates', 'loop_inliers', 'loop_share'))
+    'keyframes', 'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap',
+    'loop_votes', 'loop_candidates', 'loop_inliers', 'loop_share'))
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
              progress: Callable[[int, int], None] | None = None,
              scratch: Path | None = None) -> Slam:
     """
-    Choose keyframes, find links and loops in the recording's images, and optimise.
+    Take keyframes, find links and loops in the recording's images, and optimise.
 
     steps: at least one, of the recording's replay with the configuration; progress is called with
     (frames done, frames in all); scratch: a folder with room for the images of the keyframes,

@@ -108,7 +108,8 @@ class StepMessages:
         frame = parts.odometry.header.frame_id
         here = _of_camera(pose, self._mounting)
         if said.status in STARTED:
-            return [Step(said.stamp_ns, said.status, here, odom_frame=frame)]
+            return [Step(said.stamp_ns, said.status, here, odom_frame=frame,
+                         keyframe=said.keyframe)]
         if said.status not in TRACKED:
             return []
         expected = self._base_frame or parts.relative.header.frame_id
@@ -122,7 +123,8 @@ class StepMessages:
         covariance = np.asarray(parts.relative.pose.covariance, np.float64).reshape(6, 6)
         step = Step(said.stamp_ns, said.status, here, said.reference_ns,
                     _of_camera(motion, self._axes), rotated(self._axes[:3, :3].T, covariance),
-                    said.scale is not Scale.UNKNOWN, frame, said.scale is Scale.METRIC)
+                    said.scale is not Scale.UNKNOWN, frame, said.scale is Scale.METRIC,
+                    said.keyframe)
         if step.tracked:
             step.check(f'odometry edge to {said.stamp_ns} ns')
         return [step]

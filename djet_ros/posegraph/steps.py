@@ -20,7 +20,8 @@ class Step(Motion):
     stamp_ns, status: of the frame; pose (4, 4): the camera in the odometry's frame;
     previous_stamp_ns: of the frame that it was related to, or None; motion (4, 4), covariance
     (6, 6): from there to here, where that is known; odom_frame: name of the odometry's frame,
-    where messages say it; metric: whether a known length is in metres.
+    where messages say it; metric: whether a known length is in metres; keyframe: whether the
+    odometry took the frame for a keyframe, None where it takes none or that is not known.
     """
 
     stamp_ns: int
@@ -32,6 +33,7 @@ class Step(Motion):
     scale_known: bool = False
     odom_frame: str = ''
     metric: bool = True
+    keyframe: bool | None = None
 
     @property
     def tracked(self) -> bool:

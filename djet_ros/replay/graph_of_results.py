@@ -13,7 +13,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
+from djet_ros.odometry.messages import IS_KEYFRAME, OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.posegraph.pose_graph import PoseGraph
@@ -59,6 +59,7 @@ class _Row(NamedTuple):
     status: Status
     previous_stamp_ns: int | None
     scale: Scale
+    keyframe: bool | None
 
 
 def _rows(path: Path) -> list[_Row]:
@@ -71,7 +72,8 @@ def _rows(path: Path) -> list[_Row]:
             previous = row['previous_stamp_ns']
             rows.append(_Row(int(row['stamp_ns']), Status(row['status']),
                              int(previous) if previous else None,
-                             Scale(row['scale_kind'] or Scale.UNKNOWN)))
+                             Scale(row['scale_kind'] or Scale.UNKNOWN),
+                             IS_KEYFRAME[row.get('keyframe') or '']))
         except (KeyError, TypeError, ValueError) as error:
             raise DjetError(f'{path} line {number} is no row of a replay: {error}') from error
     return rows
@@ -104,6 +106,7 @@ def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array
                                 'missing from the bag; replay the recording once more')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
                        *motions[row.stamp_ns], row.scale is not Scale.UNKNOWN,
-                       metric=row.scale is Scale.METRIC)
+                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe)
         elif row.status in STARTED or row.stamp_ns in references:
-            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns)
+            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
+                       keyframe=row.keyframe)

@@ -152,7 +152,7 @@ class Replay:
             log.steps.append(Step(result.stamp_ns, result.status, result.pose,
                                   result.previous_stamp_ns, result.motion,
                                   result.motion_covariance, result.scale_known,
-                                  metric=result.metric))
+                                  metric=result.metric, keyframe=result.keyframe))
             self._folder.add_frame(number, result, seconds)
             self._folder.add_landmarks(tracker.settled())
         else:

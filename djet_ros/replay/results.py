@@ -22,6 +22,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import dump_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.odometry.messages import KEYFRAME_WORDS
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.steps import Step
@@ -44,7 +45,7 @@ _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt'
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
-           'ms')
+           'keyframe', 'ms')
 
 
 class ResultsFolder(Closing):
@@ -78,7 +79,7 @@ class ResultsFolder(Closing):
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
-                   f'{1e3 * seconds:.2f}'))
+                   KEYFRAME_WORDS[result.keyframe], f'{1e3 * seconds:.2f}'))
 
     def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
         """Write that an image was dropped or rejected, and why."""
@@ -147,7 +148,7 @@ class ResultsFolder(Closing):
 def _details(result: OdometryResult) -> tuple[Any, ...]:
     relative = result.relative
     if relative is None:
-        return ('',) * (len(COLUMNS) - 5)
+        return ('',) * (len(COLUMNS) - 6)
     residuals = np.abs(relative.residuals[relative.inliers])
     hamming = relative.hamming[np.isfinite(relative.hamming)]
     return (result.previous_stamp_ns, len(relative.x), int(relative.inliers.sum()),
