@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
 from djet_ros.core.jet import (
     core_scale,
@@ -334,10 +336,15 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
     kept = np.linalg.norm(joined_at - surfaces.centres, axis=1) < 1e-6
     assert (together ^ kept).all()
     assert together.mean() > 0.8 and kept[::40].all()
-    # Covariances, but for their common unit.
+    # Covariances, but for their common unit, and for how much the noise seems to differ.
     C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
-    ratio = C[together] / np.linalg.inv(precision[together])
-    assert np.ptp(ratio) < 1e-6 * ratio.max()
+    apart = surfaces.centres - found
+    squared = (apart * np.linalg.solve(S + 2 * sigma**2 * np.eye(2), apart[..., None])[..., 0])
+    ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.inv(precision), C))[together]
+    assert np.ptp(ratio, axis=1).max() < 1e-6 * ratio.max()
+    by_distance = ratio[np.argsort(squared.sum(1)[together]), 0]
+    assert (np.diff(by_distance) > -1e-9 * ratio.max()).all()
+    assert by_distance[-1] < 2 * by_distance[0]
 
 
 @pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
@@ -357,6 +364,20 @@ def test_a_pose_of_surfaces_and_matches_is_no_less_exact_than_that_of_either(sig
         errors.append([rotation_angle(R, pose.R) for pose in poses])
     surface, match, both = np.sqrt(np.mean(np.square(errors), axis=0))
     assert both < 1.05 * min(surface, match)
+
+
+def test_places_that_agree_count_for_more_where_matches_differ_in_noise():
+    rng = np.random.default_rng(22)
+    views = two_views(rng, 400)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    noise = rng.choice([0.3, 1.0, 2.0], 400)  # of what is seen around a place, however
+    surfaces, _ = ellipses(rng, np.zeros_like(y), 0.2)
+    placed = replace(surfaces, centres=y + noise[:, None] * surfaces.centres)
+    found = y + noise[:, None] * rng.normal(0, 0.2, y.shape)
+    alone = jet_problem(K, x, placed)
+    joined = with_places(alone, at(alone, R, t), K, found)
+    grown = np.median(joined.spread[::2], axis=0) / np.median(alone.spread[::2], axis=0)
+    assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
 
 
 def test_where_a_surface_has_no_minimum_or_nothing_was_found_right_surfaces_count_alone():

@@ -60,6 +60,10 @@ _ONE_PLACE = 4.6
 # err alike where the image grows, which whoever found them may not have seen.
 _LESS_EXACT = 2.0
 
+# chosen: how much matches differ in noise, over what the places of each tell of it. What is wrong
+# with both shows in no difference.
+_SHARED = 2.0
+
 
 @dataclass(frozen=True)
 class JetProblem:
@@ -185,6 +189,9 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> 
 
     Where both are farther apart than nine of ten that are right, the match began at a wrong place,
     and the surface counts alone; so it does where it has no minimum.
+
+    How far both are apart tells the noise of the match itself too: at the edge of what is near,
+    they see different things. See `_noise_of_each`.
     """
     G = inverse_of(K)[:2, :2]
     pixel = G @ G.T
@@ -199,16 +206,34 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> 
     apart = (problem.rays_y - found.rays_y)[:2].T / np.sqrt(width)
     inverse = inverse_2x2(S + T)
     has_minimum = (S[:, 0, 0] > 0) & (S[:, 0, 0] * S[:, 1, 1] > S[:, 0, 1]**2)
-    joined = has_minimum & ((apart * times(inverse, apart)).sum(1) < _ONE_PLACE)
+    squared = (apart * times(inverse, apart)).sum(1)
+    joined = has_minimum & (squared < _ONE_PLACE)
     gain = S @ inverse * joined[:, None, None]
     rays_y = problem.rays_y.copy()
     rays_y[:2] -= np.sqrt(width) * times(gain, apart).T
     S = S - gain @ S
+    if joined.any():
+        S[joined] *= _noise_of_each(squared[has_minimum], squared[joined])[:, None, None]
     widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
     spread = S.reshape(-1, 4).T[[0, 1, 3]] * (width / max(median(widths), 1e-12))
     blur = problem.blur * (np.abs(spread[0] + spread[2])
                            / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
     return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
+
+
+def _noise_of_each(all_squared: Array, squared: Array) -> Array:
+    """
+    Give the noise (M,), over the usual, of matches whose two places are d^2 (M,) apart.
+
+    all_squared: (N,) of all matches, over the covariance that is usual. Where the noise differs
+    from match to match like an inverse gamma of nu degrees of freedom, errors are those of a
+    Student distribution: a share p of all d^2 is below nu ((1 - p)^(-2 / nu) - 1), so that the
+    upper quartile over the median is 2^(2 / nu) + 1, and the noise of one is expected to be
+    (nu + d^2) / (nu + 2). Where all are alike, the ratio is two.
+    """
+    middle, upper = np.quantile(all_squared, (0.5, 0.75))
+    unlike = np.log2(max(upper / max(middle, 1e-300) - 1, 1.0)) * _SHARED  # 2 / nu
+    return np.asarray((1 + unlike / 2 * squared) / (1 + unlike))
 
 
 def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:
