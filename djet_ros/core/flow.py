@@ -48,14 +48,13 @@ def follow(previous: View, current: View, start: Array, reach: float, levels: in
     """
     points = previous.features.points
     bits = np.full(len(points), np.inf)
-    if not len(points):
-        return points, bits
     x, at_first = (places.astype(np.float32)[:, None] for places in (points, start))
     y, seen = _flow(previous.gray, current.gray, x, at_first, levels, _STEPS, _LAST_STEP)
-    back, seen_back = _flow(current.gray, previous.gray, y, x, 0, _STEPS_BACK, _LAST_STEP_BACK)
-    good = np.flatnonzero(
-        seen & seen_back & (np.linalg.norm(back - x, axis=2).ravel() < _THERE_AND_BACK)
-        & (np.linalg.norm(y - at_first, axis=2).ravel() < reach))
+    near = np.flatnonzero(seen & (np.linalg.norm(y - at_first, axis=2).ravel() < reach))
+    back, seen_back = _flow(current.gray, previous.gray, y[near], x[near], 0, _STEPS_BACK,
+                            _LAST_STEP_BACK)
+    good = near[seen_back
+                & (np.linalg.norm(back - x[near], axis=2).ravel() < _THERE_AND_BACK)]
     places = y[:, 0].astype(np.float64)
     bits[good] = match_distances(previous.smoothed, points[good], current.smoothed, places[good])
     # Not a number where a descriptor would leave the image.
@@ -67,6 +66,8 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[n
           start: NDArray[np.float32], levels: int, steps: int, last_step: float,
           ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Give where points (N, 1, 2) lead from where they may be, and (N,) whether they are seen."""
+    if not len(points):
+        return points, np.zeros(0, bool)
     found, seen, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, start.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, steps, last_step),
