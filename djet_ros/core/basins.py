@@ -40,6 +40,10 @@ class BasinTuning:
     matches_to_sketch: int = 800
     # chosen: it costs little to refine all starts on so few, and there basins lie closer
     few_matches: int = 400
+    # chosen: around the motion ahead, on still fewer: most are of the world, or others are asked
+    matches_ahead: int = 200
+    # chosen: and steps on the way there, from all directions and then from the cheapest
+    steps_ahead: tuple[int, int] = (4, 2)
     # chosen: directions all round from which basins are looked for then, and around the motion
     # before
     directions: int = 10
@@ -140,14 +144,14 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     """
     Choose among the basins around the motion before: its own, and of directions all round.
 
-    A few hundred matches lead to them, and all choose. Where these are not clearly for one, they
+    Some matches lead to them, and all choose. Where these are not clearly for one, they
     are led on, for some may have been on the way to one and the same; where that does not help,
     they are held against others. Where a turn alone explains the matches, none of that matters.
     """
-    some = problem.subset(thinned(len(problem.blur), TUNING.few_matches))
+    some = problem.subset(thinned(len(problem.blur), TUNING.matches_ahead))
     tight = Loss()
     basins = around(ahead.pose, TUNING.directions)
-    for steps in (0, TUNING.steps_to_sketch, TUNING.steps_to_sketch):
+    for steps in (0, *TUNING.steps_ahead):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), LEAST_SCALE)
         tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)

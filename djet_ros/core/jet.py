@@ -34,7 +34,7 @@ from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
-_MAX_STEPS = 30
+MAX_STEPS = 30
 _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good for
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
@@ -272,7 +272,7 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
 
 
 def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
-             max_steps: int = _MAX_STEPS) -> Solution:
+             max_steps: int = MAX_STEPS) -> Solution:
     """
     Minimise the summed loss from a starting pose by Levenberg-Marquardt steps.
 

@@ -31,6 +31,7 @@ from djet_ros.core.jet import (
     jet_problem,
     JetProblem,
     Loss,
+    MAX_STEPS,
     minimise,
     Residuals,
     Solution,
@@ -60,6 +61,8 @@ class TrackTuning:
     # than that; the world reaches from the ground before the camera to the horizon
     flat: float = 0.5
     deep: float = 0.25
+    # chosen: steps on all matches to a pose that surfaces are only placed by
+    steps_by_places: int = 2
     # robust standard deviations; the usual three, within which a match agrees with a pose
     inlier: float = 3.0
 
@@ -212,7 +215,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         begun = begun or _Begun(problem, places, voting, basin.rivals, basin.scale)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
-        solution = minimise(problem, basin.pose.R, basin.pose.t, loss)
+        steps = TUNING.steps_by_places if first is not surface and iteration == 1 else MAX_STEPS
+        solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
         if last and rival_poses:
