@@ -59,8 +59,8 @@ _SURPRISING = 20.5
 # chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
 _TRUSTED = 0.5
 
-# rad; no ellipsoid spans two motions that are further from one another, as the sphere of directions
-# is bent: up to here chord and arc agree to a twentieth.
+# rad; no ellipsoid spans two motions that are further from one another, as the sphere of
+# directions is bent: up to here chord and arc agree to a twentieth.
 _FAR = 0.5
 
 
