@@ -1,7 +1,7 @@
 """Corners are spread, real and between pixels, whatever the image."""
 
 import cv2
-from djet_ros.core.corners import corner_slopes, detect_corners, ONE_SIZE, spread_out
+from djet_ros.core.corners import corner_slopes, detect_corners, spread_out
 from djet_ros.core.hamming import describable
 import numpy as np
 import pytest
@@ -137,13 +137,3 @@ def test_slopes_are_the_same_whatever_stands_far_above_them(image, rows):
     # At a border, slopes are taken from what is mirrored there.
     assert np.array_equal(whole[rows + 2:], below[2:])
     assert below[2:].any()
-
-
-def test_corners_of_one_size_are_among_those_of_three(image):
-    found = detect_corners(image, 800, 1.0, shares=ONE_SIZE)
-    assert (found.octaves == 0).all() and len(found) > 200
-    # So many are asked for that there is room for all.
-    three = detect_corners(image, 20_000, 1.0)
-    middle = three.points[three.octaves == 1]
-    near = np.linalg.norm(found.points[:, None] - middle, axis=2).min(1)
-    assert (near < 1e-9).all()

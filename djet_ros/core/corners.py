@@ -22,10 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # How many times smaller the image is made for corners of each size, and their shares of all.
-SIZES = ((1.0, 0.6), (1.44, 0.25), (2.07, 0.15))
-
-# Of one size: found in a third of the time, and the most exact where there are few of them.
-ONE_SIZE = ((1.44, 1.0),)
+_SIZES = ((1.0, 0.6), (1.44, 0.25), (2.07, 0.15))
 
 # Side of the block, in each second pixel, over which gradients are collected.
 _BLOCK = 3
@@ -48,19 +45,17 @@ _SOBEL = 8.0
 
 
 def detect_corners(gray: Image, max_features: int, contrast: float,
-                   mask: Mask | None = None, smoothed: Image | None = None,
-                   shares: Sequence[tuple[float, float]] = SIZES) -> Features:
+                   mask: Mask | None = None, smoothed: Image | None = None) -> Features:
     """
     Detect corners in a gray image (H, W) uint8; images too small for a descriptor give none.
 
     contrast: rms slope, in gray levels per pixel, that a corner has at least in its weakest
     direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
     in the image made smaller. Octaves number the sizes. mask: (H, W) bool, where no point may be;
-    smoothed: gray as ORB's tests see it, where that is known already; shares: the sizes, by how
-    many times smaller the image is made, and the share of each in all corners.
+    smoothed: gray as ORB's tests see it, where that is known already.
     """
     sizes = [(octave, scale, round(share * max_features))
-             for octave, (scale, share) in enumerate(shares)
+             for octave, (scale, share) in enumerate(_SIZES)
              if min(gray.shape) > 2 * scale * (REACH + 1)]
     found = each(lambda size: _of_size(gray, *size, contrast, mask), sizes)
     if not found:

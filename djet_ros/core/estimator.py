@@ -8,7 +8,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from djet_ros.core.basins import Ahead, TUNING as BASIN_TUNING
-from djet_ros.core.corners import detect_corners, ONE_SIZE, SIZES
+from djet_ros.core.corners import detect_corners
 from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
@@ -92,10 +92,10 @@ class TwoViewEstimator:
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None,
                  smoothed: NDArray[np.uint8] | None = None) -> Features:
         """Detect the features of a gray image (H, W) uint8, but where a mask (H, W) is True."""
-        if self.config.detector == 'orb':
-            return detect_orb(gray, self.config.max_features, self.config.fast_threshold, mask)
-        return detect_corners(gray, self.config.max_features, self.config.corner_contrast, mask,
-                              smoothed, SIZES if self.config.detector == 'corners' else ONE_SIZE)
+        if self.config.detector == 'corners':
+            return detect_corners(gray, self.config.max_features, self.config.corner_contrast,
+                                  mask, smoothed)
+        return detect_orb(gray, self.config.max_features, self.config.fast_threshold, mask)
 
     def estimate(self, previous: View, current: View, prior: RelativePose | None = None,
                  known: Known | None = None) -> RelativePose:

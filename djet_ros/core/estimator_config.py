@@ -27,9 +27,8 @@ class EstimatorConfig:
     max_features: int = parameter(
         2000, 'features detected per image', minimum=8, maximum=20000)
     detector: str = parameter(
-        'corners', 'features: corners (well spread, of three sizes, descriptors unrotated), '
-        'coarse_corners (the same of one size, found in a third of the time) or orb (as OpenCV '
-        'detects them, descriptors rotated)', choices=('corners', 'coarse_corners', 'orb'))
+        'corners', 'features: corners (well spread, of three sizes, descriptors unrotated) or orb '
+        '(as OpenCV detects them, descriptors rotated)', choices=('corners', 'orb'))
     corner_contrast: float = parameter(
         1.0, 'slope in its weakest direction that makes a corner, in gray levels per pixel; lower '
         'it for dim images', minimum=0.01, maximum=100.0)
@@ -115,9 +114,8 @@ _PAPER: dict[str, Any] = {
 }
 
 
-# Fewer matches, of corners that are found sooner, and fewer samples of each.
-_FAST: dict[str, Any] = {
-    'detector': 'coarse_corners', 'max_features': 800, 'window': 3, 'binary_tests': 64}
+# Fewer matches, the fewer samples of each, and references taken between pixels once.
+_FAST: dict[str, Any] = {'max_features': 800, 'window': 3, 'binary_tests': 64, 'max_iterations': 2}
 
 
 def preset(name: str, **changes: Any) -> EstimatorConfig:
