@@ -5,9 +5,10 @@ from dataclasses import replace
 from djet_ros.core.bundle import (
     eliminate,
     in_frame,
+    jacobians,
     Landmarks,
-    linearise,
     noise_scale,
+    observe,
     Poses,
     projected,
 )
@@ -49,23 +50,24 @@ def test_a_landmark_is_seen_where_its_point_in_space_is_projected():
 
 def test_exact_observations_leave_no_residual():
     poses, landmarks = scene(np.random.default_rng(1))
-    assert np.abs(linearise(K, poses, landmarks).residuals).max() < 1e-9
+    assert np.abs(observe(K, poses, landmarks).residuals).max() < 1e-9
 
 
 def test_jacobians_are_those_of_small_steps():
     poses, landmarks = scene(np.random.default_rng(2))
     landmarks.minima += 3.0
-    linear = linearise(K, poses, landmarks)
+    observed = observe(K, poses, landmarks)
+    by = jacobians(observed)
     step = np.random.default_rng(3).normal(size=(4, 6)) * 1e-6
     own = np.random.default_rng(4).normal(size=(40, 3)) * [1e-7, 1e-5, 1e-5]
-    expected = (np.einsum('nij,nj->ni', linear.by_frame, step[linear.frame])
-                + np.einsum('nij,nj->ni', linear.by_anchor, step[linear.anchor])
-                + np.einsum('nij,nj->ni', linear.by_own, own[linear.landmark]))
-    ahead, back = (linearise(K, poses.moved(sign * step.ravel()), landmarks.moved(sign * own))
+    expected = (np.einsum('nij,nj->ni', by.by_frame, step[observed.frame])
+                + np.einsum('nij,nj->ni', by.by_anchor, step[observed.anchor])
+                + np.einsum('nij,nj->ni', by.by_own, own[observed.landmark]))
+    ahead, back = (observe(K, poses.moved(sign * step.ravel()), landmarks.moved(sign * own))
                    for sign in (1, -1))
     assert (ahead.residuals - back.residuals) / 2 == pytest.approx(expected, rel=1e-5, abs=1e-9)
     assert (ahead.off - back.off) / 2 == pytest.approx(
-        np.einsum('nij,nj->ni', linear.held, own[:, 1:]), abs=1e-12)
+        np.einsum('nij,nj->ni', observed.held, own[:, 1:]), abs=1e-12)
 
 
 def test_steps_undo_one_another():
@@ -78,23 +80,24 @@ def test_elimination_solves_the_same_equations_as_all_at_once():
     poses, landmarks = scene(np.random.default_rng(7))
     landmarks.minima += np.random.default_rng(8).normal(size=landmarks.minima.shape)
     landmarks.points += np.random.default_rng(13).normal(size=landmarks.points.shape)
-    linear = linearise(K, poses, landmarks)
-    weights = np.random.default_rng(9).uniform(0.5, 2, len(linear.residuals))
+    observed = observe(K, poses, landmarks)
+    by = jacobians(observed)
+    weights = np.random.default_rng(9).uniform(0.5, 2, len(observed.residuals))
     J = np.zeros((len(weights) + 40, 2, 24 + 3 * 40))
     for n, (landmark, frame, anchor) in enumerate(
-            zip(linear.landmark, linear.frame, linear.anchor)):
-        J[n, :, 6 * frame:6 * frame + 6] += linear.by_frame[n]
-        J[n, :, 6 * anchor:6 * anchor + 6] += linear.by_anchor[n]
-        J[n, :, 24 + 3 * landmark:][:, :3] = linear.by_own[n]
+            zip(observed.landmark, observed.frame, observed.anchor)):
+        J[n, :, 6 * frame:6 * frame + 6] += by.by_frame[n]
+        J[n, :, 6 * anchor:6 * anchor + 6] += by.by_anchor[n]
+        J[n, :, 24 + 3 * landmark:][:, :3] = by.by_own[n]
     for landmark in range(40):
-        J[len(weights) + landmark, :, 25 + 3 * landmark:][:, :2] = linear.held[landmark]
+        J[len(weights) + landmark, :, 25 + 3 * landmark:][:, :2] = observed.held[landmark]
     W = np.repeat([*weights, *[0.7] * 40], 2)[:, None]
-    e = np.concatenate([linear.residuals, linear.off]).ravel()
+    e = np.concatenate([observed.residuals, observed.off]).ravel()
     J = J.reshape(-1, 144)
     # The seven freedoms of the whole are held by a little information about each pose.
     held = np.diag([*[1.0] * 24, *[0.0] * 120])
     whole = -np.linalg.solve((J * W).T @ J + held, (J * W).T @ e)
-    reduced = eliminate(linear, weights, 0.7, 4)
+    reduced = eliminate(observed, weights, 0.7, 4)
     step = -np.linalg.solve(reduced.H + np.eye(24), reduced.g)
     assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
     assert reduced.change(step).ravel() == pytest.approx(whole[24:], rel=1e-4, abs=1e-6)
@@ -108,8 +111,8 @@ def test_noise_free_landmarks_bring_poses_and_depths_back():
     # The first two poses hold where all is, and how large.
     held = np.diag([*[1e12] * 12, *[0.0] * 12])
     for _ in range(8):
-        linear = linearise(K, wrong, guessed)
-        reduced = eliminate(linear, np.ones(len(linear.residuals)), 1.0, 4)
+        observed = observe(K, wrong, guessed)
+        reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, 4)
         step = -np.linalg.solve(reduced.H + held, reduced.g)
         wrong = wrong.moved(step)
         guessed = guessed.moved(reduced.change(step))
@@ -137,8 +140,8 @@ def test_noise_of_the_patch_where_a_landmark_was_found_does_not_shorten_steps():
     landmarks.minima += rng.normal(size=(8000, 1, 2))
     held = np.diag([*[1e12] * 12, *[0.0] * 6])
     for _ in range(6):
-        linear = linearise(K, poses, landmarks)
-        reduced = eliminate(linear, np.full(len(linear.residuals), 1e4), 1.0, 3)
+        observed = observe(K, poses, landmarks)
+        reduced = eliminate(observed, np.full(len(observed.residuals), 1e4), 1.0, 3)
         step = -np.linalg.solve(reduced.H + held, reduced.g)
         poses, landmarks = poses.moved(step), landmarks.moved(reduced.change(step))
     found = np.linalg.norm(poses.t[2] - poses.R[2] @ poses.R[1].T @ poses.t[1])
@@ -154,7 +157,7 @@ def test_noise_is_told_whatever_landmarks_make_up_for(frames):
     landmarks.found = landmarks.found + rng.normal(size=(1500, 2)) * 0.3
     landmarks.minima += rng.normal(size=landmarks.minima.shape) * 0.3
     for _ in range(4):
-        linear = linearise(K, poses, landmarks)
-        reduced = eliminate(linear, np.ones(len(linear.residuals)), 1.0, frames)
+        observed = observe(K, poses, landmarks)
+        reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, frames)
         landmarks = landmarks.moved(reduced.change(np.zeros(6 * frames)))
-    assert noise_scale(linearise(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)
+    assert noise_scale(observe(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)

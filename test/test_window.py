@@ -63,7 +63,8 @@ class NumbersWindow(Window):
     def __init__(self, street: Street) -> None:
         super().__init__(EstimatorConfig())
         self._distances: Any = SimpleNamespace(
-            describable=lambda points, shape, radius=0: inside(points))
+            describable=lambda points, shape, radius=0: inside(points),
+            strengths=lambda seen, points: np.ones(len(points)))
         self._street, self._which = street, dict[tuple[float, ...], int]()
         self._frame, self.told, self.taken, self.thrown = 0, list[float](), 0, 0
         self.start(blank())

@@ -21,7 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from djet_ros.core.geometry import rays, rotation_exp, rotation_log, skew
+from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
+from djet_ros.core.paraboloid import times
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,8 @@ class Poses:
     def moved(self, step: Array) -> Poses:
         """Give the poses moved by a step (6 F,)."""
         step = step.reshape(-1, 6)
-        turns = np.array([rotation_exp(omega) for omega in step[:, :3]])
-        return Poses(turns @ self.R, np.einsum('fij,fj->fi', turns, self.t) + step[:, 3:])
+        turns = rotation_exp(step[:, :3])
+        return Poses(turns @ self.R, times(turns, self.t) + step[:, 3:])
 
     def step_from(self, other: Poses) -> Array:
         """Give the step (6 F,) that moves other poses to these, to first order."""
@@ -126,8 +127,9 @@ class Landmarks:
     anchors: (N,) frames that saw them first; found: (N, 2) pixels there, around which their
     patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
     where they are taken to be; rho: (N,) inverse depths there; slopes: (N, 2) by which share these
-    change around them, a pixel; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their
-    precision, so that ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
+    change around them, a pixel; strengths: (N,) how much their patches differ from pixel to pixel;
+    minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)``
+    is white; seen: (N, F) where the last two mean anything.
     """
 
     anchors: NDArray[np.int64]
@@ -136,6 +138,7 @@ class Landmarks:
     points: Array
     rho: Array
     slopes: Array
+    strengths: Array
     minima: Array
     roots: Array
     seen: NDArray[np.bool_]
@@ -145,11 +148,12 @@ class Landmarks:
 
     @classmethod
     def at(cls, points: Array, rho: Array, anchor: int, frames: int,
-           slopes: Array | None = None) -> Landmarks:
+           slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
         """Make landmarks that no other frame has seen yet; without slopes they face the camera."""
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), points, np.zeros((n, 2, 2)), points, rho,
-                   np.zeros((n, 2)) if slopes is None else slopes, np.zeros((n, frames, 2)),
+                   np.zeros((n, 2)) if slopes is None else slopes,
+                   np.ones(n) if strengths is None else strengths, np.zeros((n, frames, 2)),
                    np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
@@ -178,7 +182,8 @@ class Landmarks:
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
 
     def _by_anchor(self) -> tuple[Any, ...]:
-        return self.anchors, self.found, self.held, self.points, self.rho, self.slopes
+        return self.anchors, self.found, self.held, self.points, self.rho, self.slopes, \
+            self.strengths
 
     def _by_frame(self) -> tuple[Any, ...]:
         return self.minima, self.roots, self.seen
@@ -188,7 +193,7 @@ def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
     """Give places (N, 3) of landmarks in a frame, times their inverse depths in their anchors."""
     R, t = poses.between()
     turned = R[frame, landmarks.anchors]
-    places: Array = np.einsum('nij,nj->ni', turned, rays(K, landmarks.points))
+    places = times(turned, rays(K, landmarks.points))
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
 
 
@@ -199,55 +204,91 @@ def projected(K: Array, places: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Linearised:
+class Observed:
     """
-    M observations of N landmarks and how they change: see ``linearise``.
+    M observations of N landmarks: see ``observe``.
 
-    landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); by_frame, by_anchor:
-    (M, 2, 6) over the steps of the two poses; by_own: (M, 2, 3) over those of the landmark's
-    inverse depth and point; off: (N, 2) residuals of the points, held: (N, 2, 2) how they change.
+    landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); off: (N, 2) residuals of
+    the points, held: (N, 2, 2) how they change. R (M, 3, 3), t (M, 3), ray (M, 3), rho (M,):
+    motion from the anchor to the frame, and the landmark there; place (M, 3): R ray + rho t; root:
+    (M, 2, 2) of the precision.
     """
 
     landmark: NDArray[np.int64]
     frame: NDArray[np.int64]
     anchor: NDArray[np.int64]
     residuals: Array
-    by_frame: Array
-    by_anchor: Array
-    by_own: Array
     off: Array
     held: Array
+    K: Array
+    R: Array
+    t: Array
+    ray: Array
+    rho: Array
+    place: Array
+    root: Array
 
 
-def linearise(K: Array, poses: Poses, landmarks: Landmarks) -> Linearised:
-    """Take the residuals of all observations, in the unit of their roots, and their Jacobians."""
+def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
+    """Take the residuals of all observations, in the unit of their roots."""
     landmark, frame = np.nonzero(landmarks.seen)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     motions = poses.between()
     R, t = motions[0][frame, anchor], motions[1][frame, anchor]
-    ray = rays(K, landmarks.points[landmark])
-    place = np.einsum('nij,nj->ni', R, ray) + rho[:, None] * t
-    z = np.maximum(place[:, 2], _NEAREST)
+    ray = rays(K, landmarks.points)[landmark]
+    place = times(R, ray) + rho[:, None] * t
     root = landmarks.roots[landmark, frame]
-    off = projected(K, place) - landmarks.minima[landmark, frame]
+    return Observed(
+        landmark, frame, anchor,
+        times(root, projected(K, place) - landmarks.minima[landmark, frame]),
+        times(landmarks.held, landmarks.points - landmarks.found), landmarks.held,
+        K, R, t, ray, rho, place, root)
+
+
+@dataclass(frozen=True)
+class Jacobians:
+    """
+    How M residuals change: see ``jacobians``.
+
+    by_frame, by_anchor: (M, 2, 6) over the steps of the two poses; by_own: (M, 2, 3) over those of
+    the landmark's inverse depth and point.
+    """
+
+    by_frame: Array
+    by_anchor: Array
+    by_own: Array
+
+
+def jacobians(observed: Observed) -> Jacobians:
+    """Differentiate the residuals of observations."""
+    K, R, place, ray = observed.K, observed.R, observed.place, observed.ray
+    scaled = observed.root @ K[:2, :2] / np.maximum(place[:, 2], _NEAREST)[:, None, None]
     # Of the projection: d(x / z) = (dx - x / z dz) / z.
-    shift = np.repeat(np.eye(3)[None, :2], len(z), axis=0)
-    shift[:, :, 2] = -place[:, :2] / z[:, None]
-    by_place = root @ (K[:2, :2] @ shift / z[:, None, None])
+    ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _NEAREST)
+    by_place = np.concatenate([scaled, ahead[:, :, None]], axis=2)
     by_turned = by_place @ R
-    weight = rho[:, None, None]
-    by_rho = np.einsum('nij,nj->ni', by_place, t)
-    by_point = by_turned @ np.linalg.inv(K)[:, :2]
-    return Linearised(
-        landmark, frame, anchor, np.einsum('nij,nj->ni', root, off),
-        np.concatenate([-by_place @ skew(place), by_place * weight], axis=2),
-        np.concatenate([by_turned @ skew(ray), -by_turned * weight], axis=2),
-        np.concatenate([by_rho[:, :, None], by_point], axis=2),
-        np.einsum('nij,nj->ni', landmarks.held, landmarks.points - landmarks.found),
-        landmarks.held)
+    weight = observed.rho[:, None, None]
+    by_frame, by_anchor = np.empty((2, len(place), 2, 6))
+    # Of a turn about omega: d(X) = omega x X, and a . (omega x X) = omega . (X x a).
+    _cross(place[:, None], by_place, by_frame[:, :, :3])
+    _cross(by_turned, ray[:, None], by_anchor[:, :, :3])
+    np.multiply(by_place, weight, out=by_frame[:, :, 3:])
+    np.multiply(by_turned, -weight, out=by_anchor[:, :, 3:])
+    by_own = np.empty((len(place), 2, 3))
+    by_own[:, :, 0] = times(by_place, observed.t)
+    np.matmul(by_turned, inverse_of(K)[:, :2], out=by_own[:, :, 1:])
+    return Jacobians(by_frame, by_anchor, by_own)
 
 
-def noise_scale(linear: Linearised) -> float:
+def _cross(a: Array, b: Array, out: Array) -> None:
+    """Put cross products into an array (…, 3): components first, which is cheaper."""
+    (a1, a2, a3), (b1, b2, b3) = (np.moveaxis(v, -1, 0) for v in (a, b))
+    out[..., 0] = a2 * b3 - a3 * b2
+    out[..., 1] = a3 * b1 - a1 * b3
+    out[..., 2] = a1 * b2 - a2 * b1
+
+
+def noise_scale(observed: Observed) -> float:
     """
     Tell the standard deviation of observations in the unit of their roots, robustly.
 
@@ -257,9 +298,9 @@ def noise_scale(linear: Linearised) -> float:
     let the noise seem to be little more than half of what it is, and what errs by no more than
     usual be taken for false. What poses make up for is neglected. At least one observation.
     """
-    count = np.bincount(linear.landmark, minlength=len(linear.off))
-    squares = (linear.off**2).sum(1) + np.bincount(
-        linear.landmark, (linear.residuals**2).sum(1), minlength=len(linear.off))
+    count = np.bincount(observed.landmark, minlength=len(observed.off))
+    squares = (observed.off**2).sum(1) + np.bincount(
+        observed.landmark, (observed.residuals**2).sum(1), minlength=len(observed.off))
     seen = count > 0
     # Wilson and Hilferty's median of the chi-square distribution.
     freedom = 2 * count[seen] - 1
@@ -286,31 +327,31 @@ class Reduced:
                                      self._slopes + self._coupling @ step))
 
 
-def eliminate(linear: Linearised, weights: Array, weight: float, frames: int) -> Reduced:
+def eliminate(observed: Observed, weights: Array, weight: float, frames: int) -> Reduced:
     """
     Sum up observations, and eliminate the landmarks.
 
     weights: (M,) of the observations; weight: that of where the landmarks were found.
     """
-    count, n = len(weights), len(linear.off)
+    count, n, linear = len(weights), len(observed.off), jacobians(observed)
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
-    e, back = linear.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
+    e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
     J = np.zeros((count, 2, frames, 6))
     rows = np.arange(count)
-    J[rows, :, linear.frame], J[rows, :, linear.anchor] = by_frame, by_anchor
+    J[rows, :, observed.frame], J[rows, :, observed.anchor] = by_frame, by_anchor
     flat = J.reshape(-1, 6 * frames)
     H, g = flat.T @ flat, flat.T @ e.ravel()
     information, slopes = np.tile(np.eye(3) * _TRACE, (n, 1, 1)), np.zeros((n, 3))
-    transposed = linear.held.transpose(0, 2, 1) * weight
-    information[:, 1:, 1:] += transposed @ linear.held
-    slopes[:, 1:] = np.einsum('nij,nj->ni', transposed, linear.off)
+    transposed = observed.held.transpose(0, 2, 1) * weight
+    information[:, 1:, 1:] += transposed @ observed.held
+    slopes[:, 1:] = times(transposed, observed.off)
     coupling = np.zeros((n, frames, 3, 6))
     if count:
         # Each landmark is seen once by a frame, and has one anchor.
-        coupling[linear.landmark, linear.frame] = back @ by_frame
-        first = np.flatnonzero(np.diff(linear.landmark, prepend=-1))
-        seen, anchor = linear.landmark[first], linear.anchor[first]
+        coupling[observed.landmark, observed.frame] = back @ by_frame
+        first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
+        seen, anchor = observed.landmark[first], observed.anchor[first]
         coupling[seen, anchor] = np.add.reduceat(back @ by_anchor, first)
         information[seen] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
         slopes[seen] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)

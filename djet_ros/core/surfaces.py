@@ -178,13 +178,15 @@ class DescriptorDistances:
 
         It is what a change of exposure makes it. Bits know of no contrast: 1.
         """
-        if not self._grading or not len(x):
-            return 1.0
-        some, tests = thinned(len(x), _MEASURED), self._tests[:_MEASURED_TESTS]
-        sums = [np.abs(np.subtract(*intensities(image, points[some], tests))).sum(0, dtype=float)
-                for image, points in ((here, y), (there, x))]
-        ratio = median((sums[0] + 1) / (sums[1] + 1))
-        return min(max(ratio, 1 / _MOST_CONTRAST), _MOST_CONTRAST)
+        some = thinned(len(x), _MEASURED)
+        return contrast_of(self.strengths(here, y[some]), self.strengths(there, x[some]))
+
+    def strengths(self, seen: NDArray[Any], points: Pixels) -> Array:
+        """Tell how much (N,) an image differs around whole pixels (N, 2), see ``contrast_of``."""
+        if not self._grading:
+            return np.ones(len(points))
+        p, q = intensities(seen, points, self._tests[:_MEASURED_TESTS])
+        return np.asarray(np.abs(p - q).sum(0, dtype=float) + 1)
 
     def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
@@ -291,6 +293,13 @@ class ReprojectionSurface:
         n = len(y)
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
                            np.zeros(n), np.ones(n, bool))
+
+
+def contrast_of(here: Array, there: Array) -> float:
+    """Contrast of an image over that of another, by strengths (N,) around the same points."""
+    if not len(here):
+        return 1.0
+    return min(max(median(here / there), 1 / _MOST_CONTRAST), _MOST_CONTRAST)
 
 
 def comparable(warp: Array) -> NDArray[np.bool_]:

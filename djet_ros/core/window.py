@@ -20,9 +20,9 @@ from djet_ros.core.bundle import (
     eliminate,
     in_frame,
     Landmarks,
-    linearise,
-    Linearised,
     noise_scale,
+    observe,
+    Observed,
     PosePrior,
     Poses,
     projected,
@@ -46,6 +46,7 @@ from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
     comparable,
+    contrast_of,
     DescriptorDistances,
     no_paraboloids,
     with_minimum,
@@ -318,9 +319,10 @@ class Window:
                              kind='stable')
         x, rho = x[nearest], rho[nearest]
         chosen = _spread(x, present, side, tuning.landmarks - len(here))
+        x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
-            x[chosen], rho[chosen] / length, anchor, len(self._images),
-            slopes(*surfaces, x[chosen])))
+            x, rho / length, anchor, len(self._images), slopes(*surfaces, x),
+            self._distances.strengths(self._images[anchor], np.rint(x).astype(np.int64))))
 
     def _measure(self) -> None:
         """Sample the surfaces of landmarks in the newest frame, where they are expected."""
@@ -365,12 +367,12 @@ class Window:
             return mine, no_paraboloids(0)
         anchors, here = self._landmarks.anchors[mine], self._images[-1]
         found, references = self._landmarks.found[mine], []
+        # Of where they are sampled: that of where they were expected would bend the scale.
+        strengths = self._distances.strengths(here, np.rint(places).astype(np.int64))
+        were = self._landmarks.strengths[mine]
         for anchor in np.unique(anchors):
-            some, there = anchors == anchor, self._images[anchor]
-            # Of where they are sampled: that of where they were expected would bend the scale.
-            contrast = self._distances.contrast(
-                there, np.rint(found[some]).astype(np.int64),
-                here, np.rint(places[some]).astype(np.int64))
+            some = anchors == anchor
+            contrast = contrast_of(strengths[some], were[some])
             references.append(self._distances.shifted(
                 self._floating[anchor], found[some], places[some], warps[some], contrast))
         fits, _ = with_minimum(self._distances.around(
@@ -392,28 +394,28 @@ class Window:
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
         self._equalise()
-        linear = self._linearised()
+        observed = self._observed()
         for _ in range(self._tuning.steps):
-            reduced = self._reduced(linear)
+            reduced = self._reduced(observed)
             H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            linear = self._moved(step, reduced.change(step))
-        false = np.linalg.norm(linear.residuals, axis=1) > self._tuning.outlier * self._scale
-        self._landmarks.seen[linear.landmark[false], linear.frame[false]] = False
+            observed = self._moved(step, reduced.change(step))
+        false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
+        self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
         return H
 
-    def _moved(self, step: Array, change: Array) -> Linearised:
+    def _moved(self, step: Array, change: Array) -> Observed:
         """Go a step of the poses and its change of the landmarks, or as little as does no harm."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
         for _ in range(self._tuning.halvings + 1):
             self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
-            linear = self._linearised()
+            observed = self._observed()
             if self._scale < self._tuning.astray * scale:
                 break
             step, change = step / 2, change / 2
-        return linear
+        return observed
 
     def _equalise(self) -> None:
         """Scale the roots in the newest frame so that a typical one is of a pixel."""
@@ -426,19 +428,19 @@ class Window:
             anew = seen & ~self._landmarks.held.any((1, 2))
             self._landmarks.held[anew] = self._landmarks.roots[anew, -1]
 
-    def _linearised(self) -> Linearised:
+    def _observed(self) -> Observed:
         """All observations; their scale is told anew."""
-        linear = linearise(self._K, self._poses, self._landmarks)
-        if len(linear.residuals):
-            self._scale = max(noise_scale(linear), self._tuning.least_scale)
-        return linear
+        observed = observe(self._K, self._poses, self._landmarks)
+        if len(observed.residuals):
+            self._scale = max(noise_scale(observed), self._tuning.least_scale)
+        return observed
 
-    def _reduced(self, linear: Linearised) -> Reduced:
+    def _reduced(self, observed: Observed) -> Reduced:
         """Weigh observations robustly, and eliminate the depths."""
         _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
-            (linear.residuals**2).sum(1))
+            (observed.residuals**2).sum(1))
         weight = self._scale**-2
-        return eliminate(linear, weights * weight, weight, len(self._images))
+        return eliminate(observed, weights * weight, weight, len(self._images))
 
     def _addition(self, H: Array) -> Addition:
         """Read the newest motion off the window, and how sure its length is."""
@@ -457,7 +459,7 @@ class Window:
         """Take what the landmarks of a frame tell into the prior, before it goes."""
         everything = self._landmarks
         self._landmarks = everything.of(everything.anchors == frame)
-        reduced = self._reduced(linearise(self._K, self._poses, self._landmarks))
+        reduced = self._reduced(observe(self._K, self._poses, self._landmarks))
         self._prior.add(reduced.H, reduced.g, self._poses)
         self._landmarks = everything
 
