@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from typing import Any
 
+from djet_ros.core.geometry import inverses
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -148,10 +149,7 @@ def inverse_2x2(A: Array) -> Array:
     a, b, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 1]
     # a trace of curvature where there is none, so that a flat surface weighs nothing
     trace = np.where(np.abs(a * d - b * b) < 1e-12, np.copysign(1e-6, a + d), 0.0)
-    a, d = a + trace, d + trace
-    determinant = a * d - b * b
-    return np.asarray(np.stack([d, -b, -b, a], axis=1).reshape(-1, 2, 2)
-                      / determinant[:, None, None])
+    return inverses(A + trace[:, None, None] * np.eye(2))
 
 
 def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
