@@ -13,12 +13,18 @@ from numpy.typing import NDArray
 # sizes, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
 CELL = 32
 
-# Into so many cells the matches are cut once more. What errs together over longer distances, such
-# as a patch's perspective or a haze, is seen by these, each of which errs by itself.
+# Into so many cells the matches are cut too. What errs together over longer distances, such as a
+# patch's perspective or a haze, is seen by these, each of which errs by itself.
 _LARGE_CELLS = 20
 
+# Sides of large cells over that; several, for a few cells tell how much they vary to a third only.
+_SIDES = (2 / 3, 3 / 2)
+
+# chosen: so many neighbouring small cells err together.
+_ALIKE = 3
+
 # Pixels; chosen: what an image's sampling, its lens and its rolling rows are good for.
-_SHIFT = 0.015
+_SHIFT = 0.0125
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -49,13 +55,14 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     they lie in too few cells.
 
     The noise is that of the residuals themselves, in whichever of the two images it arose: see
-    `_jackknife`. Many small cells tell the shape of the covariance. A few large ones, which hold
-    what errs together from one small cell to the next, tell its size: with C of the small and C'
-    of the large, q = tr(C^-1 C') / 5 is how much larger the variances are on average over the
-    five directions, and 1 where the small cells err each by itself. The image is about as many
-    large cells wide as these are small ones, and what errs together all over it shows in none;
-    its variance is taken to grow by q once more. What no residual shows comes to that: all that
-    is seen in a large cell may be shifted a little.
+    `_jackknife`. Many small cells tell the shape of the covariance. Larger ones, which hold what
+    errs together from one small cell to the next, tell its size: with C of the small and C' of
+    larger ones, tr(C^-1 C') / 5 is how much larger the variances are on average over the five
+    directions, and 1 where the small cells err each by itself; q is its mean over the
+    sizes of the larger. The image is about as many large cells wide as these are small ones, and
+    what errs together all over it shows in none; its variance is taken to grow by q once more.
+    The pose takes five freedoms of n independent errors, so that its variance grows by 1 + 5 / n.
+    What no residual shows comes to that: all that is seen in a large cell may be shifted a little.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -65,18 +72,28 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return UNKNOWN
-    parts = J[:, None] * (J * weights), J * (weights * residuals.r)
-    large = np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS)
-    small_cells, large_cells = (_jackknife(H, *summed_by_cell(places, *parts, side=side))
-                                for side in (CELL, max(large, CELL)))
+    *sums, middles, count = summed_by_cell(
+        places, J[:, None] * (J * weights), J * (weights * residuals.r), J * weights,
+        ((places // CELL + 0.5) * CELL).T, np.ones(len(places)))
+    # Larger cells are made of whole small ones.
+    middles /= count[:, None]
+    H_cells, gradients, pulls = (np.moveaxis(each, 0, -1) for each in sums)
+    large = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
+    small_cells = _jackknife(H, *sums[:2])
+    large_cells, *others = (
+        _jackknife(H, *summed_by_cell(middles, H_cells, gradients, side=side))
+        for side in (large, 2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
     if small_cells is None or large_cells is None:
         return UNKNOWN
     # Exact matches leave no noise at all.
     noise = small_cells + _LEAST_VARIANCE * np.eye(5)
-    correlated = max(1.0, np.trace(np.linalg.solve(noise, large_cells)) / 5)
-    pull, = summed_by_cell(places, J * weights, side=max(large, CELL))
+    ratios = [np.trace(np.linalg.solve(noise, cells)) / 5
+              for cells in (large_cells, *others) if cells is not None]
+    correlated = max(1.0, float(np.mean(ratios)))
+    freedoms = 1 + 5 * _ALIKE / len(count)
+    pull, = summed_by_cell(middles, pulls, side=large)
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
-    covariance = (correlated / flattening)**2 * small_cells + shifts @ shifts.T
+    covariance = freedoms * (correlated / flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
