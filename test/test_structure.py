@@ -7,7 +7,7 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.types import Pose, TRACKED
+from djet_ros.core.types import Pose, Status, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
@@ -62,6 +62,19 @@ def test_the_first_step_is_the_unit_of_all_that_follow(cards):
     assert lengths(results)[0] == pytest.approx(1)
     assert lengths(results) * WAYS[0] == pytest.approx(np.array(WAYS), rel=0.03)
     assert all(result.scale_kind is Scale.RELATIVE for result in results)
+
+
+def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
+    drive = Drive(cards)
+    before = drive.go(steps(WAYS[:4]))
+    # Half of the landmarks are out of sight, for long enough that a window of keyframes would have
+    # gone by, were each frame one.
+    still = drive.go([pose(yaw=turn) for turn in (
+        *[0.06] * 6, *[0.015 * (-1)**i for i in range(2 * TUNING.keyframes)], *[-0.06] * 5)])
+    assert all(result.status is Status.NO_PARALLAX for result in still)
+    assert not any(result.stationary or result.keyframe for result in still)
+    after = drive.go(steps(WAYS[4:8]))
+    assert lengths(before + after) * WAYS[0] == pytest.approx(np.array(WAYS[:8]), rel=0.03)
 
 
 def test_structure_takes_over_from_another_scale_on_the_way(cards):

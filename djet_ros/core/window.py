@@ -186,7 +186,8 @@ class Window:
             self.settled = self._places(self._landmarks.anchors == 0)
             self._take_along(0)
             self._forget(0)
-        self._choose_keyframe()
+        if relative.t.any():
+            self._choose_keyframe()
         return addition
 
     def landmarks(self) -> Array:
@@ -252,7 +253,12 @@ class Window:
         return int(agree.sum(1).max()), len(known)
 
     def _choose_keyframe(self) -> None:
-        """Make the newest frame a keyframe where landmarks moved since the last, or are gone."""
+        """
+        Make the newest frame a keyframe where landmarks moved since the last, or are gone.
+
+        To be asked where the camera moved: while it does not, no landmarks can be found anew, and
+        keyframes that go by would take those away that there are.
+        """
         if self._is_keyframe[-1]:
             return
         newest = len(self._images) - 1
