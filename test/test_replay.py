@@ -221,6 +221,8 @@ def test_positions_are_held_against_the_true_ones_in_the_best_unit(replayed, fol
         position_rmse(aligned(estimate[:, :3, 3], truth, metric), truth), rel=1e-3)
     assert said['positions']['way_m'] == pytest.approx(
         np.linalg.norm(np.diff(truth, axis=0), axis=1).sum())
+    assert said['positions']['scale_change'] == pytest.approx(
+        scale_change(estimate[:, :3, 3], truth), rel=1e-6)
     assert said['positions']['rmse_m'] < 0.02 * said['positions']['way_m']
 
 
@@ -232,10 +234,12 @@ def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
     truth[:, :3, 3] *= 100
     np.savetxt(tmp_path / 'far.txt', truth[:, :3].reshape(-1, 12))
     told = {}
+    places = {}
     for scale in ('none', 'ground_truth'):
         done = djet('replay', folder, '--poses', tmp_path / 'far.txt', '--scale', scale,
                     '--output', tmp_path / scale)
-        told[scale] = summary(tmp_path / scale)['drift']
+        told[scale], places[scale] = (summary(tmp_path / scale)[what]
+                                      for what in ('drift', 'positions'))
         _, estimate = read_tum(tmp_path / scale / 'trajectory_tum.txt')
         expected = drift(truth, estimate)
         assert told[scale]['rotation_deg_per_100m'] == pytest.approx(
@@ -248,8 +252,8 @@ def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
     assert told['ground_truth']['translation_percent'] == pytest.approx(
         expected.translation_percent, rel=1e-3)
     assert 0 < expected.translation_percent < 10
-    assert told['none']['scale_change'] is None
-    assert told['ground_truth']['scale_change'] == pytest.approx(1, abs=1e-6)
+    assert places['none'] is None
+    assert places['ground_truth']['scale_change'] == pytest.approx(1, abs=1e-6)
 
 
 def test_the_scale_at_the_end_is_told_over_that_at_the_start():

@@ -119,12 +119,12 @@ def _table(summary: dict[str, Any]) -> Table:
     if positions := summary.get('positions'):
         table.add_row('positions, rmse after alignment',
                       f"{positions['rmse_m']:.3f} m on {positions['way_m']:.1f} m")
+        if positions['scale_change'] is not None:
+            table.add_row('  scale, end over start', f"{positions['scale_change']:.3f}")
     if drift := summary.get('drift'):
         table.add_row('drift over 100 m and more', f"{drift['segments']} segments, "
                       f"to {drift['longest']} m")
         table.add_row('  rotation (r_rel)', f"{drift['rotation_deg_per_100m']:.3f} deg per 100 m")
         if drift['translation_percent'] is not None:
             table.add_row('  translation (t_rel)', f"{drift['translation_percent']:.2f} %")
-        if drift['scale_change'] is not None:
-            table.add_row('  scale, end over start', f"{drift['scale_change']:.3f}")
     return table

@@ -286,24 +286,26 @@ class _Log:
         if found is None:
             return None
         if self.scale is Scale.UNKNOWN:
-            return {**asdict(found), 'translation_percent': None, 'scale_change': None}
-        change = scale_change(poses[:, :3, 3], truth[known][:, :3, 3])
-        return {**asdict(found), 'scale_change': change if np.isfinite(change) else None}
+            return {**asdict(found), 'translation_percent': None}
+        return asdict(found)
 
-    def positions(self, truth: Array) -> dict[str, float] | None:
+    def positions(self, truth: Array) -> dict[str, float | None] | None:
         """
-        Root mean square error of positions, in metres, and the length of the true way.
+        Root mean square error of positions, in metres, the length of the true way, and the scale.
 
-        After the path was moved onto the true one (N, 4, 4), its scale free too unless it is in
-        metres; None where lengths mean nothing.
+        That is how large it is at the end over what it is at the start, None where it is not told.
+        Errors are taken after the path was moved onto the true one (N, 4, 4), its scale free too
+        unless it is in metres; None where lengths mean nothing.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
         if self.scale is Scale.UNKNOWN or known.sum() < _LEAST_PLACES:
             return None
         way = truth[known, :3, 3]
         places = np.array([step.pose[:3, 3] for step in self.steps])[known]
+        change = scale_change(places, way)
         return {'rmse_m': position_rmse(aligned(places, way, self.scale is Scale.METRIC), way),
-                'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())}
+                'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
+                'scale_change': change if np.isfinite(change) else None}
 
     def with_lengths_of(self, truth: Array) -> Array:
         """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
