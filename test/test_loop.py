@@ -46,8 +46,10 @@ def test_closing_the_loop_leaves_less_than_a_third_of_the_trajectory_error(block
     assert after['ape_m'] < before['ape_m'] / 3
     if 'evo_ape_m' in before:
         assert after['evo_ape_m'] < before['evo_ape_m'] / 3
-        # Loops mend the way as a whole; from frame to frame it stays what it was.
-        assert after['evo_rpe_m'] == pytest.approx(before['evo_rpe_m'], rel=0.2)
+        # Loops mend the way as a whole. From frame to frame, lengths that were exact give way by
+        # no more than they were said to be unsure.
+        step = said['way'] / (said['frames'] - 1)
+        assert after['evo_rpe_m'] < np.hypot(before['evo_rpe_m'], 0.01 * step)
 
 
 def test_live_it_shrinks_by_a_factor_too(block):
