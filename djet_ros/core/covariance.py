@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from djet_ros.core.cells import beginnings
 from djet_ros.core.geometry import rotation_log, sphere_tangents
 from djet_ros.core.jet import Loss, Residuals
@@ -58,9 +60,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     `_jackknife`. Many small cells tell the shape of the covariance. Larger ones, which hold what
     errs together from one small cell to the next, tell its size: with C of the small and C' of
     larger ones, tr(C^-1 C') / 5 is how much larger the variances are on average over the five
-    directions, and 1 where the small cells err each by itself; q is its mean over the
-    sizes of the larger. The image is about as many large cells wide as these are small ones, and
-    what errs together all over it shows in none; its variance is taken to grow by q once more.
+    directions, and 1 where the small cells err each by itself; q is its mean over the sizes of the
+    larger. The image is about as many large cells wide as these are small ones, and what errs
+    together all over it shows in none; its variance is taken to grow by q once more.
     The pose takes five freedoms of n independent errors, so that its variance grows by 1 + 5 / n.
     What no residual shows comes to that: all that is seen in a large cell may be shifted a little.
     """
@@ -72,26 +74,14 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return UNKNOWN
-    *sums, middles, count = summed_by_cell(
-        places, J[:, None] * (J * weights), J * (weights * residuals.r), J * weights,
-        ((places // CELL + 0.5) * CELL).T, np.ones(len(places)))
-    # Larger cells are made of whole small ones.
-    middles /= count[:, None]
-    H_cells, gradients, pulls = (np.moveaxis(each, 0, -1) for each in sums)
+    cells = _Cells.of(places, J, weights, residuals.r)
+    small_cells = _jackknife(H, cells.H, cells.gradients)
     large = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
-    small_cells = _jackknife(H, *sums[:2])
-    large_cells, *others = (
-        _jackknife(H, *summed_by_cell(middles, H_cells, gradients, side=side))
-        for side in (large, 2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
-    if small_cells is None or large_cells is None:
+    correlated = None if small_cells is None else _correlated(H, cells, small_cells, large)
+    if small_cells is None or correlated is None:
         return UNKNOWN
-    # Exact matches leave no noise at all.
-    noise = small_cells + _LEAST_VARIANCE * np.eye(5)
-    ratios = [np.trace(np.linalg.solve(noise, cells)) / 5
-              for cells in (large_cells, *others) if cells is not None]
-    correlated = max(1.0, float(np.mean(ratios)))
-    freedoms = 1 + 5 * _ALIKE / len(count)
-    pull, = summed_by_cell(middles, pulls, side=large)
+    freedoms = 1 + 5 * _ALIKE / len(cells.places)
+    _, _, pull = cells.in_larger(large)
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
     covariance = freedoms * (correlated / flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
@@ -100,6 +90,48 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     covariance_6 = turned @ covariance @ turned.T
     basis = lift(sphere_tangents(t))
     return basis.T @ covariance_6 @ basis, covariance_6
+
+
+class _Cells(NamedTuple):
+    """
+    What the matches of C cells tell together.
+
+    places: (C, 2) middles of the cells; H: (C, 5, 5), gradients: (C, 5) of their loss; pulls:
+    (C, 5) how the gradient changes where all residuals of a cell grow alike.
+    """
+
+    places: Array
+    H: Array
+    gradients: Array
+    pulls: Array
+
+    @classmethod
+    def of(cls, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
+        """Sum matches at pixels (N, 2) by small cells, with their J (5, N), weights and r (N,)."""
+        weighed = J * weights
+        *sums, middles, count = summed_by_cell(
+            places, J[:, None] * weighed, J * (weights * r), weighed,
+            ((places // CELL + 0.5) * CELL).T, np.ones(len(places)))
+        return cls(middles / count[:, None], *sums)
+
+    def in_larger(self, side: float) -> list[Array]:
+        """Sum H, gradients and pulls by larger cells, each made of whole small ones."""
+        return summed_by_cell(self.places, *(np.moveaxis(each, 0, -1) for each in self[1:]),
+                              side=side)
+
+
+def _correlated(H: Array, cells: _Cells, small_cells: Array, large: float) -> float | None:
+    """Give q of `pose_covariance`; None where large cells, of a side in pixels, are too few."""
+    large_cells, *others = (
+        _jackknife(H, *cells.in_larger(side)[:2])
+        for side in (large, 2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
+    if large_cells is None:
+        return None
+    # Exact matches leave no noise at all.
+    noise = small_cells + _LEAST_VARIANCE * np.eye(5)
+    ratios = [np.trace(np.linalg.solve(noise, larger)) / 5
+              for larger in (large_cells, *others) if larger is not None]
+    return max(1.0, float(np.mean(ratios)))
 
 
 def difference(R: Array, t: Array, other: Pose) -> Array:
