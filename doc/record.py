@@ -314,8 +314,8 @@ def at_pace(args: argparse.Namespace, command: str, graph: Graph) -> list[list[s
     """Play KITTI 06 at its own pace."""
     source = args.data / 'kitti' / 'sequences' / '06'
     sent = len([*source.glob('image_0/*')])
-    with started(command, 'latest', graph) as node, playing(node, source):
-        node.wait_for(sent)
+    with started(command, 'latest', graph) as node, playing(source):
+        node.wait_for(sent, 'processed', 'dropped')
         said, spent = node.said, node.cpu_ms_an_image()
         memory, took = node.memory_mb(), node.end()
     return [
@@ -333,9 +333,9 @@ def many_frames(place: Path, command: str, graph: Graph) -> list[list[str]]:
     """Play small images without end, hardly faster than they can be worked on."""
     source = render_sequence('road', place, 200, size=(320, 240))
     memory = []
-    with started(command, 'latest', graph) as node, playing(node, source, '--loop', '--rate', 4):
+    with started(command, 'latest', graph) as node, playing(source, '--loop', '--rate', 4):
         for mark in MARKS:
-            node.wait_for(mark)
+            node.wait_for(mark, 'processed')
             memory.append(f'{node.memory_mb():.1f} MB at {mark:,}')
         dropped = node.said['frames dropped']
     return [[f'{MARKS[-1]:,} images of 320×240 at 40 Hz, `queue_policy: latest`, with path and tf',
@@ -361,10 +361,10 @@ class Node:
         if processed:
             self._spent.append((processed, self._cpu_ms()))
 
-    def wait_for(self, processed: int) -> None:
-        """Wait until so many images are done; no diagnostics for a while is an error."""
+    def wait_for(self, images: int, *fates: str) -> None:
+        """Wait until so many met one of the fates; no diagnostics for a while is an error."""
         alive = monotonic()
-        while int(self.said.get('frames processed', 0)) < processed:
+        while sum(int(self.said.get(f'frames {fate}', 0)) for fate in fates) < images:
             before = len(self._spent)
             self._graph.spin(0.2)
             alive = monotonic() if len(self._spent) > before else alive
@@ -419,7 +419,7 @@ def started(command: str, policy: str, graph: Graph) -> Iterator[Node]:
 
 
 @contextmanager
-def playing(node: Node, source: Path, *words: Any) -> Iterator[None]:
+def playing(source: Path, *words: Any) -> Iterator[None]:
     """Play a recording while it lasts."""
     process = subprocess.Popen([*DJET, 'play', str(source), *map(str, words)], env=GRAPH,
                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -77,11 +77,12 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     cells = _Cells.of(places, J, weights, residuals.r)
     small_cells = _jackknife(H, cells.H, cells.gradients)
     large = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
-    correlated = None if small_cells is None else _correlated(H, cells, small_cells, large)
-    if small_cells is None or correlated is None:
+    *sums, pull = cells.in_larger(large)
+    large_cells = _jackknife(H, *sums)
+    if small_cells is None or large_cells is None:
         return UNKNOWN
+    correlated = _correlated(H, cells, small_cells, large_cells, large)
     freedoms = 1 + 5 * _ALIKE / len(cells.places)
-    _, _, pull = cells.in_larger(large)
     shifts = _SHIFT * np.linalg.solve(H, pull.T)
     covariance = freedoms * (correlated / flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
@@ -120,13 +121,11 @@ class _Cells(NamedTuple):
                               side=side)
 
 
-def _correlated(H: Array, cells: _Cells, small_cells: Array, large: float) -> float | None:
-    """Give q of `pose_covariance`; None where large cells, of a side in pixels, are too few."""
-    large_cells, *others = (
-        _jackknife(H, *cells.in_larger(side)[:2])
-        for side in (large, 2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
-    if large_cells is None:
-        return None
+def _correlated(H: Array, cells: _Cells, small_cells: Array, large_cells: Array,
+                large: float) -> float:
+    """Give q of `pose_covariance`, by large cells of a side in pixels and by others still."""
+    others = (_jackknife(H, *cells.in_larger(side)[:2])
+              for side in (2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
     # Exact matches leave no noise at all.
     noise = small_cells + _LEAST_VARIANCE * np.eye(5)
     ratios = [np.trace(np.linalg.solve(noise, larger)) / 5

@@ -190,15 +190,15 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
     poses, begun = starts, None
     # Places that were followed tell the pose well enough to sample surfaces only once: around them
     # on its lines, as it stretches the patches.
-    first = (surface if ahead is None or config.max_iterations == 1
-             else ReprojectionSurface(surface.x, y))
+    by_places = ahead is not None and config.max_iterations > 1
     warp: Array | None = None
     rival_poses: tuple[Pose, ...] = ()
     rivals: tuple[Rival, ...] = ()
     plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
     for iteration in range(1, config.max_iterations + 1):
         # Step 1: update the local residuals around the keypoints and fit A', b, c.
-        fits = (first if iteration == 1 else surface).around(keypoints, warp)
+        fits = (ReprojectionSurface(surface.x, y) if by_places else surface).around(keypoints,
+                                                                                    warp)
         paraboloids, no_minimum = with_minimum(fits, config.indefinite)
         # Match culling: a keypoint without a surface is out, and keeps its last loss.
         alive = alive & paraboloids.usable
@@ -215,8 +215,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         begun = begun or _Begun(problem, places, voting, basin.rivals, basin.scale)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
-        steps = TUNING.steps_by_places if first is not surface and iteration == 1 else MAX_STEPS
-        solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps)
+        solution = minimise(problem, basin.pose.R, basin.pose.t, loss,
+                            TUNING.steps_by_places if by_places else MAX_STEPS)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
         if last and rival_poses:
@@ -236,7 +236,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         losses[alive] = paraboloids.values(optimum)[alive]
         if observe is not None:
             observe(Round(keypoints, fits, warp, pose, optimum))
-        poses = [pose]
+        poses, by_places = [pose], False
         if last:
             break
         keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)

@@ -39,6 +39,10 @@ FARTHEST = 1e9
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
+# What is said of a frame that may be a keyframe; nothing where none are chosen.
+KEYFRAME_WORDS = {True: 'true', False: 'false', None: ''}
+IS_KEYFRAME = {word: chosen for chosen, word in KEYFRAME_WORDS.items()}
+
 
 def ns_of_time(time: Any) -> int:
     """Nanoseconds of a Time; at most what a Time can hold again."""
@@ -117,11 +121,6 @@ def mounted_frame(config: OdometryConfig, image_frame: str) -> tuple[str, Array]
     if config.camera_frame and config.frame_convention == 'body':
         axes[:3, :3] = OPTICAL_TO_BODY
     return config.camera_frame or image_frame, axes
-
-
-# What is said of a frame that may be a keyframe; nothing where none are chosen.
-KEYFRAME_WORDS = {True: 'true', False: 'false', None: ''}
-IS_KEYFRAME = {word: chosen for chosen, word in KEYFRAME_WORDS.items()}
 
 
 class MessageFactory:

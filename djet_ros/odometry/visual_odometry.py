@@ -181,8 +181,8 @@ class VisualOdometry:
         path = self._path.moved_by_pair(
             self._pose, motion, motion_covariance(relative, length.own), length.common)
         result = self._result(frame, relative.status, relative, length, motion,
-                              motion_covariance(relative, length), path)
-        result = replace(result, keyframe=self._one_scale.keyframe)
+                              motion_covariance(relative, length), path,
+                              keyframe=self._one_scale.keyframe)
         self._pose, self._path = result.pose, path
         self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
@@ -286,10 +286,11 @@ class VisualOdometry:
         self._bad_pairs = 0
         self._standstill.stay(relative, self._config.standstill)
         covariance = standstill_covariance(relative, length)
+        # The reference frame may be a keyframe, and serves both.
+        keyframe = None if self._one_scale.keyframe is None else False
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
-                              self._path.moved(self._pose, np.eye(4), covariance), stationary=True)
-        if self._one_scale.keyframe is not None:  # the reference frame may be one, and serves both
-            result = replace(result, keyframe=False)
+                              self._path.moved(self._pose, np.eye(4), covariance),
+                              stationary=True, keyframe=keyframe)
         if self._gyro is not None:
             self._gyro.learn(self._since_ns, frame.stamp_ns, np.eye(3),
                              np.eye(3) * _STILL_TO_WITHIN**2)
@@ -332,11 +333,12 @@ class VisualOdometry:
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
                 motion: Array, covariance: Array, path: PathCovariance,
-                stationary: bool = False) -> OdometryResult:
+                stationary: bool = False, keyframe: bool | None = None) -> OdometryResult:
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             self._pose @ motion, covariance, path.pose, length.value, length.known, stationary,
-            self._since_ns, self._since_covariance, length.metric, length.measured, length.common)
+            self._since_ns, self._since_covariance, length.metric, length.measured, length.common,
+            keyframe)
 
 
 def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:

@@ -25,6 +25,9 @@ import numpy as np
 # Recorded nanoseconds for which an image waits for its mask, as in a replay.
 _PATIENCE_NS = 10**9
 
+# What is kept of them.
+_FEATURES = 'points', 'octaves', 'angles', 'responses', 'descriptors'
+
 
 class KeyframeImage(NamedTuple):
     """A keyframe's image and its features."""
@@ -45,7 +48,6 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
         """Make the file."""
         # What is no array is small, and stays in memory.
         self._kept: dict[int, _Kept] = {}
-        self._features = 'points', 'octaves', 'angles', 'responses', 'descriptors'
         try:
             self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by close)
         except OSError as error:
@@ -59,7 +61,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
             offset = self._file.seek(0, 2)
             left_out = np.empty((0, 0), bool) if frame.left_out is None else frame.left_out
             for array in (frame.gray, frame.K, left_out,
-                          *(getattr(image.features, name) for name in self._features)):
+                          *(getattr(image.features, name) for name in _FEATURES)):
                 np.save(self._file, array, allow_pickle=False)
         except OSError as error:
             raise DjetError('the images of keyframes could not be written to a temporary file: '
@@ -73,10 +75,10 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
         offset, frame = self._kept[number]
         self._file.seek(offset)
         gray, K, left_out, *features = (np.load(self._file, allow_pickle=False)
-                                        for _ in range(3 + len(self._features)))
+                                        for _ in range(3 + len(_FEATURES)))
         return KeyframeImage(replace(frame, gray=gray, K=K,
                                      left_out=left_out if left_out.size else None),
-                             Features.described(**dict(zip(self._features, features))))
+                             Features.described(**dict(zip(_FEATURES, features))))
 
     def __contains__(self, number: object) -> bool:
         """Tell whether there is such a keyframe, without reading it."""

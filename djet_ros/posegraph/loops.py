@@ -11,7 +11,7 @@ from djet_ros.config.sections import SlamConfig
 from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rays, unit
+from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.masks import blocked
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
@@ -209,7 +209,8 @@ def unit_change(step: RelativePose, step_length: float, loop: RelativePose, loop
       There are many, but of a loop with hardly any length they tell little.
     """
     near, far = _Depths.here(step, K), _Depths.here(other, K)
-    here, there = _Depths.here(loop, K), _Depths.there(loop, K)
+    here = _Depths.here(loop, K)
+    there = here.there(loop, K)
     ways = []
     at_near, at_far = _ratio(near, here), _ratio(far, there)
     if at_near is not None and at_far is not None:
@@ -243,18 +244,15 @@ class _Depths(NamedTuple):
     def here(cls, pair: RelativePose, K: Array) -> _Depths:
         """Of the inliers in the pair's first view."""
         x = pair.x[pair.inliers]
-        m, y = rays(K, x) @ pair.R.T, rays(K, pair.y_opt[pair.inliers])
-        # y x (m + rho t) = 0, by least squares: linear, so that noise about zero stays about zero
-        shift, lever = np.cross(y, m), np.cross(y, pair.t)
-        inverse = -(shift * lever).sum(1) / np.maximum((lever**2).sum(1), 1e-12)
-        return cls(x, inverse, np.linalg.norm(shift, axis=1) / (y**2).sum(1))
+        rays_x, rays_y = rays(K, x), rays(K, pair.y_opt[pair.inliers])
+        inverse, _ = inverse_depths(pair.R, pair.t, rays_x, rays_y)
+        parallax = np.linalg.norm(np.cross(rays_y, rays_x @ pair.R.T), axis=1)
+        return cls(x, inverse, parallax / (rays_y**2).sum(1))
 
-    @classmethod
-    def there(cls, pair: RelativePose, K: Array) -> _Depths:
-        """Of the inliers in the pair's second view."""
-        here = cls.here(pair, K)
-        return cls(pair.y[pair.inliers], _from(here.inverse, here.x, pair.R, pair.t, K),
-                   here.parallax)
+    def there(self, pair: RelativePose, K: Array) -> _Depths:
+        """Of the same points in the pair's second view."""
+        return _Depths(pair.y[pair.inliers], _from(self.inverse, self.x, pair.R, pair.t, K),
+                       self.parallax)
 
     def of(self, chosen: NDArray[np.bool_]) -> _Depths:
         """Give some of the points."""
