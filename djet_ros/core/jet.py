@@ -56,9 +56,9 @@ _LEAST_LEFT = 0.25
 # Squared Mahalanobis distance, over two degrees of freedom, that one of ten exceeds.
 _ONE_PLACE = 4.6
 
-# chosen: matches are taken to be this much less exact than they look, in squares, for neighbours
-# err alike where the image grows, which whoever found them may not have seen.
-_LESS_EXACT = 2.0
+# chosen: share of the noise of a place that was found which is like that of the surface there, as
+# both go by the same texture; the rest is alike everywhere.
+_BY_TEXTURE = 0.5
 
 # chosen: how much matches differ in noise, over what the places of each tell of it. What is wrong
 # with both shows in no difference.
@@ -181,9 +181,9 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> 
     Join what residual surfaces tell of places with where these were found, pixels y (N, 2).
 
     The sum of two residuals of the paper: that of the surface, and the re-projection error. Both
-    measure one place, with covariances S and T = sigma^2 I; how exact each is, it shows by its
-    distances from the epipolar lines of the solution, which is that of the surfaces alone. Of two
-    Gaussians that is the place
+    measure one place, with covariances S and T, the latter half way from a circle to the shape of
+    S; how exact each is, it shows by its distances from the epipolar lines of the solution, which
+    is that of the surfaces alone. Of two Gaussians that is the place
 
         y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
 
@@ -196,13 +196,13 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> 
     G = inverse_of(K)[:2, :2]
     pixel = G @ G.T
     width = np.trace(pixel) / 2
-    found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)), spread=np.repeat(
-        pixel[[0, 0, 1], [0, 1, 1]][:, None], len(y), axis=1))
+    circle = pixel[[0, 0, 1], [0, 1, 1]][:, None]
+    found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)),
+                    spread=circle + _BY_TEXTURE * (problem.spread - circle))
     off = epipolar_residuals(found, solution.R, solution.t).r
     # In square pixels.
-    S, T = (much / width * core_scale(r)**2 * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
-            for measured, r, much in ((problem, solution.residuals.r, 1.0),
-                                      (found, off, _LESS_EXACT)))
+    S, T = (core_scale(r)**2 / width * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
+            for measured, r in ((problem, solution.residuals.r), (found, off)))
     apart = (problem.rays_y - found.rays_y)[:2].T / np.sqrt(width)
     inverse = inverse_2x2(S + T)
     has_minimum = (S[:, 0, 0] > 0) & (S[:, 0, 0] * S[:, 1, 1] > S[:, 0, 1]**2)

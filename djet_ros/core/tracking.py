@@ -19,10 +19,13 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
     epipolar_lines,
+    facing,
     fundamental,
     growth,
+    inverse_depths,
     patch_warp,
     rays,
+    slant_warp,
     values_on,
 )
 from djet_ros.core.jet import (
@@ -39,6 +42,7 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
+from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -63,6 +67,8 @@ class TrackTuning:
     deep: float = 0.25
     # chosen: steps on all matches to a pose that surfaces are only placed by
     steps_by_places: int = 2
+    # pixels; chosen: what right matches are off, where planes are fitted to their depths
+    off: float = 0.1
     # robust standard deviations; the usual three, within which a match agrees with a pose
     inlier: float = 3.0
 
@@ -336,10 +342,21 @@ def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array
 
 
 def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Tell how patches at x are seen at y, as they are where that is not plausible."""
-    seen = growth(pose.R, pose.t, rays(K, x), rays(K, y))
+    """
+    Tell how patches at x are seen at y, as they are where that is not plausible.
+
+    They lean as depths around them say; where that makes them too unlike, they face the camera.
+    """
+    rays_x, rays_y = rays(K, x), rays(K, y)
+    seen = growth(pose.R, pose.t, rays_x, rays_y)
     # Of the same size without any parallax, or on the epipole; gone where it comes too near.
     seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
+    t = facing(pose.R, pose.t, rays_x, rays_y) * pose.t
+    rho, sigma = inverse_depths(pose.R, t, rays_x, rays_y)
+    there = plausible & (rho > 0)
+    slopes = slopes_of_all(x[there], rho[there], TUNING.off / K[0, 0] * sigma[there])
+    leaning = warp[there] + slant_warp(K, t, y[there], seen[there], rho[there, None] * slopes)
+    warp[there] = np.where(comparable(leaning)[:, None, None], leaning, warp[there])
     return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
