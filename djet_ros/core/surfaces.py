@@ -34,6 +34,7 @@ from djet_ros.core.paraboloid import (
     project_to_positive,
     times,
 )
+from djet_ros.core.patches import place_exactly
 from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -82,6 +83,14 @@ class ResidualSurface(Protocol):
         """
         ...
 
+    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+        """
+        Places (M, 2) of chosen matches (N,) as found by another means than the surface, next to y.
+
+        To be asked for matches that have a surface, see ``around``.
+        """
+        ...
+
 
 class DescriptorSurface:
     """
@@ -96,6 +105,7 @@ class DescriptorSurface:
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
         self.x, self._config = x, config
         self._distances = DescriptorDistances(config)
+        self._grays = previous.gray, current.gray
         self._previous, self._current = previous, current.tested
         self._has_reference = (self._distances.describable(x, previous.tested.shape)
                                & ~at(previous.mask, x))
@@ -119,6 +129,10 @@ class DescriptorSurface:
         return self._kept(anew, usable, y, self._distances.between_pixels(
             self._previous.floating, self.x[anew], self._current, y[anew], warp[anew],
             self._contrast_around(y, usable), CLOSE // 2))
+
+    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+        """Places (M, 2) by gray levels."""
+        return place_exactly(*self._grays, self.x[chosen], y[chosen], warp[chosen])
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit them with the references of whole pixels, as the paper does."""
@@ -239,6 +253,7 @@ class PhotometricSurface:
         steps = np.arange(-radius, radius + 1, dtype=np.float32)
         offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         self._radius, self._offsets = radius, offsets
+        self._grays = previous.gray, current.gray
         self._weights = _weight_window(offsets, config.window_sigma)
         self._image = current.smoothed.astype(np.float32)
         self._gradient = [
@@ -263,6 +278,10 @@ class PhotometricSurface:
         c = (difference**2 @ W).astype(float)
         usable = self._has_reference & self._inside(y, self._image.shape) & ~at(self._mask, y)
         return Paraboloids(np.array(y, float), A, b, c, usable)
+
+    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+        """Places (M, 2) by gray levels, in smaller patches that are not smoothed."""
+        return place_exactly(*self._grays, self.x[chosen], y[chosen], warp[chosen])
 
     def _sample(self, image: NDArray[np.float32], points: Array,
                 warp: Array | None = None) -> NDArray[np.float32]:
@@ -293,6 +312,10 @@ class ReprojectionSurface:
         n = len(y)
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
                            np.zeros(n), np.ones(n, bool))
+
+    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+        """There is no other means."""
+        return y[chosen]
 
 
 def contrast_of(here: Array, there: Array) -> float:

@@ -225,14 +225,15 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
                             TUNING.steps_by_places if by_places else MAX_STEPS)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
-        if last and rival_poses:
-            # Judge again between the basins, on the last surfaces.
-            solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
         if last:
             begun = begun._replace(scale=_scale(solution.residuals.r))
         if last and config.join_matches and config.method != 'rpe':
-            # Step 2 once more: where matches were found is a measurement of its own.
-            solution, loss = _joined(problem, K, y[voting], solution, loss, config)
+            # Step 2 once more: where matches are found is a measurement of its own.
+            found = y[voting] if warp is None else surface.placed(y, warp, voting)
+            problem, solution, loss = _joined(problem, K, found, solution, loss, config)
+        if last and rival_poses:
+            # Judge again between the basins, on all that is known.
+            solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
         pose = solution.pose
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
@@ -254,13 +255,13 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
 
 
 def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
-            config: EstimatorConfig) -> tuple[Solution, Loss]:
+            config: EstimatorConfig) -> tuple[JetProblem, Solution, Loss]:
     """Optimise the pose by surfaces and by where matches were found, y (N, 2), together."""
     problem = with_places(problem, solution, K, y)
     agreeing = np.abs(solution.residuals.r) < loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t).r
     loss = replace(loss, scale=config.loss_scale * _scale(residuals[agreeing]))
-    return minimise(problem, solution.R, solution.t, loss), loss
+    return problem, minimise(problem, solution.R, solution.t, loss), loss
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:

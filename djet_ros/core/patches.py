@@ -1,0 +1,120 @@
+"""
+Where patches are, as they are seen through their warps (Lucas and Kanade, with a known shape).
+
+The flow of the image takes it to shift as a whole within a window. Where it grows or leans too,
+the flow says where the slopes of the window went, and not its middle: a tenth of a pixel beside
+that ahead of a car. Once depths are known, so is the shape.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+from djet_ros.core.geometry import inverses
+from djet_ros.core.hamming import gather_patches, Image
+from djet_ros.core.paraboloid import times
+from djet_ros.core.parallel import each
+from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
+
+Patches = NDArray[Any]
+
+# Pixels from the middle of a patch to its side.
+_RADIUS = 5
+
+# Steps, and pixels that they come to at most: farther off is something else.
+_STEPS, _FARTHEST = 2, 1
+
+# Square gray levels; where a patch has no more slope than this, nothing tells where it is.
+_LEAST_SLOPE = 1e-3
+
+# Patches per pass: bounds the memory that they take (3 MB).
+_BLOCK = 1024
+
+
+def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Array:
+    """
+    Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2), (N, 2).
+
+    warp: (N, 2, 2) how they are seen there, the derivatives dy/dx, not singular. By Gauss-Newton
+    steps on the differences of gray levels, less their mean, under the slopes of the warped patch
+    ("inverse compositional", Baker and Matthews, IJCV 2004). What would go far stays at y.
+    """
+    places, floating = y.copy(), there.astype(np.float32)
+    inside = np.flatnonzero(_within(here, y, _RADIUS + 1 + _FARTHEST))
+
+    def refine(start: int) -> None:
+        block = inside[start:start + _BLOCK]
+        seen, began = _seen_through(warp[block], floating, x[block]), y[block]
+        exact = began
+        for _ in range(_STEPS):
+            step = seen.step(_between_pixels(here, exact, _RADIUS))
+            exact = np.clip(exact + step, began - _FARTHEST, began + _FARTHEST)
+        near = (np.abs(exact - began) < _FARTHEST).all(1)
+        places[block] = np.where(near[:, None], exact, began)
+
+    each(refine, range(0, len(inside), _BLOCK))
+    return places
+
+
+class _Seen(NamedTuple):
+    """
+    N patches of P pixels as they are expected, and what their slopes tell of where they are.
+
+    gray: (P, N) float32, less the means; slopes: along x and y, (P, N) each; inverse: (N, 2, 2) of
+    the sums of their products.
+    """
+
+    gray: Patches
+    slopes: tuple[Patches, Patches]
+    inverse: Array
+
+    def step(self, gray: Patches) -> Array:
+        """Tell how far (N, 2) they are from where the image has gray levels (S, S, N)."""
+        off = self.gray - _centred(gray.reshape(self.gray.shape))
+        return times(self.inverse, _summed(*(slope * off for slope in self.slopes)))
+
+
+def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
+    """Take the patches around points (N, 2) as they are seen through a warp (N, 2, 2)."""
+    side = 2 * _RADIUS + 3
+    off = np.arange(side, dtype=np.float32) - _RADIUS - 1
+    square = np.stack([np.tile(off, side), np.repeat(off, side)])
+    back = inverses(warp).astype(np.float32)
+    x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ square for axis in (0, 1))
+    # Points first: what is near one another in the image comes one after the other.
+    wide = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    wide = np.asarray(cv2.transpose(wide)).reshape(side, side, -1)
+    gx, gy = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
+    gray, gx, gy = (one.reshape(-1, len(points)) for one in (wide[1:-1, 1:-1], gx, gy))
+    xx, xy, yy = _summed(gx * gx, gx * gy, gy * gy).T
+    G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
+    return _Seen(_centred(gray), (gx, gy), inverses(G))
+
+
+def _between_pixels(image: Image, points: Array, radius: int) -> Patches:
+    """Interpolate patches (S, S, N) around points (N, 2), all of them within the image."""
+    whole = np.floor(points).astype(np.int64)
+    x, y = (points - whole).T.astype(np.float32)
+    # One row and column more than is wanted, on the far side.
+    patches = gather_patches(image, whole, radius + 1)[1:, 1:].astype(np.float32)
+    rows = patches[:-1] + y * (patches[1:] - patches[:-1])
+    return np.asarray(rows[:, :-1] + x * (rows[:, 1:] - rows[:, :-1]))
+
+
+def _within(image: Image, points: Array, margin: float) -> NDArray[np.bool_]:
+    """(N,) bool mask of the points at least so far from the border."""
+    upper = np.array(image.shape[::-1]) - 1 - margin
+    return np.asarray(((points >= margin) & (points <= upper)).all(1))
+
+
+def _summed(*values: Patches) -> Array:
+    """Sum up several (P, N) over the pixels, (N, V)."""
+    return np.stack([value.sum(0) for value in values], axis=1).astype(float)
+
+
+def _centred(gray: Patches) -> Patches:
+    """Take patches (P, N) less their means: haze and clouds brighten them as a whole."""
+    return np.asarray(gray - gray.mean(0))
