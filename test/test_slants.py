@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from djet_ros.core.geometry import patch_warp, rotation_exp, slant_warp
-from djet_ros.core.slants import slopes
+from djet_ros.core.slants import slopes, slopes_of_all
 import numpy as np
 import pytest
 
@@ -55,3 +55,20 @@ def test_points_without_neighbours_face_the_camera() -> None:
     assert not slopes(x, np.ones(20), np.full(20, 0.01), x).any()
     assert slopes(x[:3], np.ones(3), np.ones(3), x).shape == (20, 2)
     assert slopes(x, np.ones(20), np.ones(20), x[:0]).shape == (0, 2)
+
+
+def test_all_points_of_a_road_lean_with_it_and_what_stands_on_it_does_not() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.uniform((0, 230), (1200, 370), (900, 2))
+    rho = (x[:, 1] - 180) / (650 * 1.65)
+    sigma = 0.005 * rho
+    standing = np.arange(900) % 10 == 0
+    rho[standing] *= 1.3
+    found = slopes_of_all(x, rho, sigma)
+    inner = ~standing & (np.abs(x - [600, 300]) < [550, 50]).all(1)
+    assert np.mean(np.abs(found[inner, 1] * (x[inner, 1] - 180) - 1) < 0.1) > 0.9
+    assert not found[standing].any()
+
+
+def test_of_no_points_at_all_none_lean() -> None:
+    assert slopes_of_all(np.empty((0, 2)), np.empty(0), np.empty(0)).shape == (0, 2)

@@ -22,7 +22,7 @@ NEAR, FAR = 2, 3
 
 # Steps at each level at most, and pixels of a step that is the last. Surfaces refine it: more of
 # them add nothing.
-_STEPS, _LAST_STEP = 6, 0.03
+_STEPS, _LAST_STEP = 4, 0.1
 
 # The way back only has to tell whether it leads near the beginning, by as many pixels.
 _STEPS_BACK, _LAST_STEP_BACK, _THERE_AND_BACK = 3, 0.1, 1.0

@@ -39,8 +39,9 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2), (N, 2).
 
     warp: (N, 2, 2) how they are seen there, the derivatives dy/dx, not singular. By Gauss-Newton
-    steps on the differences of gray levels, less their mean, under the slopes of the warped patch
-    ("inverse compositional", Baker and Matthews, IJCV 2004). What would go far stays at y.
+    steps on the differences of gray levels under the slopes of the warped patch ("inverse
+    compositional", Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze
+    and clouds change them. What would go far stays at y.
     """
     places, floating = y.copy(), there.astype(np.float32)
     inside = np.flatnonzero(_within(here, y, _RADIUS + 1 + _FARTHEST))
@@ -52,7 +53,7 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
         for _ in range(_STEPS):
             step = seen.step(_between_pixels(here, exact, _RADIUS))
             exact = np.clip(exact + step, began - _FARTHEST, began + _FARTHEST)
-        near = (np.abs(exact - began) < _FARTHEST).all(1)
+        near = np.abs(exact - began).max(1) < _FARTHEST
         places[block] = np.where(near[:, None], exact, began)
 
     each(refine, range(0, len(inside), _BLOCK))
@@ -61,20 +62,19 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
 
 class _Seen(NamedTuple):
     """
-    N patches of P pixels as they are expected, and what their slopes tell of where they are.
+    N patches of P pixels as they are expected: what tells where they are.
 
-    gray: (P, N) float32, less the means; slopes: along x and y, (P, N) each; inverse: (N, 2, 2) of
-    the sums of their products.
+    slopes: along x and y, (P, N) float32 each, but for what a brighter or a more contrasty patch
+    would look like; inverse: (N, 2, 2) of the sums of their products.
     """
 
-    gray: Patches
     slopes: tuple[Patches, Patches]
     inverse: Array
 
     def step(self, gray: Patches) -> Array:
         """Tell how far (N, 2) they are from where the image has gray levels (S, S, N)."""
-        off = self.gray - _centred(gray.reshape(self.gray.shape))
-        return times(self.inverse, _summed(*(slope * off for slope in self.slopes)))
+        gray = gray.reshape(self.slopes[0].shape)
+        return -times(self.inverse, _summed(*(slope * gray for slope in self.slopes)))
 
 
 def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
@@ -85,13 +85,16 @@ def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
     back = inverses(warp).astype(np.float32)
     x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ square for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
-    wide = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-    wide = np.asarray(cv2.transpose(wide)).reshape(side, side, -1)
-    gx, gy = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
-    gray, gx, gy = (one.reshape(-1, len(points)) for one in (wide[1:-1, 1:-1], gx, gy))
+    by_point = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    wide = np.asarray(cv2.transpose(by_point)).reshape(side, side, -1)
+    gray = _without_mean(wide[1:-1, 1:-1])
+    contrast = (gray * gray).sum(0) + _LEAST_SLOPE
+    gx, gy = (slope - (slope * gray).sum(0) / contrast * gray for slope in (
+        _without_mean((wide[1:-1, 2:] - wide[1:-1, :-2]) / 2),
+        _without_mean((wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2)))
     xx, xy, yy = _summed(gx * gx, gx * gy, gy * gy).T
     G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
-    return _Seen(_centred(gray), (gx, gy), inverses(G))
+    return _Seen((gx, gy), inverses(G))
 
 
 def _between_pixels(image: Image, points: Array, radius: int) -> Patches:
@@ -115,6 +118,7 @@ def _summed(*values: Patches) -> Array:
     return np.stack([value.sum(0) for value in values], axis=1).astype(float)
 
 
-def _centred(gray: Patches) -> Patches:
-    """Take patches (P, N) less their means: haze and clouds brighten them as a whole."""
-    return np.asarray(gray - gray.mean(0))
+def _without_mean(patches: Patches) -> Patches:
+    """Take patches (S, S, N), as (P, N), less their means."""
+    patches = patches.reshape(-1, patches.shape[2])
+    return np.asarray(patches - patches.mean(0))

@@ -1,0 +1,93 @@
+"""Where patches are: exactly, however they are stretched, and whatever brightens them."""
+
+from __future__ import annotations
+
+import cv2
+from djet_ros.core.patches import place_exactly
+import numpy as np
+import pytest
+
+SIZE = 400, 300
+MIDDLE = np.array([200.0, 150.0])
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    """Gray levels of a smooth pattern at any places (..., 2): a sum of waves."""
+    rng = np.random.default_rng(0)
+    directions, phases = rng.normal(size=(40, 2)) * 0.35, rng.uniform(0, 7, 40)
+    return 128 + 14 * np.sin(points @ directions.T + phases).sum(-1)
+
+
+def image(warp: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Give what `texture` looks like where each place x is seen at W (x - middle) + shift."""
+    y = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1).astype(float)
+    x = (y - MIDDLE - shift) @ np.linalg.inv(warp).T + MIDDLE
+    return np.clip(np.rint(texture(x)), 0, 255).astype(np.uint8)
+
+
+def seen(warp: np.ndarray, shift: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return (x - MIDDLE) @ warp.T + MIDDLE + shift
+
+
+@pytest.fixture
+def points() -> np.ndarray:
+    return np.random.default_rng(1).uniform((80, 80), (320, 220), (300, 2))
+
+
+WARPS = {'none': np.eye(2), 'larger': 1.08 * np.eye(2),
+         'a road': np.array([[1.05, 0.1], [0, 1.15]]),
+         'a roll': np.array([[0.99, -0.12], [0.12, 0.99]])}
+
+
+@pytest.mark.parametrize('name', WARPS)
+def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
+        points: np.ndarray, name: str) -> None:
+    warp, shift = WARPS[name], np.array([3.3, -1.7])
+    there, here = image(np.eye(2), np.zeros(2)), image(warp, shift)
+    true = seen(warp, shift, points)
+    near = true + np.random.default_rng(2).uniform(-0.3, 0.3, true.shape)
+    found = place_exactly(there, here, points, near, np.repeat(warp[None], len(points), axis=0))
+    off = np.linalg.norm(found - true, axis=1)
+    assert np.median(off) < 0.02
+    assert np.quantile(off, 0.95) < 0.06
+
+
+def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None:
+    """What the warp is good for: the same patches, taken to shift as a whole."""
+    warp = WARPS['a road']
+    there, here = image(np.eye(2), np.zeros(2)), image(warp, np.zeros(2))
+    true = seen(warp, np.zeros(2), points)
+    as_a_whole = place_exactly(there, here, points, true, np.tile(np.eye(2), (len(points), 1, 1)))
+    assert np.median(np.linalg.norm(as_a_whole - true, axis=1)) > 0.1
+
+
+def test_haze_moves_nothing(points: np.ndarray) -> None:
+    there = image(np.eye(2), np.zeros(2))
+    hazy = (there * 0.8 + 40).astype(np.uint8)
+    found = place_exactly(there, hazy, points, points, np.tile(np.eye(2), (len(points), 1, 1)))
+    assert np.median(np.linalg.norm(found - points, axis=1)) < 0.02
+
+
+def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None:
+    there, here = image(np.eye(2), np.zeros(2)), image(np.eye(2), np.array([4.0, 0.0]))
+    eye = np.tile(np.eye(2), (len(points), 1, 1))
+    found = place_exactly(there, here, points, points, eye)
+    assert (np.abs(found - points).max(1) < 1).all()
+    border = points * 0 + [3.0, 150.0]
+    assert (place_exactly(there, here, border, border, eye) == border).all()
+    flat = np.full_like(there, 90)
+    assert (place_exactly(flat, flat, points, points, eye) == points).all()
+
+
+def test_threads_change_nothing(points: np.ndarray) -> None:
+    there, here = image(np.eye(2), np.zeros(2)), image(WARPS['larger'], np.zeros(2))
+    many = np.tile(points, (8, 1))
+    warp = np.repeat(WARPS['larger'][None], len(many), axis=0)
+    true = seen(WARPS['larger'], np.zeros(2), many)
+    before = cv2.getNumThreads()
+    results = []
+    for threads in (1, 2):
+        cv2.setNumThreads(threads)
+        results.append(place_exactly(there, here, many, true, warp))
+    cv2.setNumThreads(before)
+    assert (results[0] == results[1]).all()
