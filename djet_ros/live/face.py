@@ -18,7 +18,7 @@ from djet_ros.odometry.tracker import Outgoing
 _TICK = 1.0
 
 # Seconds to wait for messages at most: with room for images, and until there is.
-_PAUSE, _MOMENT = 0.25, 0.005
+_PAUSE, _MOMENT = 0.1, 0.005
 
 _IMAGE = IMAGE_TYPES['raw']
 
