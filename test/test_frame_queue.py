@@ -27,6 +27,15 @@ def test_latest_keeps_the_newest_in_order_and_counts_the_rest():
     assert drained(queue) == [3, 4]
 
 
+def test_what_comes_next_can_be_looked_at_and_stays():
+    queue = FrameQueue('latest', 2)
+    assert queue.peek() is None
+    queue.put('first')
+    queue.put('second')
+    assert queue.peek() == queue.peek() == 'first'
+    assert [queue.get(), queue.get()] == ['first', 'second']
+
+
 def test_every_loses_nothing_however_slow_the_reader_is():
     queue, got = FrameQueue('every', 3), []
 

@@ -22,7 +22,7 @@ from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.posegraph.keyframe_images import frame_finder
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import write_kitti_bag
-from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.bags import Bag, BagMessage
 from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
@@ -31,6 +31,7 @@ from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
+from djet_ros.replay.replay import with_next_image
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE
@@ -335,6 +336,45 @@ def test_a_folder_and_its_bag_give_the_same_bytes_each_time(folder, replayed, tm
     djet('replay', folder, '--output', tmp_path / 'a')
     for name in ('trajectory_tum.txt', 'trajectory_kitti.txt', 'errors.csv'):
         assert (tmp_path / 'a' / name).read_bytes() == (replayed[0] / name).read_bytes(), name
+
+
+class Stream:
+    """A recording of so many messages of a name's first letter: images, and others; a break."""
+
+    image_topic = 'i'
+
+    def __init__(self, names, broken=False):
+        self.names, self.broken, self.read = names, broken, 0
+
+    def messages(self):
+        for name in self.names:
+            self.read += 1
+            yield BagMessage(name[0], self.read, name)
+        if self.broken:
+            raise DjetError('the file ends here')
+
+
+@pytest.mark.parametrize('broken', [False, True])
+@pytest.mark.parametrize('names', ['', 'i1', 'a1', 'i1 i2', 'a1 i1 a2 a3 i2 i3 a4'])
+def test_messages_come_in_order_with_the_next_image_before_it_comes(names, broken):
+    names, seen = names.split(), []
+    try:
+        for message, following in with_next_image(Stream(names, broken)):
+            seen.append(message.message)
+            rest = [name for name in names[len(seen):] if name[0] == 'i']
+            later = rest if message.topic == 'i' else rest[1:]
+            assert (following and following.message) == (later[0] if later else None)
+    except DjetError:
+        assert broken
+    else:
+        assert not broken
+    assert seen == names
+
+
+def test_little_is_read_ahead_where_no_image_comes_any_more():
+    stream = Stream(['i1', *['a'] * 10_000])
+    assert next(with_next_image(stream))[0].message == 'i1'
+    assert stream.read < 2_000
 
 
 def test_flags_and_file_make_the_configuration_that_is_written(bag, tmp_path):

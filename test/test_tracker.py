@@ -1,6 +1,8 @@
 """The tracker: messages in, messages out, and every image accounted for."""
 
+import gc
 import re
+import weakref
 
 from cards import Cards, K, pose, SIZE
 import cv2
@@ -97,6 +99,81 @@ def test_the_same_messages_give_the_same_bytes_also_after_a_reset(drive):
     assert one.counts == Counts()
     assert one.last is None
     assert first == poses(one)
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request):
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(request.param)
+    yield request.param
+    cv2.setNumThreads(before)
+
+
+def meddle(one, number):
+    """Do to a tracker, before an image, what may make what was begun of it useless."""
+    if number == 2:
+        one.camera_info(camera_info(K * [[1.01], [1.01], [1]], SIZE))
+    elif number == 4:
+        one.configure(with_values(one.config, {'estimator.max_features': 400}))
+    elif number in (6, 7):
+        (one.pause if number == 6 else one.resume)()
+    elif number == 8:
+        one.reset()
+
+
+def test_images_that_are_expected_come_out_as_if_they_were_not(drive, threads):
+    def results(ahead):
+        """Give all that comes of images, of which so many are told before."""
+        one = tracker()
+        messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive)]
+        messages[9].height += 1  # than there are rows
+        out = []
+        for i, message in enumerate(messages):
+            for following in messages[i + 1:i + 1 + ahead]:
+                one.expect(following)
+            meddle(one, i)
+            out.append([serialised(what) for topic, what in one.image(message)
+                        if topic != '/diagnostics'])
+        return out, one.counts
+
+    alone = results(0)
+    assert alone[1].rejected == {'short_data': 1}
+    assert results(1) == results(2) == results(3) == alone
+
+
+def test_a_mask_holds_for_an_image_that_was_expected_before_it_came(drive, threads):
+    hidden = np.full(SIZE[::-1], 255, np.uint8)
+    hidden[:, :SIZE[0] // 2] = 0
+
+    def seen(ahead):
+        one = tracker(**{'odometry.mask': True})
+        messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive[:3])]
+        for i, message in enumerate(messages):
+            if ahead and i + 1 < len(messages):
+                one.expect(messages[i + 1])
+            one.mask(image(hidden, stamp_ns=ns(0.1 * i)))
+            one.image(message)
+        return one.last.relative
+
+    alone, expected = seen(False), seen(True)
+    assert alone.x[:, 0].min() > SIZE[0] // 2
+    np.testing.assert_array_equal(expected.x, alone.x)
+    np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
+
+
+@pytest.mark.parametrize('threads', [1], indirect=True)
+def test_images_that_are_expected_and_never_come_are_forgotten(drive, threads):
+    one = tracker()
+    expected = [image(gray, stamp_ns=ns(10 + i)) for i, gray in enumerate(drive)]
+    gone = [weakref.ref(message) for message in expected]
+    for message in expected:
+        one.expect(message)
+    del message, expected
+    gc.collect()
+    assert sum(ref() is not None for ref in gone) <= 2
+    one.reset()
+    gc.collect()
+    assert not any(ref() for ref in gone)
 
 
 def test_compressed_images_are_tracked_like_raw_ones(drive):

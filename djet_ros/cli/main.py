@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from djet_ros import __version__
 from djet_ros.errors import DjetError
-from djet_ros.threads import keep_freed_memory, one_blas_thread
+from djet_ros.threads import keep_freed_memory, one_blas_thread, sleep_while_waiting
 
 # Only the module of the command that is called gets imported: help is quick, and no command
 # needs the libraries of another.
@@ -59,6 +59,7 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code is 2 for what the user can mend, 130 for Ctrl-C."""
     one_blas_thread()
+    sleep_while_waiting()
     keep_freed_memory()
     try:
         code = run(sys.argv[1:] if argv is None else argv)

@@ -9,7 +9,7 @@ import signal
 import sys
 from threading import Event
 
-from djet_ros.threads import keep_freed_memory, one_blas_thread
+from djet_ros.threads import keep_freed_memory, one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
 Topics, parameters and the rest are given as to every ROS node:
@@ -39,6 +39,7 @@ def _run(name: str, description: str, *, without_ros: str,
     where ROS is missing; extra: a library that it needs, and the extra that brings it.
     """
     one_blas_thread()
+    sleep_while_waiting()
     keep_freed_memory()
     stop = Event()
     # First of all: the imports take their time, and end no worse than anything later.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextvars import ContextVar
 from typing import TypeVar
 
 import cv2
@@ -22,10 +23,13 @@ Result = TypeVar('Result')
 # Kept, as it takes longer to make a thread than to do much of what these do.
 _others = ThreadPoolExecutor(4, 'djet')
 
+# Whether this is something that was begun beside something else: no core is left for more.
+_beside = ContextVar('beside', default=False)
+
 
 def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
     """Do two things at once, the first of them in the calling thread."""
-    if cv2.getNumThreads() < 2:
+    if cv2.getNumThreads() < 2 or _beside.get():
         return first(), second()
     later = _others.submit(second)
     try:
@@ -48,3 +52,23 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
 
     shares = both(lambda: share(0), lambda: share(1))
     return [shares[i % 2][i // 2] for i in range(len(tasks))]
+
+
+def begun(work: Callable[[], Result]) -> Callable[[], Result]:
+    """
+    Begin something that is needed later; gives what waits for its result, to be called once.
+
+    Where there is one thread, or none had time to begin it, it is done when it is needed.
+    """
+    if cv2.getNumThreads() < 2:
+        return work
+
+    def beside() -> Result:
+        token = _beside.set(True)
+        try:
+            return work()
+        finally:
+            _beside.reset(token)
+
+    later = _others.submit(beside)
+    return lambda: work() if later.cancel() else later.result()

@@ -64,6 +64,11 @@ class FrameQueue(Generic[Item]):
             self._changed.notify_all()
             return item
 
+    def peek(self) -> Item | None:
+        """Give the oldest item without taking it; None where nothing waits."""
+        with self._changed:
+            return self._items[0] if self._items else None
+
     @property
     def has_room(self) -> bool:
         """Whether ``put`` would not have to wait."""

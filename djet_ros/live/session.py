@@ -335,6 +335,8 @@ class Session:
         if not tracker.mounted:
             self._mount(frame)
         self._mount_beside(frame)
+        if (following := self._queue.peek()) is not None:
+            tracker.expect(following.image)
         self._publish(tracker.image(received.image))
         self._latencies.add(received.at)
         self._log_trouble()

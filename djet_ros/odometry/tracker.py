@@ -8,18 +8,21 @@ in the same order give the same poses everywhere.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 import math
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config, NODE_NAME
-from djet_ros.core.types import Array, STARTED, TRACKED
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.parallel import begun
+from djet_ros.core.types import Array, STARTED, TRACKED, View
 from djet_ros.odometry.beside import Beside
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import Complaint, has_frame, Health, why_restarted
-from djet_ros.odometry.images import BadMessage, gray_image
+from djet_ros.odometry.images import BadMessage, Gray, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
@@ -38,6 +41,23 @@ class Outgoing(NamedTuple):
 
     topic: str
     message: Any
+
+
+class _Seen(NamedTuple):
+    """An undistorted image, the shape of the one that came, and its view where nothing hides."""
+
+    gray: Gray
+    shape: tuple[int, ...]
+    view: View | None
+
+
+class _Expected(NamedTuple):
+    """What was begun of an image, and by what."""
+
+    message: Any
+    camera: Camera
+    estimator: TwoViewEstimator
+    seen: Callable[[], _Seen]
 
 
 class Tracker:
@@ -76,6 +96,7 @@ class Tracker:
         self._messages = Messages(message_type, config.odometry, node)
         self._info: Any = None
         self._camera: Camera | None = None
+        self._hides = still_mask is not None
         self._paused = False
         self._enter(State.WAITING_FOR_CAMERA_INFO)
         self._forget()
@@ -101,6 +122,8 @@ class Tracker:
         # What the newest frame without a pair means, for a log.
         self.remark = ''
         self._frame: Frame | None = None
+        # The next images, of which a face knows one or two.
+        self._expected: deque[_Expected] = deque(maxlen=2)
         self._health = Health(self.config.odometry, self._speed_topics)
         self._late_in_a_row = 0
         self._path: deque[Any] = deque(maxlen=self.config.ros.path_length)
@@ -148,6 +171,31 @@ class Tracker:
             self._await()
         return []
 
+    def expect(self, message: Any) -> None:
+        """
+        Begin with an image that is to come after the next one, beside the work on that one.
+
+        What comes of it is the same; it needs not be told, and the image need not come.
+        """
+        if self._camera is None or self._paused or any(
+                one.message is message for one in self._expected):
+            return
+        camera, estimator = self._camera, self._odometry.estimator
+        # What is left out of an image may not be known yet.
+        whole = not (self._hides or self.config.odometry.mask)
+        self._expected.append(_Expected(message, camera, estimator, begun(
+            lambda: _seen(message, camera, estimator if whole else None))))
+
+    def _see(self, message: Any, camera: Camera) -> _Seen:
+        """See an image, by what was begun of it unless that was by another camera."""
+        for one in self._expected:
+            if one.message is message:
+                self._expected.remove(one)
+                if one.camera is camera and one.estimator is self._odometry.estimator:
+                    return one.seen()
+                break
+        return _seen(message, camera, None)
+
     def image(self, message: Any) -> list[Outgoing]:
         """Take an Image or a CompressedImage, and give what comes of it."""
         self.counts.received += 1
@@ -161,16 +209,15 @@ class Tracker:
             self._drop(reason)
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
-            raw = gray_image(message)
-            gray = self._camera.undistort(raw)
-            left_out = self._beside.left_out(stamp, message.header.frame_id, raw.shape,
+            seen = self._see(message, self._camera)
+            left_out = self._beside.left_out(stamp, message.header.frame_id, seen.shape,
                                              self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
-        return self._process(Frame(gray, self._camera.K, stamp, message.header.frame_id,
-                                   left_out))
+        return self._process(Frame(seen.gray, self._camera.K, stamp, message.header.frame_id,
+                                   left_out), seen.view if left_out is None else None)
 
     @property
     def mounted(self) -> bool:
@@ -350,11 +397,11 @@ class Tracker:
         self._enter(State.REJECTING, problem.reason)
         return self._diagnostics_if_due(stamp)
 
-    def _process(self, frame: Frame) -> list[Outgoing]:
+    def _process(self, frame: Frame, view: View | None) -> list[Outgoing]:
         if self._frame is not None and frame.stamp_ns < self._frame.stamp_ns:
             self._path.clear()
             self._path_stamp = None
-        result = self._odometry.process(frame)
+        result = self._odometry.process(frame, view)
         self.remark = why_restarted(result, self._frame.stamp_ns if self._frame else None,
                                     self.config.odometry)
         self.last, self._frame, self.problem = result, frame, None
@@ -423,3 +470,11 @@ class Tracker:
                 return []
         self._said = what, stamp
         return [self.diagnostics(stamp)]
+
+
+def _seen(message: Any, camera: Camera, estimator: TwoViewEstimator | None) -> _Seen:
+    """See an image by a camera, and prepare its view where there is an estimator for it."""
+    raw = gray_image(message)
+    gray = camera.undistort(raw)
+    view = None if estimator is None else estimator.view(gray, camera.K)
+    return _Seen(gray, raw.shape, view)

@@ -147,15 +147,25 @@ class VisualOdometry:
         self._standstill = Standstill()
         self._pose, self._path = np.eye(4), PathCovariance()
 
-    def process(self, frame: Frame) -> OdometryResult:
-        """Take the next frame; ValueError where its stamp is that of the last one."""
+    @property
+    def estimator(self) -> TwoViewEstimator:
+        """Give what prepares the views of frames; another one with other parameters."""
+        return self._estimator
+
+    def process(self, frame: Frame, view: View | None = None) -> OdometryResult:
+        """
+        Take the next frame; ValueError where its stamp is that of the last one.
+
+        view: of the frame as `estimator` prepares it, where that was done before.
+        """
         # Can this frame be related to the past at all?
         last, self._last = self._last, frame
         status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
         if last and frame.stamp_ns == last.stamp_ns:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
         # Features are found once: now for the current frame, next time for the reference.
-        view = self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
+        if view is None:
+            view = self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
         if status is not Status.OK:
             return self._start(frame, view, status, backwards=bool(
                 last and frame.stamp_ns < last.stamp_ns))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -35,6 +35,9 @@ import numpy as np
 # Recorded nanoseconds for which an image waits for what belongs to it.
 _PATIENCE_NS = 10**9
 
+# Messages that are read ahead to find an image: those of a fast IMU beside a slow camera.
+_LONGEST_PIECE = 1000
+
 
 class Outcome(NamedTuple):
     """
@@ -46,6 +49,46 @@ class Outcome(NamedTuple):
     summary: dict[str, Any]
     problem: str | None
     advice: tuple[str, ...] = ()
+
+
+def with_next_image(recording: Recording) -> Iterator[tuple[BagMessage, BagMessage | None]]:
+    """
+    Yield all messages of a recording, each with the first image after the next one or itself.
+
+    None where that is far, or the end; what is wrong with a message comes in its place.
+    """
+    pieces, problem = _pieces(recording), None
+    piece = next(pieces, [])
+    while piece:
+        following: list[BagMessage] = []
+        try:
+            following = next(pieces, [])
+        except DjetError as error:
+            problem = error
+        image = following[-1] if following and following[-1].topic == recording.image_topic \
+            else None
+        for message in piece:
+            yield message, image
+        piece = following
+    if problem is not None:
+        raise problem
+
+
+def _pieces(recording: Recording) -> Iterator[list[BagMessage]]:
+    """Cut the messages after each image, and where very many come between two of them."""
+    piece: list[BagMessage] = []
+    try:
+        for message in recording.messages():
+            piece.append(message)
+            if message.topic == recording.image_topic or len(piece) == _LONGEST_PIECE:
+                yield piece
+                piece = []
+    except DjetError:
+        if piece:
+            yield piece
+        raise
+    if piece:
+        yield piece
 
 
 class Replay:
@@ -71,6 +114,7 @@ class Replay:
         # Images that wait for what belongs to them, which may be recorded after them, and the
         # CameraInfo between them.
         self._waiting: deque[BagMessage] = deque()
+        self._following: BagMessage | None = None
         self._truth = GroundTruth()
         self._log = _Log()
 
@@ -79,7 +123,8 @@ class Replay:
         started = perf_counter()
         complete, problem = False, 'broken off'
         try:
-            for message in self._recording.messages():
+            for message, following in with_next_image(self._recording):
+                self._following = following
                 for _ in range(self._take(message)):
                     if progress is not None:
                         progress()
@@ -144,6 +189,8 @@ class Replay:
                 tracker.mount_beside(what, mounting)
         if not tracker.mounted:
             self._mount(frame)
+        if self._following is not None:
+            tracker.expect(self._following.message)
         started = perf_counter()
         outgoing = tracker.image(message.message)
         seconds = perf_counter() - started

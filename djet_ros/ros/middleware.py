@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
+from time import monotonic
 from typing import Any
 
 from djet_ros.core.types import Array
@@ -27,6 +28,10 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 from std_srvs.srv import Trigger
+
+# Seconds between two looks for events of publishers, which rclpy logs. Each publisher has two, and
+# to wait for all of them took as long as all else that is waited for.
+_EVENTS_PERIOD = 1.0
 
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
@@ -70,6 +75,16 @@ class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
     def can_execute(self, entity: Any) -> bool:
         """Tell the executor whether to look for messages, and to hand one out."""
         return self._ready() and bool(super().can_execute(entity))
+
+
+class _NowAndThen(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
+    """Leaves events in the middleware for as long as nobody looks for them."""
+
+    looked_for = False
+
+    def can_execute(self, entity: Any) -> bool:
+        """Tell the executor whether to look for events."""
+        return self.looked_for and bool(super().can_execute(entity))
 
 
 class RosSubscription:
@@ -121,6 +136,7 @@ class RosMiddleware:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._frames: Any = None
+        self._events, self._last_look = _NowAndThen(), -float('inf')
 
     @property
     def node(self) -> str:
@@ -154,7 +170,7 @@ class RosMiddleware:
         """Publish on a topic; its quality of service can be overridden by parameters."""
         with _asked_for(self._node, topic):
             return RosPublisher(self._node.create_publisher(
-                message_type(kind), topic, _qos(DEFAULT_PROFILE),
+                message_type(kind), topic, _qos(DEFAULT_PROFILE), callback_group=self._events,
                 qos_overriding_options=_OVERRIDES))
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
@@ -200,6 +216,9 @@ class RosMiddleware:
 
     def spin(self, seconds: float) -> None:
         """Wait for something to do, at most for some time, and do it."""
+        self._events.looked_for = monotonic() - self._last_look >= _EVENTS_PERIOD
+        if self._events.looked_for:
+            self._last_look = monotonic()
         self._executor.spin_once(timeout_sec=seconds)
 
 

@@ -16,7 +16,8 @@ from rich.table import Table
 DESCRIPTION = """\
 Measure the pipeline against the plain chain of OpenCV (ORB, brute-force cross-check,
 findEssentialMat, recoverPose), pair by pair in one run, and how the D-JET stage grows with points
-and window. Writes the figures as JSON and a plot beside them.
+and window. With all cores our next frame is prepared beside the pair, as in a replay; OpenCV's
+chain takes its frames in turn. Writes the figures as JSON and a plot beside them.
 """
 
 
