@@ -112,7 +112,7 @@ class Round:
     One round of Algorithm 1 on N matches, as an observer is shown it.
 
     keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
-    warp: (N, 2, 2) through which the reference patches were seen, None where they were not warped;
+    warp: (N, 3, 2) through which the reference patches were seen, None where they were not warped;
     pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
     """
 
@@ -342,4 +342,4 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
-    return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
+    return np.where(plausible[:, None, None], warp, np.eye(3, 2)), plausible
