@@ -21,6 +21,13 @@ _STEEPEST = 0.03
 
 _ROUNDS = 4
 
+# Half the side in pixels of the squares in which all points are told at once, and rounds of that.
+_HALF, _ROUNDS_OF_ALL = 32.0, 3
+
+# Chi-squared of two degrees of freedom that chance exceeds once in a hundred. What leans by noise
+# alone leans as the pose would have it, be that wrong, and makes patches agree with it.
+_BY_CHANCE = 9.2
+
 
 def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     """
@@ -57,3 +64,76 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     found = lean / (_REACH * np.where(flat, here, 1.0)[:, None])
     flat &= np.abs(found).max(1) < _STEEPEST
     return np.where(flat[:, None], found, 0.0)
+
+
+def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
+    """
+    Slopes (N, 2) of inverse depth at points themselves, pixels x (N, 2), a pixel.
+
+    rho, sigma: (N,) inverse depths and their standard deviations; where all are negative, so are
+    slopes. As `slopes`, but with one plane for all points that are next to the middle of a square:
+    squares overlap by half, and are summed up from their quarters. Many points cost a tenth so.
+    """
+    if len(x) < _FEW:
+        return np.zeros((len(x), 2))
+    u, v = x.T / _HALF - np.floor(x.min(0) / _HALF)[:, None]
+    squares = _Squares(u, v)
+    ones = np.ones_like(u)
+    terms = np.stack([ones, u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
+    weights = trusted = 1 / np.maximum(sigma**2 + (_BENT * rho)**2, 1e-18)
+    for _ in range(_ROUNDS_OF_ALL):
+        here, *lean, told = _planes(*squares.sums(weights * terms))[:, squares.which]
+        off = (rho - here - lean[0] * u - lean[1] * v)**2 * trusted
+        weights = trusted / (1 + off / 4)
+    fits = off < 9
+    enough = squares.sums(fits[None].astype(float))[0] >= _FEW
+    found = np.stack(lean, axis=1) / _HALF
+    flat = (fits & enough[squares.which] & (told > _BY_CHANCE)
+            & (np.abs(found).max(1) < _STEEPEST * np.abs(rho)))
+    return np.where(flat[:, None], found, 0.0)
+
+
+class _Squares:
+    """
+    Squares with a side of two that overlap by half, and the points (N,) at u, v >= 0 in them.
+
+    which: (N,) the square in whose middle each point is, of the S squares that are in use.
+    """
+
+    def __init__(self, u: Array, v: Array) -> None:
+        columns, rows = u.astype(np.int64), v.astype(np.int64)
+        # One more on each side, so that those at the edges are made of four quarters too.
+        self._shape = int(rows.max()) + 3, int(columns.max()) + 3
+        self._quarter = (rows + 1) * self._shape[1] + columns + 1
+        middles = np.rint(v).astype(np.int64) * (self._shape[1] - 1) + np.rint(u).astype(np.int64)
+        self._used, self.which = np.unique(middles, return_inverse=True)
+
+    def sums(self, values: Array) -> Array:
+        """Sum up values (V, N) of the points in each square, (V, S)."""
+        size = self._shape[0] * self._shape[1]
+        places = self._quarter + size * np.arange(len(values))[:, None]
+        quarters = np.bincount(places.ravel(), values.ravel(), size * len(values)).reshape(
+            -1, *self._shape)
+        pairs = quarters[:, 1:] + quarters[:, :-1]
+        return np.asarray((pairs[:, :, 1:] + pairs[:, :, :-1]).reshape(
+            len(values), -1)[:, self._used])
+
+
+def _planes(n: Array, u: Array, v: Array, uu: Array, uv: Array, vv: Array, r: Array, ur: Array,
+            vr: Array) -> Array:
+    """
+    Fit planes to points, by weighted sums (S,) of their terms.
+
+    Gives (4, S): their values at u = v = 0, their slopes along both, and by how much these lessen
+    the sum of squares.
+    """
+    level = r / n
+    # Of no depth at all, nothing leans.
+    prior = 1 / np.maximum((_USUAL * _HALF / _REACH * level)**2, 1e-18)
+    # The level is eliminated first.
+    uu, uv, vv = uu - u * u / n + prior, uv - u * v / n, vv - v * v / n + prior
+    ur, vr = ur - u * level, vr - v * level
+    scale = 1 / (uu * vv - uv**2)
+    along_u, along_v = (vv * ur - uv * vr) * scale, (uu * vr - uv * ur) * scale
+    return np.stack([level - (along_u * u + along_v * v) / n, along_u, along_v,
+                     along_u * ur + along_v * vr])

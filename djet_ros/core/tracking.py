@@ -21,8 +21,10 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,
     growth,
+    inverse_depths,
     patch_warp,
     rays,
+    slant_warp,
     values_on,
 )
 from djet_ros.core.jet import (
@@ -39,6 +41,7 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
+from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -65,6 +68,8 @@ class TrackTuning:
     steps_by_places: int = 2
     # robust standard deviations; the usual three, within which a match agrees with a pose
     inlier: float = 3.0
+    # pixels; chosen: what right matches are off, where surfaces are fitted to their depths
+    off: float = 0.1
 
 
 TUNING = TrackTuning()
@@ -342,4 +347,13 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
-    return np.where(plausible[:, None, None], warp, np.eye(3, 2)), plausible
+    warp = np.where(plausible[:, None, None], warp, np.eye(3, 2))
+    # Neighbours tell how the surface leans that a patch is on.
+    places = np.flatnonzero(plausible)
+    x, y = x[places], y[places]
+    rho, sigma = inverse_depths(pose.R, pose.t, rays(K, x), rays(K, y))
+    slope = slopes_of_all(x, rho, TUNING.off / K[0, 0] * sigma)
+    leaning = warp[places] + slant_warp(K, pose.t, y, seen[places], slope)
+    alike = comparable(leaning)
+    warp[places[alike]] = leaning[alike]
+    return warp, plausible
