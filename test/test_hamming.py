@@ -130,8 +130,9 @@ def test_few_points_are_tested_as_many_are():
 
 def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
     smoothed = smooth(pictures()['textured'])
-    points = np.array([[60, 50], [90, 60], [70, 70]])
-    warps = np.array([np.eye(2), 1.25 * np.eye(2), [[0.9, 0.2], [-0.1, 1.1]]])
+    points = np.array([[60, 50], [90, 60], [70, 70], [80, 66]])
+    warps = np.array([np.eye(3, 2), 1.25 * np.eye(3, 2), [[0.9, 0.2], [-0.1, 1.1], [0, 0]],
+                      [[0.9, 0.2], [-0.1, 1.1], [0.01, -0.006]]])
     bits = np.less(*intensities_through(warps, smoothed, points))
     assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
 
@@ -141,10 +142,14 @@ def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
         return np.array([1 - (y - row), y - row]) @ corner @ np.array([1 - (x - column),
                                                                       x - column])
 
-    for k in (1, 2):
+    def back(warp, dy):
+        dx = np.linalg.solve(warp[:2] - np.outer(dy, warp[2]), dy)
+        assert np.allclose(warp[:2] @ dx / (1 + warp[2] @ dx), dy)
+        return dx
+
+    for k in (1, 2, 3):
         for test, bit in zip(TESTS, bits[:, k]):
-            p, q = (between(*(points[k] + np.linalg.solve(warps[k], test[i:i + 2])))
-                    for i in (0, 2))
+            p, q = (between(*(points[k] + back(warps[k], test[i:i + 2]))) for i in (0, 2))
             # OpenCV rounds intensities to whole gray levels
             assert bit == (p < q) or abs(p - q) < 1.5
 

@@ -29,6 +29,11 @@ def seen(warp: np.ndarray, shift: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (x - MIDDLE) @ warp.T + MIDDLE + shift
 
 
+def as_seen(warp: np.ndarray, count: int) -> np.ndarray:
+    """Give the same warp (3, 2) for all points, of depths that are all alike."""
+    return np.tile(np.vstack([warp, [0, 0]]), (count, 1, 1))
+
+
 @pytest.fixture
 def points() -> np.ndarray:
     return np.random.default_rng(1).uniform((80, 80), (320, 220), (300, 2))
@@ -46,7 +51,7 @@ def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
     there, here = image(np.eye(2), np.zeros(2)), image(warp, shift)
     true = seen(warp, shift, points)
     near = true + np.random.default_rng(2).uniform(-0.3, 0.3, true.shape)
-    found = place_exactly(there, here, points, near, np.repeat(warp[None], len(points), axis=0))
+    found = place_exactly(there, here, points, near, as_seen(warp, len(points)))
     off = np.linalg.norm(found - true, axis=1)
     assert np.median(off) < 0.02
     assert np.quantile(off, 0.95) < 0.06
@@ -57,20 +62,20 @@ def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None
     warp = WARPS['a road']
     there, here = image(np.eye(2), np.zeros(2)), image(warp, np.zeros(2))
     true = seen(warp, np.zeros(2), points)
-    as_a_whole = place_exactly(there, here, points, true, np.tile(np.eye(2), (len(points), 1, 1)))
+    as_a_whole = place_exactly(there, here, points, true, as_seen(np.eye(2), len(points)))
     assert np.median(np.linalg.norm(as_a_whole - true, axis=1)) > 0.1
 
 
 def test_haze_moves_nothing(points: np.ndarray) -> None:
     there = image(np.eye(2), np.zeros(2))
     hazy = (there * 0.8 + 40).astype(np.uint8)
-    found = place_exactly(there, hazy, points, points, np.tile(np.eye(2), (len(points), 1, 1)))
+    found = place_exactly(there, hazy, points, points, as_seen(np.eye(2), len(points)))
     assert np.median(np.linalg.norm(found - points, axis=1)) < 0.02
 
 
 def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None:
     there, here = image(np.eye(2), np.zeros(2)), image(np.eye(2), np.array([4.0, 0.0]))
-    eye = np.tile(np.eye(2), (len(points), 1, 1))
+    eye = as_seen(np.eye(2), len(points))
     found = place_exactly(there, here, points, points, eye)
     assert (np.abs(found - points).max(1) < 1).all()
     border = points * 0 + [3.0, 150.0]
@@ -82,7 +87,7 @@ def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None
 def test_threads_change_nothing(points: np.ndarray) -> None:
     there, here = image(np.eye(2), np.zeros(2)), image(WARPS['larger'], np.zeros(2))
     many = np.tile(points, (8, 1))
-    warp = np.repeat(WARPS['larger'][None], len(many), axis=0)
+    warp = as_seen(WARPS['larger'], len(many))
     true = seen(WARPS['larger'], np.zeros(2), many)
     before = cv2.getNumThreads()
     results = []

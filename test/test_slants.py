@@ -10,7 +10,7 @@ import pytest
 K = np.array([[700.0, 0, 600], [0, 650, 180], [0, 0, 1]])
 
 
-def test_the_warp_of_a_plane_is_the_derivative_of_where_its_points_are_seen() -> None:
+def test_the_warp_of_a_plane_tells_where_its_points_are_seen() -> None:
     R, t = rotation_exp(np.array([0.02, -0.05, 0.03])), np.array([0.3, -0.1, -0.8])
     x, rho, lean = np.array([710.0, 260.0]), 0.12, np.array([-2e-4, 6e-4])
 
@@ -22,9 +22,9 @@ def test_the_warp_of_a_plane_is_the_derivative_of_where_its_points_are_seen() ->
     y, z = seen(np.zeros(2))
     y, growth = y[None], np.array([1 / z])
     warp = patch_warp(K, R, y, growth) + slant_warp(K, t, y, growth, lean[None])
-    steps = np.eye(2) * 1e-4
-    numeric = np.stack([(seen(step)[0] - seen(-step)[0]) / 2e-4 for step in steps], axis=1)
-    assert warp[0] == pytest.approx(numeric, rel=1e-6)
+    for step in ((0.01, 0), (0, 0.01), (20, -30), (-10, 40)):
+        *moved, deeper = warp[0] @ step
+        assert y[0] + np.divide(moved, 1 + deeper) == pytest.approx(seen(np.array(step))[0])
 
 
 def test_a_road_is_told_from_its_points() -> None:
@@ -48,6 +48,38 @@ def test_what_is_beyond_an_edge_does_not_lean() -> None:
     before = np.abs(x - [130, 150]) < [5, 120]
     found = slopes(x, rho, 0.01 * rho, x[before.all(1)])
     assert np.median(np.abs(found)) < 1e-3
+
+
+def test_all_points_of_a_road_tell_its_slope_at_once() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.uniform((0, 230), (1200, 370), (1200, 2))
+    rho, slope = (x[:, 1] - 180) / (650 * 1.65), 1 / (650 * 1.65)
+    sigma = 0.005 * rho
+    inner = (np.abs(x - [600, 300]) < [560, 40]).all(1)
+    found = slopes_of_all(x, rho, sigma)
+    assert found[inner] == pytest.approx(np.tile([0, slope], (inner.sum(), 1)), abs=0.1 * slope)
+    noisy = slopes_of_all(x, rho + rng.normal(size=1200) * sigma, sigma)
+    assert np.median(np.abs(noisy - found)[inner].max(1)) < 0.1 * slope
+    # The sign of t is open, and so is that of all depths.
+    assert slopes_of_all(x, -rho, sigma) == pytest.approx(-found)
+
+
+def test_of_all_points_those_beyond_an_edge_do_not_bend_what_others_tell() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.uniform(0, 300, (900, 2))
+    rho = np.where(x[:, 0] > 150, 0.05, 0.2)
+    assert np.median(np.abs(slopes_of_all(x, rho, 0.01 * rho)) / rho[:, None]) < 1e-3
+
+
+def test_all_points_face_the_camera_where_they_are_few_or_scattered() -> None:
+    x = np.arange(20.0)[:, None] * [200.0, 0.0]
+    assert not slopes_of_all(x, np.ones(20), np.full(20, 0.01)).any()
+    for few in (0, 3):
+        assert not slopes_of_all(x[:few], np.ones(few), np.ones(few)).any()
+    scattered = np.random.default_rng(4).uniform(0, 300, (900, 2))
+    depths = np.random.default_rng(5).uniform(0.01, 1, 900)
+    lean = slopes_of_all(scattered, depths, 0.001 * depths)
+    assert (lean != 0).any(1).mean() < 0.05
 
 
 def test_points_without_neighbours_face_the_camera() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig, preset
+from djet_ros.core.geometry import patch_warp
 from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids
@@ -91,7 +92,7 @@ def test_references_between_pixels_have_their_minimum_nearer_to_where_the_image_
     x = before.features.points
     x = x[(np.abs(x - (160, 120)) < (110, 70)).all(1)]
     surface = DescriptorSurface(before, after, x, EstimatorConfig())
-    errors, y, as_it_was = [], x + np.rint(shift), np.repeat(np.eye(2)[None], len(x), axis=0)
+    errors, y, as_it_was = [], x + np.rint(shift), np.repeat(np.eye(3, 2)[None], len(x), axis=0)
     for warp in (None, as_it_was, as_it_was):
         fitted, _ = with_minimum(surface.around(y, warp), 'project')
         y = np.clip(fitted.minima(), y - 1, y + 1)
@@ -117,7 +118,7 @@ def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
 def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(pair, warped):
     rng = np.random.default_rng(34)
     x = rng.uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
-    warp = np.repeat(np.diag([1.1, 0.95])[None], 30, axis=0) if warped else None
+    warp = np.repeat([np.diag([1.1, 0.95, 0])[:, :2]], 30, axis=0) if warped else None
     surface = DescriptorSurface(*pair, x, EstimatorConfig())
     y = x.copy()
     surface.around(y)
@@ -143,8 +144,9 @@ def warped(warp):
     M = np.column_stack([warp, middle - warp @ middle])
     grid = np.stack(np.meshgrid(np.arange(70, 250, 9), np.arange(70, 170, 9)), -1)
     x = grid.reshape(-1, 2).astype(float)
-    return view(image), view(cv2.warpAffine(image, M, (320, 240), flags=cv2.INTER_CUBIC)), x, (
-        (x - middle) @ warp.T + middle, np.repeat(warp[None], len(x), axis=0))
+    seen = cv2.warpAffine(image, M, (320, 240), flags=cv2.INTER_CUBIC)
+    warps = np.repeat([np.vstack([warp, np.zeros(2)])], len(x), axis=0)
+    return view(image), view(seen), x, ((x - middle) @ warp.T + middle, warps)
 
 
 @pytest.mark.parametrize('name', WARPS)
@@ -167,12 +169,36 @@ def test_patches_look_more_alike_where_the_reference_is_warped(kind, name):
     assert seen < plain
 
 
+@pytest.mark.parametrize('turn', [(0.0, 0.3, 0.0), (0.2, -0.2, 0.1)])
+def test_after_a_large_turn_places_are_off_together_unless_patches_are_seen_in_perspective(turn):
+    camera = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    R = Rotation.from_rotvec(turn).as_matrix()
+    H = camera @ R @ np.linalg.inv(camera)
+    off = {'perspective': [], 'derivatives alone': []}
+    for seed in range(4):
+        image = textured(np.random.default_rng(seed), (640, 480))
+        turned = cv2.warpPerspective(image, H, (640, 480), flags=cv2.INTER_CUBIC)
+        there = np.random.default_rng(seed).uniform((40, 40), (600, 440), (2000, 2))
+        here = cv2.perspectiveTransform(there[None], H)[0]
+        both = ((here > 40) & (here < (600, 440))).all(1)
+        x, y = there[both], here[both]
+        # Of what is far away, depth grows by the turn alone.
+        grown = 1 / (np.column_stack([x, np.ones(len(x))]) @ H[2])
+        for name, rows in zip(off, (1, 0)):
+            warp = patch_warp(camera, R, y, grown) * [[1], [1], [rows]]
+            fits = DescriptorSurface(view(image), view(turned), x, EstimatorConfig()).around(
+                y, warp)
+            off[name].append(np.median((fits.minima() - y)[fits.usable], axis=0))
+    together = {name: np.linalg.norm(np.mean(means, axis=0)) for name, means in off.items()}
+    assert together['perspective'] < 0.25 * together['derivatives alone']
+
+
 def test_no_warp_changes_nothing_on_whole_pixels(pair):
     x = np.array([[60.0, 50.0], [90.0, 71.0]])
     config = EstimatorConfig(window=3, grading=0.0)
     pair = [view(one.gray, config) for one in pair]
     plain, same = (DescriptorSurface(*pair, x, config).around(x + 2.0, warp)
-                   for warp in (None, np.repeat(np.eye(2)[None], 2, axis=0)))
+                   for warp in (None, np.repeat(np.eye(3, 2)[None], 2, axis=0)))
     assert np.array_equal(plain.A, same.A) and np.array_equal(plain.c, same.c)
 
 

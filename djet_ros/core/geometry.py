@@ -195,27 +195,38 @@ def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
 
 def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     """
-    (N, 2, 2) derivatives dy/dx: how patches that face camera A are seen in B.
+    (N, 3, 2) local homographies: how patches that face camera A are seen in B.
 
     y: (N, 2) pixels in B; growth: (N,) see there. Depth is taken to be the same all over a patch,
-    so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, the derivative is
-    Z_A / Z_B (M_12 - y m_3^T), with M_12 the first two rows of M and m_3 the third.
+    so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, a step dx leads exactly to
+
+        dy = W dx / (1 + c^T dx),   W = Z_A / Z_B (M_12 - y m_3^T),   c = Z_A / Z_B m_3,
+
+    with M_12 the first two rows of M and m_3 the third, of two entries each. The first two rows of
+    a warp are W, the derivative dy/dx, and the third is c, the share by which depth in B grows a
+    pixel.
     """
     M = K @ R @ inverse_of(K)
-    return np.asarray(growth[:, None, None] * (M[:2, :2] - y[:, :, None] * M[2, :2]))
+    warp = np.empty((len(y), 3, 2))
+    warp[:, :2] = M[:2, :2] - y[:, :, None] * M[2, :2]
+    warp[:, 2] = M[2, :2]
+    return np.asarray(growth[:, None, None] * warp)
 
 
 def slant_warp(K: Array, t: Array, y: Array, growth: Array, slope: Array) -> Array:
     """
-    (N, 2, 2) what `patch_warp` lacks of dy/dx where patches do not face the camera.
+    (N, 3, 2) what `patch_warp` lacks where patches do not face the camera.
 
     t: (3,) translation to B; slope: (N, 2) how inverse depth in A, over the unit of t, changes a
-    pixel. Of y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is
-    Z_A / Z_B ((K t)_12 - y t_3).
+    pixel: all over a plane alike, so that their sum is the homography of it. Of
+    y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is Z_A / Z_B ((K t)_12 - y t_3), and
+    that of the denominator is t_3.
     """
     shift = K @ t
-    return np.asarray((growth[:, None] * (shift[:2] - y * shift[2]))[:, :, None]
-                      * slope[:, None])
+    by_depth = np.empty((len(y), 3))
+    by_depth[:, :2] = shift[:2] - y * shift[2]
+    by_depth[:, 2] = shift[2]
+    return np.asarray((growth[:, None] * by_depth)[:, :, None] * slope[:, None])
 
 
 def inverses(A: Array) -> Array:

@@ -30,6 +30,14 @@ _BLOCK = 2048
 # Points per pass of warped patches, which take up to 512 places in the image each (2 MB).
 _WARPED_BLOCK = 256
 
+# Pixels by which the farthest ends of tests may be off, for when driving, a warp's derivative will
+# do. All of a patch is off by a seventh of that, and a covariance takes four times as much for
+# granted (`covariance._SHIFT`).
+_BENT = 0.02
+
+# chosen: no part of a patch is nearer, or farther, than its middle by a larger factor.
+_MOST_NEARER = 2.0
+
 # Tests times points below which it takes longer to gather patches than to look where tests do.
 _FEW = 20_000
 
@@ -90,10 +98,17 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
     """
     Intensities (T, N) float32 at both ends of T tests, on patches seen through a warp.
 
-    warp: (N, 2, 2) derivatives dy/dx, not singular; points: (N, 2) pixels. The tests look
-    at dx = warp^-1 dy from the point, between pixels; beyond the image its border goes on.
+    warp: (N, 3, 2) W and c of `geometry.patch_warp`, W not singular; points: (N, 2) pixels. The
+    tests look between pixels, at the dx from the point that is seen at their dy: of
+    dy = W dx / (1 + c^T dx), that is dx = u / (1 - c^T u) with u = W^-1 dy. Beyond the image its
+    border goes on.
     """
-    inverse = inverses(warp).astype(np.float32)
+    inverse = inverses(warp[:, :2])
+    nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
+    # The ends of tests are up to sqrt(2) times their reach from the point.
+    bend = 2 * reach(tests)**2 * np.sqrt(np.einsum('nij,nij->n', inverse, inverse)
+                                         * np.einsum('nj,nj->n', nearer, nearer))
+    inverse, nearer = inverse.astype(np.float32), nearer.astype(np.float32)
     ends, of_tests = _ends(tests.tobytes())
     # OpenCV is three times as fast on floating point numbers as on short ones.
     image, places = smoothed.astype(np.float32, copy=False), points.astype(np.float32)
@@ -102,7 +117,13 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
     def look(start: int) -> None:
         # Points first: what is near one another in the image comes one after the other.
         block = slice(start, start + _WARPED_BLOCK)
-        x, y = (places[block, axis, None] + inverse[block, axis] @ ends for axis in (0, 1))
+        away = [inverse[block, axis] @ ends for axis in (0, 1)]
+        bent = np.flatnonzero(bend[block] > _BENT)
+        if len(bent):
+            depths = (1 - nearer[block][bent] @ ends).clip(1 / _MOST_NEARER, _MOST_NEARER)
+            for along in away:
+                along[bent] /= depths
+        x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
         cv2.remap(image, x, y, cv2.INTER_LINEAR, values[block], cv2.BORDER_REPLICATE)
 
     each(look, range(0, len(points), _WARPED_BLOCK))

@@ -38,10 +38,11 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     """
     Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2), (N, 2).
 
-    warp: (N, 2, 2) how they are seen there, the derivatives dy/dx, not singular. By Gauss-Newton
-    steps on the differences of gray levels under the slopes of the warped patch ("inverse
-    compositional", Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze
-    and clouds change them. What would go far stays at y.
+    warp: (N, 3, 2) how they are seen there, see `geometry.patch_warp`; so small a patch needs but
+    the derivatives dy/dx, its first two rows, which must not be singular. By Gauss-Newton steps on
+    the differences of gray levels under the slopes of the warped patch ("inverse compositional",
+    Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
+    them. What would go far stays at y.
     """
     places, floating = y.copy(), there.astype(np.float32)
     inside = np.flatnonzero(_within(here, y, _RADIUS + 1 + _FARTHEST))
@@ -78,11 +79,11 @@ class _Seen(NamedTuple):
 
 
 def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
-    """Take the patches around points (N, 2) as they are seen through a warp (N, 2, 2)."""
+    """Take the patches around points (N, 2) as they are seen through a warp (N, 3, 2)."""
     side = 2 * _RADIUS + 3
     off = np.arange(side, dtype=np.float32) - _RADIUS - 1
     square = np.stack([np.tile(off, side), np.repeat(off, side)])
-    back = inverses(warp).astype(np.float32)
+    back = inverses(warp[:, :2]).astype(np.float32)
     x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ square for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
     by_point = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)

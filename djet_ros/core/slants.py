@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from djet_ros.core.cells import cells_of
 from djet_ros.core.types import Array
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,69 +21,119 @@ _STEEPEST = 0.03
 
 _ROUNDS = 4
 
-# Pixels; chosen: side of the cells in which one plane serves all points that lie in it, and
-# standard deviations from it up to which they do.
-_SIDE, _IN_PLANE = 48.0, 3.0
+# Half the side in pixels of the squares in which all points are told at once, and rounds of that.
+_HALF, _ROUNDS_OF_ALL = 32.0, 3
 
-
-def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
-    """
-    Give `slopes` (N, 2) at the points themselves: of one plane in each cell of the image.
-
-    x: (N, 2) pixels, rho: (N,) inverse depths and sigma: (N,) their standard deviations. Zero for
-    points that do not lie in the plane of their cell.
-    """
-    _, cell, count = np.unique(cells_of(x, _SIDE), return_inverse=True, return_counts=True)
-    middles = np.stack([np.bincount(cell, along) for along in x.T], axis=1) / count[:, None]
-    level, lean = _planes(x, rho, sigma, middles)
-    expected = level[cell] + (lean[cell] * (x - middles[cell])).sum(1)
-    near = np.abs(rho - expected) < _IN_PLANE * np.hypot(sigma, _BENT * expected)
-    return np.where((near & (rho > 0))[:, None], lean[cell] / np.maximum(rho, 1e-12)[:, None], 0.0)
+# Chi-squared of two degrees of freedom that chance exceeds once in a hundred. What leans by noise
+# alone leans as the pose would have it, be that wrong, and makes patches agree with it.
+_BY_CHANCE = 9.2
 
 
 def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     """
     Slopes (M, 2) of inverse depth at points (M, 2), a pixel, as shares of the inverse depth there.
 
-    x: (N, 2) other pixels, rho: (N,) inverse depths and sigma: (N,) their standard deviations.
-    Zero, as of a surface that faces the camera, where too few lie in one plane.
-    """
-    level, lean = _planes(x, rho, sigma, points)
-    return np.where(level[:, None] > 0, lean / np.maximum(level, 1e-12)[:, None], 0.0)
-
-
-def _planes(x: Array, rho: Array, sigma: Array, points: Array) -> tuple[Array, Array]:
-    """
-    Fit planes around points (M, 2): inverse depths (M,) there, and their slopes (M, 2) a pixel.
-
-    The inverse depth of a plane is affine in pixels. It is fitted to the neighbours by least
-    squares under a Cauchy loss, so that those beyond an edge count little. Not a number where too
-    few lie in one plane.
+    x: (N, 2) other pixels, rho: (N,) inverse depths and sigma: (N,) their standard deviations. The
+    inverse depth of a plane is affine in pixels. It is fitted to the neighbours by least squares
+    under a Cauchy loss, so that those beyond an edge count little. Zero, as of a surface that
+    faces the camera, where too few lie in one plane.
     """
     if len(x) < _FEW or not len(points):
-        return np.full(len(points), np.nan), np.full((len(points), 2), np.nan)
+        return np.zeros((len(points), 2))
     away, near = cKDTree(x).query(
         points, k=min(_NEIGHBOURS, len(x)), distance_upper_bound=_REACH)
-    # Points last: what is summed up over neighbours runs over contiguous memory.
-    there = np.isfinite(away).T
-    near = np.where(there, near.T, 0)
+    there = np.isfinite(away)
+    near = np.where(there, near, 0)
     value = rho[near]
-    count = np.maximum(there.sum(0), 1)
+    count = np.maximum(there.sum(1), 1)
     # The lower median of those that are there.
-    level = np.take_along_axis(np.sort(np.where(there, value, np.inf), axis=0),
-                               (count - 1)[None] // 2, axis=0)[0]
-    level = np.where(there.any(0), level, 1.0)
-    J = np.stack([np.ones_like(value), *((x.T[:, near] - points.T[:, None]) / _REACH)])
-    JJ, Jv = J[:, None] * J, J * value
-    trusted = there / (sigma[near]**2 + (_BENT * level)**2)
+    level = np.take_along_axis(np.sort(np.where(there, value, np.inf), axis=1),
+                               (count - 1)[:, None] // 2, axis=1)[:, 0]
+    level = np.where(there.any(1), level, 1.0)
+    J = np.concatenate([np.ones_like(value)[:, :, None], (x[near] - points[:, None]) / _REACH], 2)
+    trusted = there / (sigma[near]**2 + (_BENT * level[:, None])**2)
     prior = np.diag([1e-9, 1.0, 1.0]) / (_USUAL * level)[:, None, None]**2
     weights = trusted
     for _ in range(_ROUNDS):
-        H = (JJ * weights).sum(2).transpose(2, 0, 1) + prior
-        plane = np.linalg.solve(H, (Jv * weights).sum(1).T[:, :, None])[:, :, 0]
-        squares = (value - (plane.T[:, None] * J).sum(0))**2 * trusted
+        back = (J * weights[:, :, None]).transpose(0, 2, 1)
+        plane = np.linalg.solve(back @ J + prior, back @ value[:, :, None])
+        squares = (value - (J @ plane)[:, :, 0])**2 * trusted
         weights = trusted / (1 + squares / 4)
-    here, lean = plane[:, 0], plane[:, 1:] / _REACH
-    flat = ((there & (squares < 9)).sum(0) >= _FEW) & (here > 0)
-    flat &= np.abs(lean).max(1) < _STEEPEST * here
-    return np.where(flat, here, np.nan), np.where(flat[:, None], lean, np.nan)
+    here, lean = plane[:, 0, 0], plane[:, 1:, 0]
+    flat = ((there & (squares < 9)).sum(1) >= _FEW) & (here > 0)
+    found = lean / (_REACH * np.where(flat, here, 1.0)[:, None])
+    flat &= np.abs(found).max(1) < _STEEPEST
+    return np.where(flat[:, None], found, 0.0)
+
+
+def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
+    """
+    Slopes (N, 2) of inverse depth at points themselves, pixels x (N, 2), a pixel.
+
+    rho, sigma: (N,) inverse depths and their standard deviations; where all are negative, so are
+    slopes. As `slopes`, but with one plane for all points that are next to the middle of a square:
+    squares overlap by half, and are summed up from their quarters. Many points cost a tenth so.
+    """
+    if len(x) < _FEW:
+        return np.zeros((len(x), 2))
+    u, v = x.T / _HALF - np.floor(x.min(0) / _HALF)[:, None]
+    squares = _Squares(u, v)
+    ones = np.ones_like(u)
+    terms = np.stack([ones, u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
+    weights = trusted = 1 / np.maximum(sigma**2 + (_BENT * rho)**2, 1e-18)
+    for _ in range(_ROUNDS_OF_ALL):
+        here, *lean, told = _planes(*squares.sums(weights * terms))[:, squares.which]
+        off = (rho - here - lean[0] * u - lean[1] * v)**2 * trusted
+        weights = trusted / (1 + off / 4)
+    fits = off < 9
+    enough = squares.sums(fits[None].astype(float))[0] >= _FEW
+    found = np.stack(lean, axis=1) / _HALF
+    flat = (fits & enough[squares.which] & (told > _BY_CHANCE)
+            & (np.abs(found).max(1) < _STEEPEST * np.abs(rho)))
+    return np.where(flat[:, None], found, 0.0)
+
+
+class _Squares:
+    """
+    Squares with a side of two that overlap by half, and the points (N,) at u, v >= 0 in them.
+
+    which: (N,) the square in whose middle each point is, of the S squares that are in use.
+    """
+
+    def __init__(self, u: Array, v: Array) -> None:
+        columns, rows = u.astype(np.int64), v.astype(np.int64)
+        # One more on each side, so that those at the edges are made of four quarters too.
+        self._shape = int(rows.max()) + 3, int(columns.max()) + 3
+        self._quarter = (rows + 1) * self._shape[1] + columns + 1
+        middles = np.rint(v).astype(np.int64) * (self._shape[1] - 1) + np.rint(u).astype(np.int64)
+        self._used, self.which = np.unique(middles, return_inverse=True)
+
+    def sums(self, values: Array) -> Array:
+        """Sum up values (V, N) of the points in each square, (V, S)."""
+        size = self._shape[0] * self._shape[1]
+        places = self._quarter + size * np.arange(len(values))[:, None]
+        quarters = np.bincount(places.ravel(), values.ravel(), size * len(values)).reshape(
+            -1, *self._shape)
+        pairs = quarters[:, 1:] + quarters[:, :-1]
+        return np.asarray((pairs[:, :, 1:] + pairs[:, :, :-1]).reshape(
+            len(values), -1)[:, self._used])
+
+
+def _planes(n: Array, u: Array, v: Array, uu: Array, uv: Array, vv: Array, r: Array, ur: Array,
+            vr: Array) -> Array:
+    """
+    Fit planes to points, by weighted sums (S,) of their terms.
+
+    Gives (4, S): their values at u = v = 0, their slopes along both, and by how much these lessen
+    the sum of squares.
+    """
+    level = r / n
+    # Of no depth at all, nothing leans.
+    prior = 1 / np.maximum((_USUAL * _HALF / _REACH * level)**2, 1e-18)
+    # The level is eliminated first.
+    uu, uv, vv = uu - u * u / n + prior, uv - u * v / n, vv - v * v / n + prior
+    ur, vr = ur - u * level, vr - v * level
+    scale = 1 / (uu * vv - uv**2)
+    along_u, along_v = (vv * ur - uv * vr) * scale, (uu * vr - uv * ur) * scale
+    return np.stack([level - (along_u * u + along_v * v) / n, along_u, along_v,
+                     along_u * ur + along_v * vr])

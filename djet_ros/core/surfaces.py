@@ -78,8 +78,8 @@ class ResidualSurface(Protocol):
         """
         Paraboloids of the residual, valid in the neighbourhood of y (N, 2).
 
-        warp: (N, 2, 2) how the surroundings of x are seen around y, the derivatives dy/dx; None
-        where that is not known, and for surfaces that are to be as the paper has them.
+        warp: (N, 3, 2) how the surroundings of x are seen around y, see `geometry.patch_warp`;
+        None where that is not known, and for surfaces that are to be as the paper has them.
         """
         ...
 
@@ -112,7 +112,7 @@ class DescriptorSurface:
         self._mask = current.mask
         self._latest = no_paraboloids(len(x))
         # How the reference of each match was seen last, and how far x is from its pixel.
-        self._warp = np.repeat(np.eye(2)[None], len(x), axis=0)
+        self._warp = np.repeat(np.eye(3, 2)[None], len(x), axis=0)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
         self._contrast: float | None = None
 
@@ -140,7 +140,7 @@ class DescriptorSurface:
         centres = np.rint(y - self._offset).astype(np.int64)
         usable = self._usable(centres, radius)
         anew = usable & (centres + self._offset != self._latest.centres).any(1)
-        self._warp[anew] = np.eye(2)
+        self._warp[anew] = np.eye(3, 2)
         pixels = np.rint(self.x).astype(np.int64)
         references = self._distances.reference(
             self._previous.tested, pixels[anew], self._contrast_around(centres, usable))
@@ -205,7 +205,7 @@ class DescriptorDistances:
     def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
         """
-        Descriptors (T, N) at whole pixels, or seen through a warp (N, 2, 2) at any points (N, 2).
+        Descriptors (T, N) at whole pixels, or seen through a warp (N, 3, 2) at any points (N, 2).
 
         contrast: that of the image which they are to be compared with. Raises ValueError where a
         point is too close to the border for a descriptor, and there is no warp.
@@ -227,14 +227,14 @@ class DescriptorDistances:
         Fit paraboloids to the distances in an image around y (N, 2), from references around x.
 
         References are taken between pixels, so that a minimum at y comes to lie on a whole pixel:
-        there a paraboloid fits without a bias. warp: (N, 2, 2) how they are seen at y.
+        there a paraboloid fits without a bias. warp: (N, 3, 2) how they are seen at y.
         """
         return self.around(self.shifted(there, x, y, warp, contrast), here, y, radius)
 
     def shifted(self, there: NDArray[Any], x: Array, y: Array, warp: Array,
                 contrast: float) -> NDArray[Any]:
         """Descriptors (T, N) next to x whose minima at y come to lie on whole pixels."""
-        back = times(inverses(warp), y - np.rint(y))
+        back = times(inverses(warp[:, :2]), y - np.rint(y))
         return self.reference(there, x - back, contrast, warp)
 
     def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
@@ -288,9 +288,10 @@ class PhotometricSurface:
         """
         Bilinear samples (N, P^2) of the window around each point, as it looks through a warp.
 
+        Of the warp the derivatives alone: over so small a window they hardly change.
         Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
         """
-        offsets = self._offsets.T if warp is None else inverses(warp) @ self._offsets.T
+        offsets = self._offsets.T if warp is None else inverses(warp[:, :2]) @ self._offsets.T
         places = np.moveaxis(points[:, :, None] + offsets, 1, 0)
         return np.asarray(map_coordinates(image, places[::-1], order=1, mode='nearest'))
 
@@ -326,8 +327,8 @@ def contrast_of(here: Array, there: Array) -> float:
 
 
 def comparable(warp: Array) -> NDArray[np.bool_]:
-    """(N,) bool mask of warps (N, 2, 2) through which a patch is still like itself."""
-    least, most = stretches(warp)
+    """(N,) bool mask of warps (N, 3, 2) through which a patch is still like itself."""
+    least, most = stretches(warp[:, :2])
     return np.asarray((least > 1 / _MOST_STRETCH) & (most < _MOST_STRETCH))
 
 

@@ -19,7 +19,6 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import (
     epipolar_lines,
-    facing,
     fundamental,
     growth,
     inverse_depths,
@@ -118,7 +117,7 @@ class Round:
     One round of Algorithm 1 on N matches, as an observer is shown it.
 
     keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
-    warp: (N, 2, 2) through which the reference patches were seen, None where they were not warped;
+    warp: (N, 3, 2) through which the reference patches were seen, None where they were not warped;
     pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
     """
 
@@ -354,10 +353,13 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
     plausible = (seen > 0) & comparable(warp)
-    t = facing(pose.R, pose.t, rays_x, rays_y) * pose.t
-    rho, sigma = inverse_depths(pose.R, t, rays_x, rays_y)
-    there = plausible & (rho > 0)
-    slopes = slopes_of_all(x[there], rho[there], TUNING.off / K[0, 0] * sigma[there])
-    leaning = warp[there] + slant_warp(K, t, y[there], seen[there], rho[there, None] * slopes)
-    warp[there] = np.where(comparable(leaning)[:, None, None], leaning, warp[there])
-    return np.where(plausible[:, None, None], warp, np.eye(2)), plausible
+    warp = np.where(plausible[:, None, None], warp, np.eye(3, 2))
+    # Neighbours tell how the surface leans that a patch is on.
+    there = np.flatnonzero(plausible)
+    x, y = x[there], y[there]
+    rho, sigma = inverse_depths(pose.R, pose.t, rays_x[there], rays_y[there])
+    slopes = slopes_of_all(x, rho, TUNING.off / K[0, 0] * sigma)
+    leaning = warp[there] + slant_warp(K, pose.t, y, seen[there], slopes)
+    alike = comparable(leaning)
+    warp[there[alike]] = leaning[alike]
+    return warp, plausible

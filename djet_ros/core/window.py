@@ -340,7 +340,7 @@ class Window:
             expected, self._images[newest].shape, radius)
         # One that neither of the last two frames saw is gone.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
-        warps = np.empty((len(landmarks), 2, 2))
+        warps = np.empty((len(landmarks), 3, 2))
         R, t = (motions[newest] for motions in self._poses.between())
         lean = landmarks.rho[:, None] * landmarks.slopes
         for anchor in np.unique(landmarks.anchors[wanted]):

@@ -142,7 +142,7 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
         # As the round saw it, in relation to whole pixels.
         ahead = step.keypoints[match] - np.rint(step.keypoints[match])
         reference = distances.reference(
-            trace.previous.tested, (x - np.linalg.solve(step.warp[match], ahead))[None],
+            trace.previous.tested, (x - np.linalg.solve(step.warp[match, :2], ahead))[None],
             warp=step.warp[[match]])
     surface = distances.surfaces(reference, trace.current.tested, centre[None], RADIUS)[:, :, 0]
     panels.draw_patch(axes, trace.current.gray, centre, RADIUS)
