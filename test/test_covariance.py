@@ -112,7 +112,7 @@ def test_minima_stay_where_they_are_when_their_keypoints_are_displaced_a_little(
     x = views[0].features.points
     y, seen = pair.project(x)
     x, y = x[seen], y[seen]
-    as_it_is = np.repeat(np.eye(2)[None], len(x), 0)
+    as_it_is = np.repeat(np.eye(3, 2)[None], len(x), 0)
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(5):

@@ -318,19 +318,22 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
     views = two_views(rng, 400)
     x, y, R, t = views.x, views.y, views.R, views.t
     surfaces, S = ellipses(rng, y, 0.3)
-    found = y + rng.normal(0, 0.2, y.shape)
+    # The shape of the second is half way from a circle to that of the first.
+    S = S / np.median(np.trace(S, axis1=1, axis2=2) / 2)
+    T = (np.eye(2) + S) / 2
+    found = y + 0.2 * (np.linalg.cholesky(T) @ rng.normal(size=(*y.shape, 1)))[..., 0]
     found[::40] += 30  # these were found elsewhere
     alone = jet_problem(K, x, surfaces)
     joined = with_places(alone, at(alone, R, t), K, found)
     # How exact each is, in pixels: from its distances to the true lines.
     lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
     normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    sigma = core_scale(((found - y) * normals).sum(1))
-    of_lines = np.sqrt(np.einsum('ni,nij,nj->n', normals, S, normals))
-    S = S * core_scale(((surfaces.centres - y) * normals).sum(1) / of_lines)**2
-    precision = np.linalg.inv(S) + np.eye(2) / (2 * sigma**2)
-    expected = np.linalg.solve(precision, (
-        np.linalg.solve(S, surfaces.centres[..., None]) + found[..., None] / (2 * sigma**2)))
+    S, T = (shape * core_scale(((at_places - y) * normals).sum(1) / np.sqrt(
+        np.einsum('ni,nij,nj->n', normals, shape, normals)))**2
+        for shape, at_places in ((S, surfaces.centres), (T, found)))
+    precision = np.linalg.inv(S) + np.linalg.inv(T)
+    expected = np.linalg.solve(precision, (np.linalg.solve(S, surfaces.centres[..., None])
+                                           + np.linalg.solve(T, found[..., None])))
     joined_at = (joined.rays_y.T @ K.T)[:, :2]
     together = np.linalg.norm(joined_at - expected[..., 0], axis=1) < 1e-6
     kept = np.linalg.norm(joined_at - surfaces.centres, axis=1) < 1e-6
@@ -339,7 +342,7 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
     # Covariances, but for their common unit, and for how much the noise seems to differ.
     C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
     apart = surfaces.centres - found
-    squared = (apart * np.linalg.solve(S + 2 * sigma**2 * np.eye(2), apart[..., None])[..., 0])
+    squared = (apart * np.linalg.solve(S + T, apart[..., None])[..., 0])
     ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.inv(precision), C))[together]
     assert np.ptp(ratio, axis=1).max() < 1e-6 * ratio.max()
     by_distance = ratio[np.argsort(squared.sum(1)[together]), 0]

@@ -26,7 +26,7 @@ _SIDES = (2 / 3, 3 / 2)
 _ALIKE = 3
 
 # Pixels; chosen: what an image's sampling, its lens and its rolling rows are good for.
-_SHIFT = 0.0125
+_SHIFT = 0.006
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.

@@ -74,8 +74,8 @@ class EstimatorConfig:
     weigh_by_fit: bool = parameter(
         True, 'take the noise of a match from what is left of its residual at its best place')
     join_matches: bool = parameter(
-        True, 'count where a match was found beside what its surface tells, each as exact as it '
-        'shows itself to be; never for rpe, which is that alone')
+        True, 'count where gray levels have each match beside what its surface tells, each as '
+        'exact as it shows itself to be; not for rpe, which is where matches were found alone')
     loss: str = parameter(
         'geman_mcclure', 'robust loss over matches',
         choices=('none', 'huber', 'cauchy', 'geman_mcclure'))

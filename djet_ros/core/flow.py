@@ -20,7 +20,7 @@ _WINDOW = 9
 # where they are not.
 NEAR, FAR = 2, 3
 
-# Steps at each level at most, and pixels of a step that is the last. Surfaces refine it: more of
+# Steps at each level at most, and pixels of a step that is the last. Patches refine it: more of
 # them add nothing.
 _STEPS, _LAST_STEP = 4, 0.1
 

@@ -31,7 +31,7 @@ _BLOCK = 2048
 _WARPED_BLOCK = 256
 
 # Pixels by which the farthest ends of tests may be off, for when driving, a warp's derivative will
-# do. All of a patch is off by a seventh of that, and a covariance takes four times as much for
+# do. All of a patch is off by a seventh of that, and a covariance takes twice as much for
 # granted (`covariance._SHIFT`).
 _BENT = 0.02
 
