@@ -114,8 +114,11 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
         views.append(estimator.view(frame.gray, frame.K))
     pairs = [estimator.estimate(*views[n:n + 2]) for n in range(len(ways))]
     doubtful = pairs[-2]
-    wrong = replace(doubtful, y_opt=doubtful.x + np.random.default_rng(1).permutation(
-        doubtful.y_opt - doubtful.x))
+    # What is far goes as far as what is near, and the other way round.
+    moved = doubtful.y_opt - doubtful.x
+    by_way = np.argsort(moved[:, 0], kind='stable')
+    moved[by_way] = moved[by_way[::-1]]
+    wrong = replace(doubtful, y_opt=doubtful.x + moved)
     found = []
     for pair in doubtful, wrong:
         scale.configure(ESTIMATOR, Unmeasured(), 0.05)

@@ -8,6 +8,7 @@ that ahead of a car. Once depths are known, so is the shape.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -19,7 +20,7 @@ from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
-Patches = NDArray[Any]
+Gray = NDArray[Any]
 
 # Pixels from the middle of a patch to its side.
 _RADIUS = 5
@@ -42,44 +43,52 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     the derivatives dy/dx, its first two rows, which must not be singular. By Gauss-Newton steps on
     the differences of gray levels under the slopes of the warped patch ("inverse compositional",
     Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
-    them. What would go far stays at y.
+    them. What would go far, or lies at the border, stays at y.
     """
     places, floating = y.copy(), there.astype(np.float32)
-    inside = np.flatnonzero(_within(here, y, _RADIUS + 1 + _FARTHEST))
 
     def refine(start: int) -> None:
-        block = inside[start:start + _BLOCK]
-        seen, began = _seen_through(warp[block], floating, x[block]), y[block]
-        exact = began
-        for _ in range(_STEPS):
-            step = seen.step(_between_pixels(here, exact, _RADIUS))
-            exact = np.clip(exact + step, began - _FARTHEST, began + _FARTHEST)
-        near = np.abs(exact - began).max(1) < _FARTHEST
-        places[block] = np.where(near[:, None], exact, began)
+        block = slice(start, start + _BLOCK)
+        places[block] = expect(floating, x[block], warp[block]).place(here, y[block])
 
-    each(refine, range(0, len(inside), _BLOCK))
+    each(refine, range(0, len(y), _BLOCK))
     return places
 
 
-class _Seen(NamedTuple):
+class Expected(NamedTuple):
     """
     N patches of P pixels as they are expected: what tells where they are.
 
-    slopes: along x and y, (P, N) float32 each, but for what a brighter or a more contrasty patch
+    slopes: (2, P, N) float32 along x and y, but for what a brighter patch or one of more contrast
     would look like; inverse: (N, 2, 2) of the sums of their products.
     """
 
-    slopes: tuple[Patches, Patches]
+    slopes: Gray
     inverse: Array
 
-    def step(self, gray: Patches) -> Array:
-        """Tell how far (N, 2) they are from where the image has gray levels (S, S, N)."""
-        gray = gray.reshape(self.slopes[0].shape)
-        return -times(self.inverse, _summed(*(slope * gray for slope in self.slopes)))
+    @classmethod
+    def together(cls, parts: Sequence[Expected]) -> Expected:
+        """Put patches of several images together."""
+        return cls(np.concatenate([one.slopes for one in parts], axis=2),
+                   np.concatenate([one.inverse for one in parts]))
+
+    def place(self, here: Image, y: Array) -> Array:
+        """Give where they are (N, 2) in an image, next to y (N, 2), see ``place_exactly``."""
+        margin = _RADIUS + 1 + _FARTHEST
+        inside = _within(here, y, margin)
+        # Those at the border are looked for elsewhere, to no end.
+        began = np.where(inside[:, None], y, margin)
+        places = began
+        for _ in range(_STEPS):
+            gray = _between_pixels(here, places, _RADIUS).reshape(self.slopes.shape[1:])
+            step = -times(self.inverse, (self.slopes * gray).sum(1).T.astype(float))
+            places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
+        near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
+        return np.where(near[:, None], places, y)
 
 
-def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
-    """Take the patches around points (N, 2) as they are seen through a warp (N, 3, 2)."""
+def expect(image: Gray, points: Array, warp: Array) -> Expected:
+    """Tell how patches around points (N, 2) of a float32 image look through a warp (N, 3, 2)."""
     side = 2 * _RADIUS + 3
     off = np.arange(side, dtype=np.float32) - _RADIUS - 1
     square = np.stack([np.tile(off, side), np.repeat(off, side)])
@@ -93,12 +102,12 @@ def _seen_through(warp: Array, image: Patches, points: Array) -> _Seen:
     gx, gy = (slope - (slope * gray).sum(0) / contrast * gray for slope in (
         _without_mean((wide[1:-1, 2:] - wide[1:-1, :-2]) / 2),
         _without_mean((wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2)))
-    xx, xy, yy = _summed(gx * gx, gx * gy, gy * gy).T
+    xx, xy, yy = (products.sum(0).astype(float) for products in (gx * gx, gx * gy, gy * gy))
     G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
-    return _Seen((gx, gy), inverses(G))
+    return Expected(np.stack([gx, gy]), inverses(G))
 
 
-def _between_pixels(image: Image, points: Array, radius: int) -> Patches:
+def _between_pixels(image: Image, points: Array, radius: int) -> Gray:
     """Interpolate patches (S, S, N) around points (N, 2), all of them within the image."""
     whole = np.floor(points).astype(np.int64)
     x, y = (points - whole).T.astype(np.float32)
@@ -114,12 +123,7 @@ def _within(image: Image, points: Array, margin: float) -> NDArray[np.bool_]:
     return np.asarray(((points >= margin) & (points <= upper)).all(1))
 
 
-def _summed(*values: Patches) -> Array:
-    """Sum up several (P, N) over the pixels, (N, V)."""
-    return np.stack([value.sum(0) for value in values], axis=1).astype(float)
-
-
-def _without_mean(patches: Patches) -> Patches:
+def _without_mean(patches: Gray) -> Gray:
     """Take patches (S, S, N), as (P, N), less their means."""
     patches = patches.reshape(-1, patches.shape[2])
     return np.asarray(patches - patches.mean(0))

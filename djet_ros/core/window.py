@@ -3,9 +3,10 @@ A window of frames and of the landmarks that they share: what ties the lengths o
 
 A landmark keeps the descriptor of the frame that saw it first, its anchor, and its inverse depth
 there. Each later frame samples the landmark's surface anew where pose and depth let it be
-expected, seen through the warp that they imply: nothing is detected again, so nothing wanders. The
-warp is that of a surface that leans as depths around the landmark say (`core.slants`): were all
-taken to face the camera, a road's places would be off by up to half a pixel, alike in all.
+expected, seen through the warp that they imply, and compares gray levels there: nothing is
+detected again, so nothing wanders. The warp is that of a surface that leans as depths around the
+landmark say (`core.slants`): were all taken to face the camera, a road's places would be off by up
+to half a pixel, alike in all.
 `djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
 what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
 al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015).
@@ -42,6 +43,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.jet import Loss
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
+from djet_ros.core.patches import expect, Expected
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
@@ -92,6 +94,8 @@ class WindowTuning:
     known: float = 0.15
     # pixels; chosen: what right matches are off, where surfaces are fitted to them
     off: float = 0.1
+    # pixels; chosen: what surfaces and gray levels are apart that tell the same place
+    agree: float = 0.5
     # chosen: inverse depth, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length
@@ -141,6 +145,7 @@ class Window:
     def start(self, view: View) -> None:
         """Forget everything; this frame is the first."""
         self._K, self._images, self._floating = view.K, [view.tested], [view.floating]
+        self._grays = [view.gray.astype(np.float32)]
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
@@ -283,6 +288,8 @@ class Window:
         self._has_landmarks.append(False)
         self._images.append(view.tested)
         self._floating.append(view.floating)
+        self._grays.append(view.gray.astype(np.float32))
+        self._here = view.gray
         self._mask = view.mask
         self._landmarks = self._landmarks.with_frame()
 
@@ -359,7 +366,8 @@ class Window:
         good = ~at(self._mask, close) & self._distances.describable(
             close, self._images[newest].shape, CLOSE // 2)
         mine = mine[good]
-        self._take(*self._around(mine, warps[mine], close[good], CLOSE // 2))
+        mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
+        self._take(mine, fits, self._exactly(mine, warps[mine], fits.minima()))
 
     def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
                 ) -> tuple[NDArray[np.int64], Paraboloids]:
@@ -386,13 +394,29 @@ class Window:
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 
-    def _take(self, mine: NDArray[np.int64], fits: Paraboloids) -> None:
-        """Take the minima of paraboloids as observations, and their curvatures as weights."""
-        minima = fits.minima()
+    def _exactly(self, mine: NDArray[np.int64], warps: Array, minima: Array) -> Array:
+        """
+        Join the minima (M, 2) of surfaces with where gray levels have landmarks (M,).
+
+        Both are about as exact as one another. What they do not agree on is left to the surface.
+        Landmarks come ordered by their anchors.
+        """
+        if not len(mine):
+            return minima
+        anchors, found = self._landmarks.anchors[mine], self._landmarks.found[mine]
+        expected = Expected.together([
+            expect(self._grays[anchor], found[anchors == anchor], warps[anchors == anchor])
+            for anchor in np.unique(anchors)])
+        apart = expected.place(self._here, minima) - minima
+        agree = (apart**2).sum(1) < self._tuning.agree**2
+        return np.asarray(minima + np.where(agree[:, None], apart / 2, 0.0))
+
+    def _take(self, mine: NDArray[np.int64], fits: Paraboloids, places: Array) -> None:
+        """Take places (M, 2) as observations, and the curvatures of paraboloids as weights."""
         # As in any least squares, what the best fit leaves over tells the noise.
-        left = np.maximum(fits.values(minima), 1e-3)
+        left = np.maximum(fits.values(fits.minima()), 1e-3)
         spread = fits.inverses * left[:, None, None]
-        self._landmarks.minima[mine, -1] = minima
+        self._landmarks.minima[mine, -1] = places
         self._landmarks.roots[mine, -1] = np.linalg.cholesky(
             np.linalg.inv(spread)).transpose(0, 2, 1)
         self._landmarks.seen[mine, -1] = True
@@ -476,7 +500,7 @@ class Window:
         self._landmarks = self._landmarks.without_frame(frame)
         self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
         lists: tuple[list[Any], ...] = (
-            self._images, self._floating, self._is_keyframe, self._has_landmarks)
+            self._images, self._floating, self._grays, self._is_keyframe, self._has_landmarks)
         for things in lists:
             del things[frame]
 
