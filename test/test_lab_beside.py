@@ -167,11 +167,14 @@ def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands(
 
 
 def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
-    scene = make_scene('traffic', 70, (620, 188))
-    results = gone(scene, scene.trajectory(16), 70, first=22)
-    # Nothing is left to stand still for.
-    assert Status.AMBIGUOUS in {result.status for result in results}
-    assert all(result.stationary for result in results if result.status in TRACKED)
+    seen = set()
+    for seed in (70, 71, 73):
+        scene = make_scene('traffic', seed, (620, 188))
+        results = gone(scene, scene.trajectory(16), seed, first=22)
+        assert all(result.stationary for result in results if result.status in TRACKED)
+        seen |= {result.status for result in results}
+    # In some image nothing was left to stand still for.
+    assert Status.AMBIGUOUS in seen
 
 
 @pytest.mark.parametrize(('axis', 'step'), [(0, 0.05), (2, 0.2)])
