@@ -215,11 +215,11 @@ def test_the_same_frames_give_the_same_scale_to_the_last_bit(cards):
         assert np.array_equal(one.pose_covariance, other.pose_covariance)
 
 
-def test_the_window_keeps_few_images(cards):
+def test_the_window_keeps_few_views(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12, yaw=0.004)] * 14)
     window = drive.odometry._one_scale._window
-    assert len(window._images) <= 7
+    assert len(window._views) <= 7
     assert len(window._landmarks) < 2000
     assert window.landmarks().shape[1] == 3
     assert (window.landmarks()[:, 2] > 0).mean() > 0.9

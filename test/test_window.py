@@ -77,7 +77,7 @@ class NumbersWindow(Window):
         return self.add(blank(), pair, 1.0).length
 
     def _measure(self) -> None:
-        found, newest = self._landmarks, len(self._images) - 1
+        found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
         wanted = seen[mine] & inside(projected(K, in_frame(K, self._poses, found, newest)))
@@ -100,7 +100,8 @@ def inside(places: Numbers) -> NDArray[np.bool_]:
 
 def blank() -> Any:
     image: Image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    return SimpleNamespace(K=K, gray=image, tested=image, floating=image, mask=None)
+    return SimpleNamespace(K=K, gray=image, gray_levels=image, tested=image, floating=image,
+                           mask=None)
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])
@@ -123,7 +124,7 @@ def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
         window.go()
         chosen.append(window.is_keyframe)
         held = min(sum(chosen[:-1]), TUNING.keyframes) + 1
-        assert len(window._images) == held
+        assert len(window._views) == held
     assert 5 < sum(chosen) < 25
 
 

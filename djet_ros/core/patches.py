@@ -25,6 +25,10 @@ Gray = NDArray[Any]
 # Pixels from the middle of a patch to its side.
 _RADIUS = 5
 
+# The side of a patch with what its slopes take beside it, and the offsets (2, P) of all of that.
+_SIDE = 2 * _RADIUS + 3
+_SQUARE = np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1).astype(np.float32) - (_RADIUS + 1)
+
 # Steps, and pixels that they come to at most: farther off is something else.
 _STEPS, _FARTHEST = 2, 1
 
@@ -35,17 +39,18 @@ _LEAST_SLOPE = 1e-3
 _BLOCK = 1024
 
 
-def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Array:
+def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> Array:
     """
     Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2), (N, 2).
 
+    there: (H, W), as float32 it need not be converted; here: (H, W) uint8;
     warp: (N, 3, 2) how they are seen there, see `geometry.patch_warp`; so small a patch needs but
     the derivatives dy/dx, its first two rows, which must not be singular. By Gauss-Newton steps on
     the differences of gray levels under the slopes of the warped patch ("inverse compositional",
     Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
     them. What would go far, or lies at the border, stays at y.
     """
-    places, floating = y.copy(), there.astype(np.float32)
+    places, floating = y.copy(), there.astype(np.float32, copy=False)
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
@@ -75,7 +80,7 @@ class Expected(NamedTuple):
     def place(self, here: Image, y: Array) -> Array:
         """Give where they are (N, 2) in an image, next to y (N, 2), see ``place_exactly``."""
         margin = _RADIUS + 1 + _FARTHEST
-        inside = _within(here, y, margin)
+        inside = within(y, here.shape, margin)
         # Those at the border are looked for elsewhere, to no end.
         began = np.where(inside[:, None], y, margin)
         places = began
@@ -89,14 +94,11 @@ class Expected(NamedTuple):
 
 def expect(image: Gray, points: Array, warp: Array) -> Expected:
     """Tell how patches around points (N, 2) of a float32 image look through a warp (N, 3, 2)."""
-    side = 2 * _RADIUS + 3
-    off = np.arange(side, dtype=np.float32) - _RADIUS - 1
-    square = np.stack([np.tile(off, side), np.repeat(off, side)])
     back = inverses(warp[:, :2]).astype(np.float32)
-    x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ square for axis in (0, 1))
+    x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
     by_point = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-    wide = np.asarray(cv2.transpose(by_point)).reshape(side, side, -1)
+    wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)
     gray = _without_mean(wide[1:-1, 1:-1])
     contrast = (gray * gray).sum(0) + _LEAST_SLOPE
     gx, gy = (slope - (slope * gray).sum(0) / contrast * gray for slope in (
@@ -117,9 +119,9 @@ def _between_pixels(image: Image, points: Array, radius: int) -> Gray:
     return np.asarray(rows[:, :-1] + x * (rows[:, 1:] - rows[:, :-1]))
 
 
-def _within(image: Image, points: Array, margin: float) -> NDArray[np.bool_]:
-    """(N,) bool mask of the points at least so far from the border."""
-    upper = np.array(image.shape[::-1]) - 1 - margin
+def within(points: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+    """(N,) bool mask of the points (N, 2) at least so far from the border of an image."""
+    upper = np.array([shape[1], shape[0]]) - 1 - margin
     return np.asarray(((points >= margin) & (points <= upper)).all(1))
 
 

@@ -34,7 +34,7 @@ from djet_ros.core.paraboloid import (
     project_to_positive,
     times,
 )
-from djet_ros.core.patches import place_exactly
+from djet_ros.core.patches import place_exactly, within
 from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -92,7 +92,19 @@ class ResidualSurface(Protocol):
         ...
 
 
-class DescriptorSurface:
+class _OfImages:
+    """What surfaces of two images share: gray levels tell places too, in unsmoothed patches."""
+
+    def __init__(self, previous: View, current: View, x: Array) -> None:
+        self.x = x
+        self._there, self._here = previous.gray_levels, current.gray
+
+    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+        """Places (M, 2) by gray levels."""
+        return place_exactly(self._there, self._here, self.x[chosen], y[chosen], warp[chosen])
+
+
+class DescriptorSurface(_OfImages):
     """
     Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET).
 
@@ -103,9 +115,9 @@ class DescriptorSurface:
     """
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
-        self.x, self._config = x, config
+        super().__init__(previous, current, x)
+        self._config = config
         self._distances = DescriptorDistances(config)
-        self._grays = previous.gray, current.gray
         self._previous, self._current = previous, current.tested
         self._has_reference = (self._distances.describable(x, previous.tested.shape)
                                & ~at(previous.mask, x))
@@ -129,10 +141,6 @@ class DescriptorSurface:
         return self._kept(anew, usable, y, self._distances.between_pixels(
             self._previous.floating, self.x[anew], self._current, y[anew], warp[anew],
             self._contrast_around(y, usable), CLOSE // 2))
-
-    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
-        """Places (M, 2) by gray levels."""
-        return place_exactly(*self._grays, self.x[chosen], y[chosen], warp[chosen])
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit them with the references of whole pixels, as the paper does."""
@@ -245,15 +253,15 @@ class DescriptorDistances:
             fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))
 
 
-class PhotometricSurface:
+class PhotometricSurface(_OfImages):
     """Lucas-Kanade residual with structure tensor A' and a weight window (P-JET)."""
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
+        super().__init__(previous, current, x)
         radius = config.window // 2
         steps = np.arange(-radius, radius + 1, dtype=np.float32)
         offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         self._radius, self._offsets = radius, offsets
-        self._grays = previous.gray, current.gray
         self._weights = _weight_window(offsets, config.window_sigma)
         self._image = current.smoothed.astype(np.float32)
         self._gradient = [
@@ -263,7 +271,6 @@ class PhotometricSurface:
         self._reference = self._sample(self._previous, x)
         self._has_reference = self._inside(x, previous.smoothed.shape) & ~at(previous.mask, x)
         self._mask = current.mask
-        self.x = x
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
@@ -279,10 +286,6 @@ class PhotometricSurface:
         usable = self._has_reference & self._inside(y, self._image.shape) & ~at(self._mask, y)
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
-    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
-        """Places (M, 2) by gray levels, in smaller patches that are not smoothed."""
-        return place_exactly(*self._grays, self.x[chosen], y[chosen], warp[chosen])
-
     def _sample(self, image: NDArray[np.float32], points: Array,
                 warp: Array | None = None) -> NDArray[np.float32]:
         """
@@ -296,9 +299,7 @@ class PhotometricSurface:
         return np.asarray(map_coordinates(image, places[::-1], order=1, mode='nearest'))
 
     def _inside(self, points: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        margin = self._radius + 1
-        upper = np.array([shape[1], shape[0]]) - 1 - margin
-        return np.asarray(((points >= margin) & (points <= upper)).all(1))
+        return within(points, shape, self._radius + 1)
 
 
 class ReprojectionSurface:

@@ -96,6 +96,11 @@ class View:
         """Give `tested` as places between pixels are read from it; converted once for all."""
         return self.tested.astype(np.float32)
 
+    @cached_property
+    def gray_levels(self) -> NDArray[np.float32]:
+        """Give `gray` in the same way."""
+        return self.gray.astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Pose:

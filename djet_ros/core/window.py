@@ -144,8 +144,7 @@ class Window:
 
     def start(self, view: View) -> None:
         """Forget everything; this frame is the first."""
-        self._K, self._images, self._floating = view.K, [view.tested], [view.floating]
-        self._grays = [view.gray.astype(np.float32)]
+        self._K, self._views = view.K, [view]
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
@@ -156,7 +155,7 @@ class Window:
     @property
     def is_new(self) -> bool:
         """Whether there is one frame alone, so that the next pair makes the unit."""
-        return len(self._images) == 1
+        return len(self._views) == 1
 
     @property
     def is_keyframe(self) -> bool:
@@ -184,8 +183,8 @@ class Window:
         if first:  # by definition
             addition = replace(addition, length=length)
         # What is no keyframe goes, and so does the oldest where there are too many.
-        if len(self._images) > 2 and not self._is_keyframe[-2]:
-            self._forget(len(self._images) - 2)
+        if len(self._views) > 2 and not self._is_keyframe[-2]:
+            self._forget(len(self._views) - 2)
         self.settled = np.empty((0, 3))
         if sum(self._is_keyframe) > self._tuning.keyframes:
             self.settled = self._places(self._landmarks.anchors == 0)
@@ -203,7 +202,7 @@ class Window:
         """Places (M, 3), in the newest frame, of those of some landmarks (N,) that are sure."""
         sure = self._landmarks.of(np.asarray(
             chosen & (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
-        places = in_frame(self._K, self._poses, sure, len(self._images) - 1)
+        places = in_frame(self._K, self._poses, sure, len(self._views) - 1)
         return np.asarray(places / sure.rho[:, None])
 
     def _length(self, relative: RelativePose, guess: float) -> float:
@@ -226,7 +225,7 @@ class Window:
         before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
         if not len(before) or not len(x):
             return np.empty(0), np.empty(0, np.int64)
-        places = in_frame(self._K, self._poses, before, len(self._images) - 1)
+        places = in_frame(self._K, self._poses, before, len(self._views) - 1)
         away, match = cKDTree(x).query(projected(self._K, places),
                                        distance_upper_bound=self._tuning.beside)
         near = np.isfinite(away) & (places[:, 2] > 0)
@@ -266,7 +265,7 @@ class Window:
         """
         if self._is_keyframe[-1]:
             return
-        newest = len(self._images) - 1
+        newest = len(self._views) - 1
         last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
         here = self._landmarks.of(self._landmarks.seen[:, newest])
         few = len(here) < (1 - self._tuning.gone) * self._tuning.landmarks
@@ -286,11 +285,7 @@ class Window:
         # The second frame stays, for the unit is told by it.
         self._is_keyframe.append(self.is_new)
         self._has_landmarks.append(False)
-        self._images.append(view.tested)
-        self._floating.append(view.floating)
-        self._grays.append(view.gray.astype(np.float32))
-        self._here = view.gray
-        self._mask = view.mask
+        self._views.append(view)
         self._landmarks = self._landmarks.with_frame()
 
     def _add_pair(self, relative: RelativePose, length: float, first: bool) -> None:
@@ -315,17 +310,17 @@ class Window:
 
     def _found(self, relative: RelativePose, length: float) -> None:
         """Make landmarks of the matches of a keyframe with the frame after it."""
-        tuning, anchor = self._tuning, len(self._images) - 2
+        tuning, anchor = self._tuning, len(self._views) - 2
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
         rho, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
         ahead, off = rho > 0, tuning.off / self._K[0, 0] * sigma
         surfaces = x[ahead], rho[ahead], off[ahead]
-        usable = (rho > 0) & self._distances.describable(x, self._images[anchor].shape)
+        usable = (rho > 0) & self._distances.describable(x, self._views[anchor].tested.shape)
         x, rho = x[usable], rho[usable]
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
         present = projected(self._K, in_frame(self._K, self._poses, here, anchor))
-        side = tuning.cell * np.sqrt(self._images[anchor].size / tuning.landmarks)
+        side = tuning.cell * np.sqrt(self._views[anchor].tested.size / tuning.landmarks)
         # Near ones tell most, but by their own noisy depths those would be chosen that err most,
         # and each step come out shorter: by 6 % in 300 small pictures. Others tell where is near.
         nearest = np.argsort(-np.floor(_around_patches(x, np.log2(rho)) / tuning.classes),
@@ -334,17 +329,18 @@ class Window:
         chosen = _spread(x, present, side, tuning.landmarks - len(here))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
-            x, rho / length, anchor, len(self._images), slopes(*surfaces, x),
-            self._distances.strengths(self._images[anchor], np.rint(x).astype(np.int64))))
+            x, rho / length, anchor, len(self._views), slopes(*surfaces, x),
+            self._distances.strengths(self._views[anchor].tested, np.rint(x).astype(np.int64))))
 
     def _measure(self) -> None:
         """Sample the surfaces of landmarks in the newest frame, where they are expected."""
-        landmarks, newest = self._landmarks, len(self._images) - 1
+        landmarks, newest = self._landmarks, len(self._views) - 1
         places = in_frame(self._K, self._poses, landmarks, newest)
         expected = projected(self._K, places)
         radius = self._config.window // 2
-        wanted = (places[:, 2] > 0) & ~at(self._mask, expected) & self._distances.describable(
-            expected, self._images[newest].shape, radius)
+        here = self._views[newest]
+        wanted = (places[:, 2] > 0) & ~at(here.mask, expected) & self._distances.describable(
+            expected, here.tested.shape, radius)
         # One that neither of the last two frames saw is gone.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
         warps = np.empty((len(landmarks), 3, 2))
@@ -363,8 +359,8 @@ class Window:
         # expected. Close ones around it do not.
         mine, fits = self._around(mine, warps[mine], expected[mine], radius)
         close = fits.minima()
-        good = ~at(self._mask, close) & self._distances.describable(
-            close, self._images[newest].shape, CLOSE // 2)
+        good = ~at(here.mask, close) & self._distances.describable(
+            close, here.tested.shape, CLOSE // 2)
         mine = mine[good]
         mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
         self._take(mine, fits, self._exactly(mine, warps[mine], fits.minima()))
@@ -379,7 +375,7 @@ class Window:
         """
         if not len(mine):
             return mine, no_paraboloids(0)
-        anchors, here = self._landmarks.anchors[mine], self._images[-1]
+        anchors, here = self._landmarks.anchors[mine], self._views[-1].tested
         found, references = self._landmarks.found[mine], []
         # Of where they are sampled: that of where they were expected would bend the scale.
         strengths = self._distances.strengths(here, np.rint(places).astype(np.int64))
@@ -388,7 +384,7 @@ class Window:
             some = anchors == anchor
             contrast = contrast_of(strengths[some], were[some])
             references.append(self._distances.shifted(
-                self._floating[anchor], found[some], places[some], warps[some], contrast))
+                self._views[anchor].floating, found[some], places[some], warps[some], contrast))
         fits, _ = with_minimum(self._distances.around(
             np.concatenate(references, axis=1), here, places, radius), 'drop')
         good = fits.usable & fits.minimum_within(radius)
@@ -405,9 +401,9 @@ class Window:
             return minima
         anchors, found = self._landmarks.anchors[mine], self._landmarks.found[mine]
         expected = Expected.together([
-            expect(self._grays[anchor], found[anchors == anchor], warps[anchors == anchor])
-            for anchor in np.unique(anchors)])
-        apart = expected.place(self._here, minima) - minima
+            expect(self._views[anchor].gray_levels, found[some], warps[some])
+            for anchor in np.unique(anchors) for some in (anchors == anchor,)])
+        apart = expected.place(self._views[-1].gray, minima) - minima
         agree = (apart**2).sum(1) < self._tuning.agree**2
         return np.asarray(minima + np.where(agree[:, None], apart / 2, 0.0))
 
@@ -470,7 +466,7 @@ class Window:
         _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
             (observed.residuals**2).sum(1))
         weight = self._scale**-2
-        return eliminate(observed, weights * weight, weight, len(self._images))
+        return eliminate(observed, weights * weight, weight, len(self._views))
 
     def _addition(self, H: Array) -> Addition:
         """Read the newest motion off the window, and how sure its length is."""
@@ -500,7 +496,7 @@ class Window:
         self._landmarks = self._landmarks.without_frame(frame)
         self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
         lists: tuple[list[Any], ...] = (
-            self._images, self._floating, self._grays, self._is_keyframe, self._has_landmarks)
+            self._views, self._is_keyframe, self._has_landmarks)
         for things in lists:
             del things[frame]
 

@@ -66,7 +66,7 @@ class RosPublisher:
 
 
 class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
-    """Leaves messages in the middleware for as long as nobody is ready to take them."""
+    """Leaves messages and events in the middleware for as long as nobody is ready for them."""
 
     def __init__(self, ready: Callable[[], bool]) -> None:
         super().__init__()
@@ -75,16 +75,6 @@ class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
     def can_execute(self, entity: Any) -> bool:
         """Tell the executor whether to look for messages, and to hand one out."""
         return self._ready() and bool(super().can_execute(entity))
-
-
-class _NowAndThen(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
-    """Leaves events in the middleware for as long as nobody looks for them."""
-
-    looked_for = False
-
-    def can_execute(self, entity: Any) -> bool:
-        """Tell the executor whether to look for events."""
-        return self.looked_for and bool(super().can_execute(entity))
 
 
 class RosSubscription:
@@ -136,7 +126,8 @@ class RosMiddleware:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._frames: Any = None
-        self._events, self._last_look = _NowAndThen(), -float('inf')
+        self._looks, self._last_look = False, -float('inf')
+        self._events = _WhenReady(lambda: self._looks)
 
     @property
     def node(self) -> str:
@@ -216,8 +207,8 @@ class RosMiddleware:
 
     def spin(self, seconds: float) -> None:
         """Wait for something to do, at most for some time, and do it."""
-        self._events.looked_for = monotonic() - self._last_look >= _EVENTS_PERIOD
-        if self._events.looked_for:
+        self._looks = monotonic() - self._last_look >= _EVENTS_PERIOD
+        if self._looks:
             self._last_look = monotonic()
         self._executor.spin_once(timeout_sec=seconds)
 
