@@ -18,6 +18,7 @@ from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Gray = NDArray[Any]
@@ -25,9 +26,11 @@ Gray = NDArray[Any]
 # Pixels from the middle of a patch to its side.
 _RADIUS = 5
 
-# The side of a patch with what its slopes take beside it, and the offsets (2, P) of all of that.
+# The side of a patch with what its slopes take beside it, and the offsets of all of that with a
+# one, (3, P).
 _SIDE = 2 * _RADIUS + 3
-_SQUARE = np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1).astype(np.float32) - (_RADIUS + 1)
+_SQUARE = np.concatenate([np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1) - (_RADIUS + 1),
+                          np.ones((1, _SIDE**2))]).astype(np.float32)
 
 # Steps, and pixels that they come to at most: farther off is something else.
 _STEPS, _FARTHEST = 2, 1
@@ -83,10 +86,17 @@ class Expected(NamedTuple):
         inside = within(y, here.shape, margin)
         # Those at the border are looked for elsewhere, to no end.
         began = np.where(inside[:, None], y, margin)
-        places = began
+        places, whole = began, np.floor(began)
+        products = _products(self.slopes, here, whole)
         for _ in range(_STEPS):
-            gray = _between_pixels(here, places, _RADIUS).reshape(self.slopes.shape[1:])
-            step = -times(self.inverse, (self.slopes * gray).sum(1).T.astype(float))
+            # Few cross over to other pixels.
+            across = np.flatnonzero((np.floor(places) != whole).any(1))
+            if len(across):
+                whole[across] = np.floor(places[across])
+                # Points last in memory too, which indexing does not give.
+                slopes = self.slopes.take(across, axis=2)
+                products[..., across] = _products(slopes, here, whole[across])
+            step = -times(self.inverse, _between(products, places - whole).T)
             places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
         near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
         return np.where(near[:, None], places, y)
@@ -94,38 +104,49 @@ class Expected(NamedTuple):
 
 def expect(image: Gray, points: Array, warp: Array) -> Expected:
     """Tell how patches around points (N, 2) of a float32 image look through a warp (N, 3, 2)."""
-    back = inverses(warp[:, :2]).astype(np.float32)
-    x, y = (points[:, axis, None].astype(np.float32) + back[:, axis] @ _SQUARE for axis in (0, 1))
+    back = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2, dtype=np.float32)
+    x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
     by_point = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)
-    gray = _without_mean(wide[1:-1, 1:-1])
-    contrast = (gray * gray).sum(0) + _LEAST_SLOPE
-    gx, gy = (slope - (slope * gray).sum(0) / contrast * gray for slope in (
-        _without_mean((wide[1:-1, 2:] - wide[1:-1, :-2]) / 2),
-        _without_mean((wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2)))
-    xx, xy, yy = (products.sum(0).astype(float) for products in (gx * gx, gx * gy, gy * gy))
+    middle = wide[1:-1, 1:-1]
+    gray = (middle - middle.mean((0, 1))).reshape(-1, len(points))
+    slopes = np.empty((2, *middle.shape), np.float32)
+    np.subtract(wide[1:-1, 2:], wide[1:-1, :-2], out=slopes[0])
+    np.subtract(wide[2:, 1:-1], wide[:-2, 1:-1], out=slopes[1])
+    slopes = slopes.reshape(2, *gray.shape)
+    slopes *= np.float32(0.5)
+    contrast = np.einsum('pn,pn->n', gray, gray) + _LEAST_SLOPE
+    slopes -= (np.einsum('kpn,pn->kn', slopes, gray) / contrast)[:, None] * gray
+    slopes -= slopes.mean(1, keepdims=True)
+    xx, xy, yy = (np.einsum('pn,pn->n', slopes[one], slopes[other]).astype(float)
+                  for one, other in ((0, 0), (0, 1), (1, 1)))
     G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
-    return Expected(np.stack([gx, gy]), inverses(G))
+    return Expected(slopes, inverses(G))
 
 
-def _between_pixels(image: Image, points: Array, radius: int) -> Gray:
-    """Interpolate patches (S, S, N) around points (N, 2), all of them within the image."""
-    whole = np.floor(points).astype(np.int64)
-    x, y = (points - whole).T.astype(np.float32)
+def _products(slopes: Gray, image: Image, whole: Array) -> Gray:
+    """
+    Sum up products (2, 2, 2, N) of slopes (2, P, N) and the patches of an image at four pixels.
+
+    whole: (N, 2) the first of two pixels each way, rows first. What lies between pixels is as
+    linear in them as the image is.
+    """
+    side = 2 * _RADIUS + 1
     # One row and column more than is wanted, on the far side.
-    patches = gather_patches(image, whole, radius + 1)[1:, 1:].astype(np.float32)
-    rows = patches[:-1] + y * (patches[1:] - patches[:-1])
-    return np.asarray(rows[:, :-1] + x * (rows[:, 1:] - rows[:, :-1]))
+    patches = gather_patches(image, whole.astype(np.int64), _RADIUS + 1)[1:, 1:]
+    four = sliding_window_view(patches.astype(np.float32), (side, side), axis=(0, 1))
+    return np.asarray(np.einsum('kyxn,ijnyx->ijkn', slopes.reshape(2, side, side, -1), four))
+
+
+def _between(products: Gray, part: Array) -> Array:
+    """Interpolate (2, 2, 2, N) at pixels, rows first, by parts (N, 2) of the way; (2, N)."""
+    x, y = part.T
+    rows = products[0] + y * (products[1] - products[0])
+    return np.asarray(rows[0] + x * (rows[1] - rows[0]))
 
 
 def within(points: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
     """(N,) bool mask of the points (N, 2) at least so far from the border of an image."""
     upper = np.array([shape[1], shape[0]]) - 1 - margin
     return np.asarray(((points >= margin) & (points <= upper)).all(1))
-
-
-def _without_mean(patches: Gray) -> Gray:
-    """Take patches (S, S, N), as (P, N), less their means."""
-    patches = patches.reshape(-1, patches.shape[2])
-    return np.asarray(patches - patches.mean(0))
