@@ -24,4 +24,6 @@ def rank_in_cells(cells: NDArray[Any]) -> NDArray[np.int64]:
 
 def beginnings(ordered: NDArray[Any]) -> NDArray[np.int64]:
     """Give the indices at which another number begins among ordered ones (N,)."""
-    return np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1))
+    begins = np.ones(len(ordered), bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=begins[1:])
+    return np.flatnonzero(begins)

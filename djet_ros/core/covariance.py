@@ -41,6 +41,10 @@ UNKNOWN = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 # Of what is known in a direction of the pose, the matches of one cell may make up all but this.
 _LEAST_SUPPORT = 1e-6
 
+# Where the upper triangle of a (5, 5) has its entries, and which of them stands at each of all 25.
+_UPPER = np.triu_indices(5)
+_WHOLE = [i * (9 - i) // 2 + j for i, j in map(sorted, np.ndindex(5, 5))]
+
 # chosen: share of a cell, summed over the five directions, from which on it is looked at closely.
 _WEIGHTY = 0.9
 
@@ -74,16 +78,17 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return UNKNOWN
+    inverse = np.asarray(np.linalg.inv(H))
     cells = _Cells.of(places, J, weights, residuals.r)
-    small_cells = _jackknife(H, cells.H, cells.gradients)
+    small_cells = _jackknife(H, inverse, cells)
     large = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
-    *sums, pull = cells.in_larger(large)
-    large_cells = _jackknife(H, *sums)
+    larger = cells.in_larger(large)
+    large_cells = _jackknife(H, inverse, larger)
     if small_cells is None or large_cells is None:
         return UNKNOWN
-    correlated = _correlated(H, cells, small_cells, large_cells, large)
+    correlated = _correlated(H, inverse, cells, small_cells, large_cells, large)
     freedoms = 1 + 5 * _ALIKE / len(cells.places)
-    shifts = _SHIFT * np.linalg.solve(H, pull.T)
+    shifts = _SHIFT * inverse @ larger.pulls
     covariance = freedoms * (correlated / flattening)**2 * small_cells + shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
@@ -97,34 +102,51 @@ class _Cells(NamedTuple):
     """
     What the matches of C cells tell together.
 
-    places: (C, 2) middles of the cells; H: (C, 5, 5), gradients: (C, 5) of their loss; pulls:
-    (C, 5) how the gradient changes where all residuals of a cell grow alike.
+    places: (C, 2) middles of the cells; sums: (25, C), one row after the other the upper triangle
+    of H (5, 5) of their loss, its gradient (5,), and how that changes where all residuals of a
+    cell grow alike (5,).
     """
 
     places: Array
-    H: Array
-    gradients: Array
-    pulls: Array
+    sums: Array
 
     @classmethod
     def of(cls, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
         """Sum matches at pixels (N, 2) by small cells, with their J (5, N), weights and r (N,)."""
+        order, first = _by_cell(places, CELL)
+        J, weights, r = J[:, order], weights[order], r[order]
         weighed = J * weights
-        *sums, middles, count = summed_by_cell(
-            places, J[:, None] * weighed, J * (weights * r), weighed,
-            ((places // CELL + 0.5) * CELL).T, np.ones(len(places)))
-        return cls(middles / count[:, None], *sums)
+        rows, columns = _UPPER
+        terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed])
+        return cls((places[order[first]] // CELL + 0.5) * CELL,
+                   np.add.reduceat(terms, first, axis=1))
 
-    def in_larger(self, side: float) -> list[Array]:
-        """Sum H, gradients and pulls by larger cells, each made of whole small ones."""
-        return summed_by_cell(self.places, *(np.moveaxis(each, 0, -1) for each in self[1:]),
-                              side=side)
+    def in_larger(self, side: float) -> _Cells:
+        """Give larger cells, each made of whole small ones; places are those of one of them."""
+        order, first = _by_cell(self.places, side)
+        return _Cells(self.places[order[first]],
+                      np.add.reduceat(self.sums[:, order], first, axis=1))
+
+    @property
+    def H(self) -> Array:
+        """Give (C, 5, 5)."""
+        return self.sums[_WHOLE].T.reshape(-1, 5, 5)
+
+    @property
+    def gradients(self) -> Array:
+        """Give (5, C)."""
+        return self.sums[-10:-5]
+
+    @property
+    def pulls(self) -> Array:
+        """Give (5, C)."""
+        return self.sums[-5:]
 
 
-def _correlated(H: Array, cells: _Cells, small_cells: Array, large_cells: Array,
+def _correlated(H: Array, inverse: Array, cells: _Cells, small_cells: Array, large_cells: Array,
                 large: float) -> float:
     """Give q of `pose_covariance`, by large cells of a side in pixels and by others still."""
-    others = (_jackknife(H, *cells.in_larger(side)[:2])
+    others = (_jackknife(H, inverse, cells.in_larger(side))
               for side in (2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
     # Exact matches leave no noise at all.
     noise = small_cells + _LEAST_VARIANCE * np.eye(5)
@@ -166,38 +188,42 @@ def lift(tangents: Array) -> Array:
     return lifted
 
 
-def _jackknife(H: Array, H_cells: Array, gradients: Array) -> Array | None:
+def _jackknife(H: Array, inverse: Array, cells: _Cells) -> Array | None:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
-    H: (5, 5) of all; H_cells, gradients: (C, 5, 5), (C, 5) of each cell. A delete-a-group
-    jackknife, to first order (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide
-    about a direction, their moves say little; so the mean is taken of the moves that are seen and
-    of those that noise would make, which are large there, at the size that has the seen ones on
-    average. None where cells are too few, or one alone decides.
+    H, inverse: (5, 5) of all. A delete-a-group jackknife, to first order (Bell and McCaffrey,
+    Survey Methodology 2002). Where few cells decide about a direction, their moves say little; so
+    the mean is taken of the moves that are seen and of those that noise would make, which are
+    large there, at the size that has the seen ones on average. None where cells are too few, or
+    one alone decides.
     """
-    cells = len(gradients)
-    if cells <= 5:  # so many are gone with the pose's own freedom
+    count, H_cells = len(cells.places), cells.H
+    if count <= 5:  # so many are gone with the pose's own freedom
         return None
     # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
-    inverse = np.linalg.inv(H)
-    weighty = H_cells[np.einsum('ij,cij->c', inverse, H_cells) > _WEIGHTY]
-    whitening = np.linalg.inv(np.linalg.cholesky(H))
-    if (np.linalg.eigvalsh(whitening @ weighty @ whitening.T) > 1 - _LEAST_SUPPORT).any():
-        return None
+    weighty = H_cells[H_cells.reshape(-1, 25) @ inverse.ravel() > _WEIGHTY]
+    if len(weighty):
+        whitening = np.linalg.inv(np.linalg.cholesky(H))
+        if (np.linalg.eigvalsh(whitening @ weighty @ whitening.T) > 1 - _LEAST_SUPPORT).any():
+            return None
     without = np.linalg.inv(H - H_cells)
-    moves = (without @ gradients[:, :, None])[:, :, 0]
-    seen = moves.T @ moves
-    by_noise = (without - inverse).sum(0)
+    moves = np.einsum('cij,jc->ic', without, cells.gradients)
+    seen = moves @ moves.T
+    by_noise = without.sum(0) - count * inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    return np.asarray((1 - 1 / cells) * (seen + by_noise) / 2)
+    return np.asarray((1 - 1 / count) * (seen + by_noise) / 2)
 
 
-def summed_by_cell(places: Array, *values: Array, side: float = CELL) -> list[Array]:
-    """Sum values (..., N) over the C cells of the image that have matches; each (C, ...)."""
-    cells: NDArray[np.int64] = (places // side).astype(np.int64)
-    cell = cells[:, 0] * 2**32 + cells[:, 1]
+def summed_by_cell(places: Array, values: Array) -> Array:
+    """Sum values (V, N) of matches at pixels (N, 2) over the C small cells in use, (V, C)."""
+    order, first = _by_cell(places, CELL)
+    return np.asarray(np.add.reduceat(values[:, order], first, axis=1))
+
+
+def _by_cell(places: Array, side: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give the order of points (N, 2) by cells of a side, and where each cell begins in that."""
+    columns, rows = np.floor(places / side).astype(np.int64).T
+    cell = columns * 2**32 + rows
     order = np.argsort(cell, kind='stable')
-    first = beginnings(cell[order])
-    return [np.moveaxis(np.add.reduceat(value[..., order], first, axis=-1), -1, 0)
-            for value in values]
+    return order, beginnings(cell[order])

@@ -112,8 +112,8 @@ def preferences(losses: Array, places: Array, chosen: int) -> Array:
 
     The probability that a pose preferred by z is the wrong one is Phi(-z) at most.
     """
-    by_cell, = summed_by_cell(places, losses - losses[chosen])
-    return np.asarray(by_cell.sum(0) / np.sqrt(np.maximum((by_cell**2).sum(0), 1e-300)))
+    by_cell = summed_by_cell(places, losses - losses[chosen])
+    return np.asarray(by_cell.sum(1) / np.sqrt(np.maximum((by_cell**2).sum(1), 1e-300)))
 
 
 def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> list[Pose]:
