@@ -31,7 +31,7 @@ _BLOCK = 3
 _LEAST_RATIO = 0.1
 
 # Rows of blocks that are looked at at once.
-_STRIP = 32
+_STRIP = 64
 
 # Corners are the strongest of all that are so near, in each second pixel each way: those of the
 # wider surroundings come first, and the others where there are not enough.
@@ -88,10 +88,13 @@ def _slopes_of_rows(image: Image, first: int, after: int) -> NDArray[np.float32]
     # With the rows that are next to them, and those that these take their slopes from.
     start, end = max(first - 1, 0), min(after + 1, len(image) // 2)
     top = max(2 * start - 1, 0)
-    dx, dy = (slope[2 * start - top:2 * end - top]
+    dx, dy = (slope[2 * start - top:2 * end - top].astype(np.float32)
               for slope in cv2.spatialGradient(image[top:2 * end + 1]))
-    xx, xy, yy = (_over_block(cv2.multiply(a, b, dtype=cv2.CV_32F))[first - start:after - start]
-                  for a, b in ((dx, dx), (dx, dy), (dy, dy)))
+    both = dx * dy
+    dx *= dx
+    dy *= dy
+    xx, xy, yy = (_over_block(products)[first - start:after - start]
+                  for products in (dx, both, dy))
     trace = xx + yy
     # Not by cv2.magnitude: its last bit depends on where in memory the arrays lie.
     xx -= yy
@@ -101,7 +104,8 @@ def _slopes_of_rows(image: Image, first: int, after: int) -> NDArray[np.float32]
     xx += xy
     spread = np.sqrt(xx, out=xx)
     least, most = trace - spread, trace + spread
-    least *= least >= np.float32(_LEAST_RATIO) * most
+    most *= np.float32(_LEAST_RATIO)
+    np.copyto(least, 0, where=least < most)
     least *= np.float32(0.5 / _SOBEL**2)
     return np.asarray(least, np.float32)
 
@@ -120,11 +124,25 @@ def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int,
 
     first: (N,) bool mask of points that come before all others.
     """
-    by_strength = np.argsort(-strengths, kind='stable')
-    (columns, rows), late = points[by_strength].T // _CELL, ~first[by_strength]
+    by_strength = _strongest_first(strengths)
+    columns, rows = (points[by_strength, axis] // _CELL for axis in (0, 1))
+    late = ~first[by_strength]
     rank = rank_in_cells(_short((rows * (columns.max(initial=0) + 1) + columns) * 2 + late))
     later = _short(rank + (rank.max(initial=0) + 1) * late)
     return np.asarray(np.sort(by_strength[np.argsort(later, kind='stable')[:most]]))
+
+
+def _strongest_first(strengths: NDArray[np.float32]) -> NDArray[np.int64]:
+    """
+    Give the order of strengths (N,), none below 0, of equal ones the first first.
+
+    Bits of such numbers are ordered as they are. With their places they differ all, and sorted as
+    they are they take a third of the time of a stable `argsort`.
+    """
+    keys = (~strengths.view(np.uint32)).astype(np.uint64) << np.uint64(32)
+    keys |= np.arange(len(keys), dtype=np.uint64)
+    keys.sort()
+    return (keys & np.uint64(2**32 - 1)).astype(np.int64)
 
 
 def _short(numbers: NDArray[np.int64]) -> NDArray[Any]:
