@@ -14,9 +14,10 @@ from djet_ros.core.jet import (
     JetProblem,
     Loss,
     minimise,
+    Residuals,
     Solution,
 )
-from djet_ros.core.paraboloid import median
+from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
 from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
 from djet_ros.core.starts import all_round, around, thinned
@@ -77,13 +78,14 @@ TUNING = BasinTuning()
 @dataclass(frozen=True)
 class Basin:
     """
-    A pose, the scale of the residuals there, and the poses of other basins.
+    A pose, the scale of the residuals there, these themselves, and the poses of other basins.
 
     others_move: whether most matches tell another motion.
     """
 
     pose: Pose
     scale: float
+    residuals: Residuals
     others_move: bool = False
     rivals: tuple[Pose, ...] = ()
 
@@ -134,9 +136,9 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     basins = _promising(problem, refined, tight, TUNING.refined_starts, possible)
     best = basins.pop(_likeliest(losses_at(problem, basins, tight), places, basins, prior))
     # All matches are placed equally well, whatever they move with.
-    scale = (min(map(core_scale, refined.r)) if others_move
-             else core_scale(epipolar_residuals(problem, best.R, best.t).r))
-    return Basin(best, max(scale, LEAST_SCALE), others_move, tuple(basins))
+    residuals = epipolar_residuals(problem, best.R, best.t)
+    scale = min(map(core_scale, refined.r)) if others_move else core_scale(residuals.r)
+    return Basin(best, max(scale, LEAST_SCALE), residuals, others_move, tuple(basins))
 
 
 def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
@@ -182,13 +184,13 @@ def _mere_turn(problem: JetProblem, parallax: float) -> bool:
     off = np.linalg.norm(turned[:, :2] / turned[:, 2:] - rays_y[:, :2], axis=1)
     # A typical residual surface is of a pixel.
     pixel = np.sqrt(median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
-    return bool(np.quantile(off, 0.75) < parallax * pixel)
+    return bool(quantile(off, 0.75) < parallax * pixel)
 
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:
     """Give the basin of a pose that has no rival."""
-    scale = core_scale(epipolar_residuals(problem, pose.R, pose.t).r)
-    return Basin(pose, max(scale, LEAST_SCALE))
+    residuals = epipolar_residuals(problem, pose.R, pose.t)
+    return Basin(pose, max(core_scale(residuals.r), LEAST_SCALE), residuals)
 
 
 def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],
@@ -256,4 +258,6 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
         if (possible is None or possible[number]) and (
                 off[number, chosen] > TUNING.same_basin**2).all():
             chosen.append(number)
-    return [sketch.pose(number) for number in chosen[:most]]
+            if len(chosen) == most:
+                break
+    return [sketch.pose(number) for number in chosen]

@@ -26,6 +26,7 @@ from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
 from djet_ros.core.memory import keep_freed_memory
+from djet_ros.core.paraboloid import quantile
 from djet_ros.core.parallel import both
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
@@ -110,9 +111,9 @@ class TwoViewEstimator:
         with _timed(timings, 'matching'):
             foreseen = match_foreseen(previous, current, prior, known, self.config.search_radius)
         if foreseen is not None and prior is not None:
-            (x, y), ahead = foreseen
+            (x, y), bits, ahead = foreseen
             result = self.estimate_matched(previous, current, x, y, prior, timings, known=known,
-                                           ahead=ahead)
+                                           ahead=ahead, bits=bits)
             if _as_good(result, prior):
                 return replace(result, timings=timings)
         with _timed(timings, 'matching'):
@@ -129,13 +130,15 @@ class TwoViewEstimator:
                          prior: RelativePose | None = None,
                          timings: dict[str, float] | None = None,
                          observe: Observer | None = None,
-                         known: Known | None = None, ahead: Pose | None = None) -> RelativePose:
+                         known: Known | None = None, ahead: Pose | None = None,
+                         bits: Array | None = None) -> RelativePose:
         """
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
         timings: gets the seconds of each stage; observe: is shown each round of Algorithm 1;
         known: as for ``estimate``; ahead: the motion by which matches were foreseen where they
-        are, so that its basin will do as a start where none other comes near; its t may be zeros.
+        are, so that its basin will do as a start where none other comes near; its t may be zeros;
+        bits: (N,) in which descriptors at x and y differ, where that is known already.
         """
         known = known or Known()
         timings = {} if timings is None else timings
@@ -148,6 +151,8 @@ class TwoViewEstimator:
         if begun is None:
             return RelativePose(Status.DEGENERATE, x=x, y=y)
         starts, surface, y = begun
+        # Where starts were sought, some matches may have been left out.
+        alike = None if starts or bits is None else (y, bits)
 
         # Joint epipolar tracking on the residual surfaces.
         K, x = current.K, surface.x
@@ -164,7 +169,7 @@ class TwoViewEstimator:
 
         # What is to be believed of it.
         with _timed(timings, 'result'):
-            result = self._result(previous, current, surface, y, track, before)
+            result = self._result(previous, current, surface, y, track, before, alike)
         if known.turn is None or agrees(known.turn, result):
             return result
 
@@ -174,7 +179,7 @@ class TwoViewEstimator:
         if track is None:
             return result
         with _timed(timings, 'result'):
-            turned = self._result(previous, current, surface, y, track, before)
+            turned = self._result(previous, current, surface, y, track, before, alike)
         more = turned.inliers.sum() > result.inliers.sum()
         return turned if more and agrees(known.turn, turned) else result
 
@@ -233,7 +238,8 @@ class TwoViewEstimator:
                                  ahead)
 
     def _result(self, previous: View, current: View, surface: ResidualSurface, y: Array,
-                track: Track, before: Pose | None) -> RelativePose:
+                track: Track, before: Pose | None, alike: tuple[Array, Array] | None
+                ) -> RelativePose:
         """Settle the direction of t, the covariance, and whether it is to be believed."""
         x, K, R = surface.x, current.K, track.pose.R
         inliers = track.inliers()
@@ -244,7 +250,7 @@ class TwoViewEstimator:
 
         covariances = pose_covariance(
             track.residuals, track.loss, x[track.voting], t, sign < 0)
-        hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt)
+        hamming = match_distances(previous.smoothed, x, current.smoothed, track.y_opt, alike)
         status = Status.OK
         if (inliers.sum() < self.config.min_matches or not np.isfinite(covariances[0]).all()
                 or _by_chance(hamming[inliers])):
@@ -332,7 +338,7 @@ def _pose(prior: RelativePose | None) -> Pose | None:
 def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
     """Upper quartile of the distances in pixels of y from where rotation alone would bring x."""
     rotated = rays_x @ (K @ R).T
-    return float(np.quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75))
+    return quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
 
 
 @contextmanager

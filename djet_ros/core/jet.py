@@ -16,20 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from djet_ros.core.geometry import (
+    GENERATORS,
     inverse_of,
     rays,
     rotation_exp,
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import (
-    inverse_2x2,
-    median,
-    medians,
-    middles,
-    Paraboloids,
-    times,
-)
+from djet_ros.core.paraboloid import median, medians, middles, Paraboloids, quantile
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -200,25 +194,43 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> 
     found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)),
                     spread=circle + _BY_TEXTURE * (problem.spread - circle))
     off = epipolar_residuals(found, solution.R, solution.t).r
-    # In square pixels.
-    S, T = (core_scale(r)**2 / width * measured.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
+    # In square pixels, as the entries 11, 12, 22.
+    S, T = (core_scale(r)**2 / width * measured.spread
             for measured, r in ((problem, solution.residuals.r), (found, off)))
-    apart = (problem.rays_y - found.rays_y)[:2].T / np.sqrt(width)
-    inverse = inverse_2x2(S + T)
-    has_minimum = (S[:, 0, 0] > 0) & (S[:, 0, 0] * S[:, 1, 1] > S[:, 0, 1]**2)
-    squared = (apart * times(inverse, apart)).sum(1)
+    apart = (problem.rays_y - found.rays_y)[:2] / np.sqrt(width)
+    inverse = _inverse(S + T)
+    way = _times(inverse, apart)
+    has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
+    squared = (apart * way).sum(0)
     joined = has_minimum & (squared < _ONE_PLACE)
-    gain = S @ inverse * joined[:, None, None]
     rays_y = problem.rays_y.copy()
-    rays_y[:2] -= np.sqrt(width) * times(gain, apart).T
-    S = S - gain @ S
+    rays_y[:2] -= np.sqrt(width) * joined * _times(S, way)
+    S = S - joined * np.stack([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
+                               _form(S[1:], inverse, S[1:])])
     if joined.any():
-        S[joined] *= _noise_of_each(squared[has_minimum], squared[joined])[:, None, None]
-    widths = np.abs(S[:, 0, 0] + S[:, 1, 1]) / 2
-    spread = S.reshape(-1, 4).T[[0, 1, 3]] * (width / max(median(widths), 1e-12))
+        S[:, joined] *= _noise_of_each(squared[has_minimum], squared[joined])
+    widths = np.abs(S[0] + S[2]) / 2
+    spread = S * (width / max(median(widths), 1e-12))
     blur = problem.blur * (np.abs(spread[0] + spread[2])
                            / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
     return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
+
+
+def _inverse(S: Array) -> Array:
+    """Entries 11, 12, 22 (3, N) of the inverses of symmetric matrices, given by theirs."""
+    area = S[0] * S[2] - S[1]**2
+    # Exact matches have no area at all.
+    return np.stack([S[2], -S[1], S[0]]) / np.where(area != 0, area, 1e-300)
+
+
+def _times(S: Array, v: Array) -> Array:
+    """Products (2, N) of symmetric matrices, by their entries (3, N), and vectors (2, N)."""
+    return np.asarray(S[:2] * v[0] + S[1:] * v[1])
+
+
+def _form(u: Array, S: Array, v: Array) -> Array:
+    """Values u^T S v (N,) of vectors (2, N) and matrices by their entries (3, N)."""
+    return np.asarray((u * _times(S, v)).sum(0))
 
 
 def _noise_of_each(all_squared: Array, squared: Array) -> Array:
@@ -231,7 +243,7 @@ def _noise_of_each(all_squared: Array, squared: Array) -> Array:
     upper quartile over the median is 2^(2 / nu) + 1, and the noise of one is expected to be
     (nu + d^2) / (nu + 2). Where all are alike, the ratio is two.
     """
-    middle, upper = np.quantile(all_squared, (0.5, 0.75))
+    middle, upper = median(all_squared), quantile(all_squared, 0.75)
     unlike = np.log2(max(upper / max(middle, 1e-300) - 1, 1.0)) * _SHARED  # 2 / nu
     return np.asarray((1 + unlike / 2 * squared) / (1 + unlike))
 
@@ -251,41 +263,48 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     """Residuals at the pose (R, t) with their analytic Jacobian over 3 + 2 parameters."""
     tangents = sphere_tangents(t)
     # Of t, and of the two directions in which it moves.
-    E, *by_direction = skew(np.vstack([t, tangents.T])) @ R
+    frame = np.empty((3, 3))
+    frame[0], frame[1:] = t, tangents.T
+    by_direction = skew(frame) @ R
     x, y, spread = problem.rays_x, problem.rays_y, problem.spread
-    lines = E @ x
+    lines = by_direction[0] @ x
     e = (y * lines).sum(0)
     # The first two components of the lines, times the covariances of their points.
     M = spread[:2] * lines[0] + spread[1:] * lines[1]
-    variance = lines[0] * M[0] + lines[1] * M[1]  # g^T A'^-1 g
+    variance = (lines[:2] * M).sum(0)  # g^T A'^-1 g
     sign = np.where(variance < 0, -1.0, 1.0)
-    size = np.maximum(np.abs(variance) + problem.blur, 1e-24)
+    size = np.abs(variance)
+    size += problem.blur
+    np.maximum(size, 1e-24, out=size)
     root = np.sqrt(size)
     # dr = w^T dE x, with the variance's own change in w.
-    w = y.copy()
-    w[:2] -= e * sign / size * M
-    w /= root
-    # [t]_x [e_i]_x R = e_i (R^T t)^T - t_i R
-    slopes = np.concatenate([np.eye(3)[:, :, None] * (t @ R) - t[:, None, None] * R, by_direction])
+    w = y / root
+    r = e / root
+    w[:2] -= r * sign / size * M
+    slopes = np.empty((5, 3, 3))
+    slopes[:3], slopes[3:] = skew(t) @ (GENERATORS @ R), by_direction[1:]
     jacobian = slopes.reshape(5, 9) @ (w[:, None] * x).reshape(9, -1)
-    return Residuals(e / root, sign, jacobian, tangents)
+    return Residuals(r, sign, jacobian, tangents)
 
 
 def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
-             max_steps: int = MAX_STEPS) -> Solution:
+             max_steps: int = MAX_STEPS, residuals: Residuals | None = None) -> Solution:
     """
     Minimise the summed loss from a starting pose by Levenberg-Marquardt steps.
 
-    Never ends above the cost of the start. t must have unit length.
+    Never ends above the cost of the start. t must have unit length; residuals: those at the start,
+    where they are known.
     """
-    residuals, (cost, weights) = _evaluate(problem, R, t, loss)
+    residuals = residuals or epipolar_residuals(problem, R, t)
+    cost, weights = _cost(residuals, loss)
     damping = 1e-4
     for _ in range(max_steps):
         step = _step(residuals, weights, loss, damping)
         if step is None:
             break
         R_new, t_new = moved(R, t, residuals.tangents, step)
-        trial, (trial_cost, trial_weights) = _evaluate(problem, R_new, t_new, loss)
+        trial = epipolar_residuals(problem, R_new, t_new)
+        trial_cost, trial_weights = _cost(trial, loss)
         if trial_cost < cost:
             gain = cost - trial_cost
             R, t, residuals, cost, weights = R_new, t_new, trial, trial_cost, trial_weights
@@ -335,11 +354,10 @@ def core_scale(residuals: Array) -> float:
     return scale
 
 
-def _evaluate(problem: JetProblem, R: Array, t: Array,
-              loss: Loss) -> tuple[Residuals, tuple[float, Array]]:
-    residuals = epipolar_residuals(problem, R, t)
+def _cost(residuals: Residuals, loss: Loss) -> tuple[float, Array]:
+    """Sum up the loss, and give the weights (N,)."""
     values, weights = loss(residuals.r**2)
-    return residuals, (float((residuals.sign * values).sum()), weights)
+    return float(residuals.sign @ values), weights
 
 
 def _step(residuals: Residuals, weights: Array, loss: Loss, damping: float) -> Array | None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from djet_ros.core.features import match_everywhere, match_nearby
 from djet_ros.core.flow import FAR, follow, NEAR, reach_of_levels
 from djet_ros.core.hamming import match_distances
+from djet_ros.core.paraboloid import quantile
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Pose, RelativePose, View
@@ -47,14 +48,26 @@ class Matches(NamedTuple):
     y: Array
 
 
+class Foreseen(NamedTuple):
+    """
+    Matches that a motion foresaw, and in how many bits (N,) their descriptors differ.
+
+    motion: where the camera turns otherwise than before, with the turn that the largest features
+    tell.
+    """
+
+    matches: Matches
+    bits: Array
+    motion: Pose
+
+
 def match_foreseen(previous: View, current: View, prior: RelativePose | None, known: Known,
-                   search_radius: float) -> tuple[Matches, Pose] | None:
+                   search_radius: float) -> Foreseen | None:
     """
     Follow features from where the motion before foresees them; None where too few are near.
 
     Nor where other things move: a gyro is asked to tell these from the world. search_radius: as a
-    share of the longer side. Gives the motion too, where the camera turns otherwise than before
-    with the turn that the largest features tell.
+    share of the longer side.
     """
     if (prior is None or known.turn is not None or search_radius >= 1
             or prior.inliers.sum() < _MANY or prior.inliers.mean() < RIGID):
@@ -62,11 +75,11 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
                  for levels in (NEAR, FAR))
     R = prior.R if known.guess is None else known.guess.R
-    matched = _follow_on(previous, current, prior, R, near, NEAR)
-    if matched is None:
+    found = _follow_on(previous, current, prior, R, near, NEAR)
+    if found is None:
         R = likely_rotation(previous.features, current.features, current.K, [R], far)
-        matched = _follow_on(previous, current, prior, R, far, FAR)
-    return None if matched is None else (matched, Pose(R, prior.t))
+        found = _follow_on(previous, current, prior, R, far, FAR)
+    return found
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
@@ -85,11 +98,13 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     turned = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
     y, bits = follow(previous, current, turned, radius)
     pairs = _match_turned(previous, current, turned, prior, radius)
-    return _surest(there.points, *_settled(previous, current, y, bits, pairs))
+    y, bits = _settled(previous, current, y, bits, pairs)
+    first = _surest(bits)
+    return Matches(there.points[first], y[first])
 
 
 def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
-               levels: int) -> Matches | None:
+               levels: int) -> Foreseen | None:
     """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
     foreseen = foresee(previous.features, current.K, R, prior)
     y, bits = follow(previous, current, foreseen, reach, levels)
@@ -98,9 +113,11 @@ def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, rea
         return None
     # Where many are far off, as after a step twice as long, others are farther than the reach.
     off = np.linalg.norm((y - foreseen)[found], axis=1)
-    if np.quantile(off, _NEARLY_ALL) > reach / 2:
+    if quantile(off, _NEARLY_ALL) > reach / 2:
         return None
-    return _surest(previous.features.points, y, bits)
+    first = _surest(bits)
+    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
+                    Pose(R, prior.t))
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,
@@ -135,7 +152,6 @@ def _settled(previous: View, current: View, y: Array, bits: Array, pairs: NDArra
     return y, bits
 
 
-def _surest(x: Array, y: Array, bits: Array) -> Matches:
-    """Give the places x, y (N, 2) that are not lost, those first that look most alike."""
-    order = np.argsort(bits, kind='stable')[:np.isfinite(bits).sum()]
-    return Matches(x[order], y[order])
+def _surest(bits: Array) -> NDArray[np.int64]:
+    """Give the indices of places that are not lost, those first that look most alike."""
+    return np.argsort(bits, kind='stable')[:np.isfinite(bits).sum()]

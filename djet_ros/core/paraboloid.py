@@ -61,7 +61,7 @@ class Paraboloids:
     def values(self, y: Array) -> Array:
         """Values (N,) of the paraboloids at pixels y (N, 2)."""
         v = y - self.centres
-        return np.asarray((v * (times(self.A, v) + 2 * self.b)).sum(1) + self.c)
+        return np.asarray(np.einsum('ni,ni->n', v, times(self.A, v) + 2 * self.b) + self.c)
 
 
 @lru_cache(maxsize=32)
@@ -99,6 +99,14 @@ def medians(values: Array) -> Array:
     """Medians (...,) of (..., N) values."""
     half, odd = divmod(values.shape[-1], 2)
     return middles(np.partition(values, half if odd else (half - 1, half)))
+
+
+def quantile(values: Array, share: float) -> float:
+    """Value below which a share of (N,) values lie, as `np.quantile`, at a third of its price."""
+    place = share * (len(values) - 1)
+    below, above = int(place), min(int(place) + 1, len(values) - 1)
+    ordered = np.partition(values, (below, above))
+    return float(ordered[below] + (place - below) * (ordered[above] - ordered[below]))
 
 
 def middles(ordered: Array) -> Array:
@@ -147,9 +155,12 @@ def largest(values: Array) -> Array:
 def inverse_2x2(A: Array) -> Array:
     """Inverses of (N, 2, 2) symmetric matrices; singular ones get a huge, finite inverse."""
     a, b, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 1]
-    # a trace of curvature where there is none, so that a flat surface weighs nothing
-    trace = np.where(np.abs(a * d - b * b) < 1e-12, np.copysign(1e-6, a + d), 0.0)
-    return inverses(A + trace[:, None, None] * np.eye(2))
+    flat = np.abs(a * d - b * b) < 1e-12
+    if flat.any():
+        # a trace of curvature where there is none, so that a flat surface weighs nothing
+        trace = np.where(flat, np.copysign(1e-6, a + d), 0.0)
+        A = A + trace[:, None, None] * np.eye(2)
+    return inverses(A)
 
 
 def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
@@ -160,13 +171,15 @@ def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
     vanishes for vertical lines; walking from the foot point along the line has no such hole.
     g: (N, 2) first components of the lines; h: (N,) equals -(y, 1) F (x, 1)^T.
     """
-    norm = np.maximum(np.hypot(g[:, 0], g[:, 1]), 1e-300)
-    normal = g / norm[:, None]
-    along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-    foot = normal * (h / norm)[:, None]
-    slope = (along * (times(A, foot) + b)).sum(1)
-    curvature = (along * times(A, along)).sum(1)
+    # Components first: a third of the time.
+    (g1, g2), (a, c, d) = g.T, (A[:, 0, 0], A[:, 0, 1], A[:, 1, 1])
+    norm = np.maximum(np.sqrt(g1 * g1 + g2 * g2), 1e-300)
+    n1, n2, away = g1 / norm, g2 / norm, h / norm
+    foot1, foot2 = n1 * away, n2 * away
+    # The line leads along (-n2, n1).
+    slope = n1 * (c * foot1 + d * foot2 + b[:, 1]) - n2 * (a * foot1 + c * foot2 + b[:, 0])
+    curvature = a * n2 * n2 - 2 * c * n1 * n2 + d * n1 * n1
     # A surface that is flat along its line gives no reason to move along it.
     flat = np.abs(curvature) < 1e-12
     walk = np.where(flat, 0.0, -slope / np.where(flat, 1.0, curvature))
-    return np.asarray(foot + walk[:, None] * along)
+    return np.stack([foot1 - walk * n2, foot2 + walk * n1], axis=1)

@@ -72,6 +72,11 @@ class _Look:
     weights: Array
     roots: Array
 
+    def stay(self, before: _Look, which: NDArray[np.int64]) -> None:
+        """Take some of the poses to be as they were before."""
+        for name in ('costs', 'r', 'sign', 'weights', 'roots'):
+            getattr(self, name)[which] = getattr(before, name)[which]
+
 
 @dataclass(frozen=True)
 class Held:
@@ -99,11 +104,13 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
         there = _look(problem, products, R_new, t_new, loss, held)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
-        if better.all():
-            R, t, here = R_new, t_new, there
-        elif better.any():
-            R, t, here = _where(better, R_new, R), _where(better, t_new, t), _chosen(
-                better, there, here)
+        if not better.any():
+            continue
+        # Few are worse, and stay where they are.
+        if len(worse := np.flatnonzero(~better)):
+            R_new[worse], t_new[worse] = R[worse], t[worse]
+            there.stay(here, worse)
+        R, t, here = R_new, t_new, there
     return Sketch(R, t, here.costs, here.r, here.sign)
 
 
@@ -191,7 +198,8 @@ def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
     diagonal = H.diagonal(axis1=1, axis2=2)
     most = diagonal.max(1, keepdims=True)
     ridge = damping[:, None] * diagonal + 1e-12 * most
-    H = H + ridge[:, :, None] * np.eye(5)
+    H = H.copy()
+    H.reshape(-1, 25)[:, ::6] += ridge
     if not (np.isfinite(H.sum()) and most.all()):
         usable = np.asarray(np.isfinite(H).all((1, 2)) & diagonal.any(1))
         H = np.where(usable[:, None, None], H, np.eye(5))
@@ -202,13 +210,3 @@ def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
 def _moved(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
     """Move poses by steps (S, 5), as ``jet.moved`` does one."""
     return rotation_exp(steps[:, :3]) @ R, unit(t + (tangents @ steps[:, 3:, None])[..., 0])
-
-
-def _chosen(better: NDArray[np.bool_], there: _Look, here: _Look) -> _Look:
-    return _Look(*(_where(better, getattr(there, name), getattr(here, name))
-                   for name in ('costs', 'r', 'sign', 'weights', 'roots')))
-
-
-def _where(better: NDArray[np.bool_], there: Array, here: Array) -> Array:
-    """Take from one array (S, …) or the other."""
-    return np.where(better.reshape(-1, *(1,) * (there.ndim - 1)), there, here)

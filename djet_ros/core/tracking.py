@@ -221,7 +221,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss,
-                            TUNING.steps_by_places if by_places else MAX_STEPS)
+                            TUNING.steps_by_places if by_places else MAX_STEPS, basin.residuals)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         last = converged or iteration == config.max_iterations
         if last:
@@ -258,9 +258,9 @@ def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: L
     """Optimise the pose by surfaces and by where matches were found, y (N, 2), together."""
     problem = with_places(problem, solution, K, y)
     agreeing = np.abs(solution.residuals.r) < loss.scale
-    residuals = epipolar_residuals(problem, solution.R, solution.t).r
-    loss = replace(loss, scale=config.loss_scale * _scale(residuals[agreeing]))
-    return problem, minimise(problem, solution.R, solution.t, loss), loss
+    residuals = epipolar_residuals(problem, solution.R, solution.t)
+    loss = replace(loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
+    return problem, minimise(problem, solution.R, solution.t, loss, MAX_STEPS, residuals), loss
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
