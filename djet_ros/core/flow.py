@@ -18,7 +18,7 @@ _WINDOW = 9
 
 # Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and
 # where they are not.
-NEAR, FAR = 1, 3
+NEAR, FAR = 2, 3
 
 # Steps at each level at most, and pixels of a step that is the last. Patches refine it: more of
 # them add nothing.
