@@ -89,7 +89,7 @@ def test_rings_around_the_middle_say_the_same() -> None:
 
 @pytest.fixture(scope='module')
 def whip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render_sequence('whip', tmp_path_factory.mktemp('whip'), 24, size=(480, 360))
+    return render_sequence('whip', tmp_path_factory.mktemp('whip'), 30, size=(480, 360))
 
 
 @pytest.fixture(scope='module')

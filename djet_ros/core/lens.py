@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
-from djet_ros.core.geometry import inverses, rays, rotation_log
+from djet_ros.core.geometry import fit_rotation, inverses, rays, rotation_log
 from djet_ros.core.jet import core_scale, epipolar_residuals, JetProblem, Loss, minimise
 from djet_ros.core.paraboloid import times
 from djet_ros.core.tracking import TUNING
@@ -28,6 +28,14 @@ import numpy as np
 
 # Matches of a pair that are kept, evenly among the surest and the least sure.
 MOST_MATCHES = 300
+
+# chosen: of a distortion's pixels, what a pair's pose has to leave over for the pair to tell it.
+# On straight roads, where it is less, what is wrong otherwise looks like a distortion.
+LEAST_SHARE = 0.005
+
+# chosen: times that parallax has to exceed noise, twice what makes it be believed at all. Where it
+# does not, a way sideways passes for a turn, and a distortion makes it pass better.
+_OUT_OF_NOISE = 6.0
 
 # chosen: rounds, of which three are enough, and what k1 may still move then, in standard errors.
 _ROUNDS, _SETTLED = 10, 0.01
@@ -104,8 +112,8 @@ class Told(NamedTuple):
     What a pair tells of k1 once its pose is eliminated.
 
     share: how much of a distortion its pose can't take up, as residuals over the pixels by which
-    matches move; noise: robust standard deviation of its residuals in pixels; by_match: (2, N) of
-    half the summed loss in units of that noise, by k1, its second derivative and its first.
+    matches move; noise: robust standard deviation in pixels of what no k1 explains; by_match:
+    (2, N) of half the summed loss in units of noise, by k1, its second derivative and its first.
     """
 
     pair: MatchedPair
@@ -167,6 +175,12 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
     return np.array(rows).T
 
 
+def tells(pair: MatchedPair, lens: Lens) -> bool:
+    """Tell whether a pair can say something of k1, by the calibration at hand."""
+    told = tell(pair, lens, lens.k1)
+    return told.share > LEAST_SHARE and _parallax(pair, lens) > _OUT_OF_NOISE * told.noise
+
+
 def tell(pair: MatchedPair, lens: Lens, k1: float) -> Told:
     """Tell what a pair says at some k1, from its own best pose there."""
     problem = _problem(pair, lens, k1)
@@ -183,11 +197,13 @@ def tell(pair: MatchedPair, lens: Lens, k1: float) -> Told:
     weighed = J * weights
     left = by_k1 - np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0] @ J
     squares = np.stack([left * left, left * r]) * weights
+    by_own_k1 = r - left * (squares[1].sum() / max(squares[0].sum(), 1e-300))
     # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
     squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), _LEAST_CURVED)
     moved = _displacements(problem.rays_y[:2].T, lens, k1)
     share = np.sqrt((weights * left * left).sum() / max((weights * moved * moved).sum(), 1e-300))
-    return Told(replace(pair, pose=solution.pose), float(share), noise, squares / noise**2)
+    return Told(replace(pair, pose=solution.pose), float(share), core_scale(by_own_k1),
+                squares / noise**2)
 
 
 def _problem(pair: MatchedPair, lens: Lens, k1: float) -> JetProblem:
@@ -213,6 +229,15 @@ def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
         by_pixel = inverses(slopes)
         places = places + times(by_pixel, seen - there)
     return places, by_pixel
+
+
+def _parallax(pair: MatchedPair, lens: Lens) -> float:
+    """Give the usual distance in pixels of matches from where a turn alone would bring them."""
+    rays_x, rays_y = (np.column_stack([one, np.ones(len(one))]) for one in (pair.x, pair.y))
+    turned = rays_x @ fit_rotation(rays_x, rays_y).T
+    there, here = (lens.pixels(places, lens.k1)[0]
+                   for places in (turned[:, :2] / turned[:, 2:], pair.y))
+    return float(np.median(np.linalg.norm(there - here, axis=1)))
 
 
 def _displacements(places: Array, lens: Lens, k1: float) -> Array:
