@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 from djet_ros.core.geometry import fit_rotation, inverses, rays, rotation_log
@@ -165,7 +166,7 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
     All else is as it was fitted. NaN where there are none.
     """
     rows = []
-    for inner, outer in zip(edges[:-1], edges[1:]):
+    for inner, outer in pairwise(edges):
         chosen = [one.by_match[:, (radii >= inner) & (radii < outer)].sum(1) for one in fit.told
                   for radii in [np.linalg.norm(one.pair.y, axis=1)]]
         curvature, gradient = np.array([sums for sums in chosen if sums[0] > 0]).reshape(-1, 2).T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +33,9 @@ _AGREE = 3.0
 # chosen: share by which a coefficient may change how far the camera turns; 0.07 was seen where
 # 0.05 was right, and 0.44 where noise was taken for parallax.
 _SAME_TURN = 0.2
+
+# rad; chosen: what a turn from one image to the next is good for.
+_HARDLY_TURNED = 1e-3
 
 # Parts of the radius that the plot shows.
 _RINGS = 8
@@ -98,16 +101,22 @@ def examine(recording: Recording, config: Config, advance: Callable[[], None]) -
                         'needed; record turns, or ways sideways, past what is near and far: '
                         'straight ahead tells nothing')
     fit = fit_lens(telling, seen.camera)
-    turned = sum(one.pair.angle for one in fit.told) / sum(pair.angle for pair in telling)
-    if abs(turned - 1) > _SAME_TURN:
-        raise DjetError(f'with k1 = {fit.k1:.2g} the camera would turn {turned:.1f} times as far '
-                        'as by its calibration: ways sideways pass for turns here; record turns '
-                        'past what is near and far, with a camera that is not blurred')
+    _check(fit, telling)
+    return LensReport(seen.camera, seen.size, pairs, fit)
+
+
+def _check(fit: LensFit, pairs: Sequence[MatchedPair]) -> None:
+    """Raise DjetError where something else than a k1 seems to be wrong with the pairs."""
+    before, after = (sum(pair.angle for pair in some)
+                     for some in (pairs, [one.pair for one in fit.told]))
+    if abs(after - before) > _SAME_TURN * before + _HARDLY_TURNED * len(pairs):
+        raise DjetError(f'with k1 = {fit.k1:.2g} the camera would turn by {np.degrees(after):.0f} '
+                        f'degrees, not {np.degrees(before):.0f}: turns pass for ways sideways '
+                        'here; record turns past what is near and far, without blur')
     if fit.disagreement > _AGREE:
         raise DjetError('the pairs that tell most of the lens are at odds with the others, by '
                         f'{fit.disagreement:.1f} standard errors: no k1 explains that, but '
                         'rolling rows, blur or a wrong camera matrix may; record slower turns')
-    return LensReport(seen.camera, seen.size, pairs, fit)
 
 
 class _Pair(NamedTuple):
