@@ -96,10 +96,12 @@ class MatchedPair:
         """
         Take what the odometry found in undistorted images with a camera matrix K (3, 3).
 
-        All matches and not its inliers, as these are what the calibration at hand agrees with.
+        Where gray levels have them, which go by no epipolar lines. All that voted and not
+        its inliers, as these are what the calibration at hand agrees with.
         """
-        some = slice(None, None, -(-len(relative.x) // MOST_MATCHES))
-        x, y = (rays(K, points[some])[:, :2] for points in (relative.x, relative.y))
+        voting = np.flatnonzero(relative.voting)
+        some = voting[::-(-len(voting) // MOST_MATCHES)]
+        x, y = (rays(K, points[some])[:, :2] for points in (relative.x, relative.placed))
         return cls(x, y, Pose(relative.R, relative.t))
 
     @property
