@@ -230,8 +230,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
             begun = begun._replace(scale=_scale(solution.residuals.r))
         if last and config.join_matches and config.method != 'rpe':
             # Step 2 once more: where matches are found is a measurement of its own.
-            if warp is not None:
-                placed[voting] = surface.placed(y, warp, voting)
+            placed[voting] = y[voting] if warp is None else surface.placed(y, warp, voting)
             problem, solution, loss = _joined(problem, K, placed[voting], solution, loss, config)
         if last and rival_poses:
             # Judge again between the basins, on all that is known.
