@@ -15,6 +15,7 @@ DISTORTIONS = {
     'rational_polynomial': np.array([0.4, -0.3, 1e-4, 2e-4, 0.02, 0.7, -0.3, 0.01]),
     'equidistant': np.array([-0.02, 0.01, -0.003, 0.001]),
 }
+PLACES = np.array([[0.2, 0.1], [-0.3, 0.2], [0.1, -0.25], [0, 0]])
 
 
 def reason(*args, **changes):
@@ -49,6 +50,26 @@ def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
     gray = np.zeros(SIZE[::-1], np.uint8)
     assert np.array_equal(camera.K, K)
     assert camera.undistort(gray) is gray
+
+
+@pytest.mark.parametrize('model', DISTORTIONS)
+def test_points_are_seen_where_undistortion_takes_them_from(model):
+    D = DISTORTIONS[model]
+    camera = Camera(K, D, SIZE, model)
+    seen, _ = camera.pixels(PLACES, camera.k1)
+    undistort = cv2.fisheye.undistortPoints if model == 'equidistant' else cv2.undistortPoints
+    assert camera.k1 == D[0]
+    assert np.allclose(undistort(seen[:, None], K, D)[:, 0], PLACES, atol=2e-4)
+    assert not np.allclose(camera.pixels(PLACES, camera.k1 + 0.1)[0], seen, atol=0.1)
+
+
+@pytest.mark.parametrize('model', [*DISTORTIONS, ''])
+def test_how_points_move_in_the_image_is_the_derivative_of_where_they_are_seen(model):
+    camera = Camera(K, DISTORTIONS.get(model, np.empty(0)), SIZE, model or 'plumb_bob')
+    for way in 1e-6 * np.eye(2):
+        more, less = (camera.pixels(PLACES + sign * way, 0.05)[0] for sign in (1, -1))
+        _, slopes = camera.pixels(PLACES, 0.05)
+        assert np.allclose((more - less) / 2e-6, slopes @ way / 1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize('model', DISTORTIONS)

@@ -22,6 +22,7 @@ COMMANDS = {
     'echo': 'what a live odometry says, in the terminal',
     'slam': 'close loops offline and optimise the trajectory with GTSAM',
     'export': 'write the pose graph of a replay for a SLAM backend',
+    'lens': 'what the calibration leaves of the lens, from a recording of turns',
     'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
     'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
     'lab': 'measure and draw: errors, speed, memory, surfaces (djet lab --help)',

@@ -267,8 +267,9 @@ class TwoViewEstimator:
                 status, covariances = _judged(Pose(R, t), covariances, track, before)
         lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
         return RelativePose(
-            status, R, t, *covariances, x=x, y=y, y_opt=track.y_opt,
-            inliers=inliers, residuals=line_distances(lines, y),
+            status, R, t, *covariances, x=x, y=y, placed=track.placed,
+            y_opt=track.y_opt, inliers=inliers, voting=track.voting,
+            residuals=line_distances(lines, y),
             hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
             indefinite=track.indefinite, iterations=track.iterations,
             rivals=tuple(rival.pose for rival in track.rivals))

@@ -82,9 +82,10 @@ class Track:
 
     pose; loss: the robust loss in force; residuals: those of the voting matches at the pose;
     voting: (N,) bool, matches that took part; minima: (N, 2) the surfaces' own minima y*;
-    y_opt: (N, 2) the final step onto the epipolar line; losses: (N,) last known surface values;
-    rivals: other motions that explain the voting matches; guess: whether that is so because two
-    bodies move, and nothing tells which is the world.
+    placed: (N, 2) where gray levels have y, through the last warp, or y itself where that was not
+    asked; y_opt: (N, 2) the final step onto the epipolar line; losses: (N,) last known surface
+    values; rivals: other motions that explain the voting matches; guess: whether that is so
+    because two bodies move, and nothing tells which is the world.
     """
 
     pose: Pose
@@ -92,6 +93,7 @@ class Track:
     residuals: Residuals
     voting: NDArray[np.bool_]
     minima: Array
+    placed: Array
     y_opt: Array
     losses: Array
     indefinite: int
@@ -191,7 +193,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            turn: Turn | None, alive: NDArray[np.bool_],
            ahead: Ahead | None = None) -> tuple[Track, _Begun] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
-    keypoints, losses = y.copy(), np.full(len(y), np.nan)
+    keypoints, placed, losses = y.copy(), y.copy(), np.full(len(y), np.nan)
     poses, begun = starts, None
     # Places that were followed tell the pose well enough to sample surfaces only once: around them
     # on its lines, as it stretches the patches.
@@ -228,8 +230,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
             begun = begun._replace(scale=_scale(solution.residuals.r))
         if last and config.join_matches and config.method != 'rpe':
             # Step 2 once more: where matches are found is a measurement of its own.
-            found = y[voting] if warp is None else surface.placed(y, warp, voting)
-            problem, solution, loss = _joined(problem, K, found, solution, loss, config)
+            placed[voting] = y[voting] if warp is None else surface.placed(y, warp, voting)
+            problem, solution, loss = _joined(problem, K, placed[voting], solution, loss, config)
         if last and rival_poses:
             # Judge again between the basins, on all that is known.
             solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
@@ -249,8 +251,8 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         if config.warp_reference:
             warp, plausible = _warps(pose, K, surface.x, optimum)
     assert begun is not None  # there is at least one iteration
-    return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), optimum, losses,
-                 no_minimum, iteration, rivals), begun
+    return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), placed, optimum,
+                 losses, no_minimum, iteration, rivals), begun
 
 
 def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
@@ -269,7 +271,7 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     voting = paraboloids.usable
     residuals = epipolar_residuals(jet_problem(K, surface.x, paraboloids), pose.R, pose.t)
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), optimum,
+    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), y, optimum,
                  paraboloids.values(optimum), 0, 0)
 
 

@@ -124,7 +124,9 @@ class RelativePose:
     covariance_6: (6, 6) over (rotation vector, t), of rank 5 because the length of t is fixed.
 
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
-    the place of y after its final step onto the epipolar line; inliers: (N,) bool;
+    the place of y after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,)
+    bool, those that took part in the pose, whether they agree with it or not; placed: (N, 2)
+    where gray levels have y, seen through the pose and the depths, or y itself;
     residuals: (N,) signed distances in pixels of y to its epipolar line;
     hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
     losses: (N,) each match's loss on its surface, the last known one where it was culled;
@@ -140,8 +142,10 @@ class RelativePose:
     covariance_6: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     x: Array = field(default_factory=lambda: np.empty((0, 2)))
     y: Array = field(default_factory=lambda: np.empty((0, 2)))
+    placed: Array = field(default_factory=lambda: np.empty((0, 2)))
     y_opt: Array = field(default_factory=lambda: np.empty((0, 2)))
     inliers: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
+    voting: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
     residuals: Array = field(default_factory=lambda: np.empty(0))
     hamming: Array = field(default_factory=lambda: np.empty(0))
     losses: Array = field(default_factory=lambda: np.empty(0))

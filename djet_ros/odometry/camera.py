@@ -27,8 +27,8 @@ class Camera:
     """
     A camera, and what makes its images those of a pinhole.
 
-    K: (3, 3) camera matrix of the images that ``undistort`` gives; size: (width, height) of the
-    images that it takes, or None where that is open.
+    K: (3, 3) camera matrix of the images that ``undistort`` gives; raw_K: (3, 3) that of those
+    that it takes; size: (width, height) of the images that it takes, or None where that is open.
     """
 
     def __init__(self, K: Array, D: Array, size: tuple[int, int] | None,
@@ -40,7 +40,7 @@ class Camera:
         camera matrix of the undistorted images, by default K. Raises BadMessage.
         """
         _check_camera(K)
-        self._raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
+        self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
         self._distortion = _distortion(model, D) if D.any() else None
         self._maps: tuple[Any, Any] | None = None
 
@@ -77,11 +77,37 @@ class Camera:
         return np.asarray(cv2.remap(gray, *self._maps, cv2.INTER_LINEAR,
                                     borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
 
+    @property
+    def k1(self) -> float:
+        """Give the first coefficient of its radial distortion."""
+        return float(self.distortion[1][0])
+
+    @property
+    def distortion(self) -> tuple[str, Array]:
+        """Give the model and its coefficients, zeros where the images are undistorted."""
+        return self._distortion or ('plumb_bob', np.zeros(5))
+
+    def pixels(self, places: Array, k1: float) -> tuple[Array, Array]:
+        """
+        Show points X/Z, Y/Z (N, 2) in the images as they come, with another coefficient k1.
+
+        Gives pixels (N, 2), and how these move with the points (N, 2, 2).
+        """
+        model, D = self.distortion
+        points = np.column_stack([places, np.ones(len(places))])[:, None]
+        project, by_way = ((cv2.fisheye.projectPoints, 11) if model == 'equidistant'
+                           else (cv2.projectPoints, 3))
+        pixels, slopes = project(points, np.zeros(3), np.zeros(3), self.raw_K,
+                                 np.append(k1, D[1:]))
+        # A step of the camera moves points at a depth of one as they would move themselves.
+        return (np.asarray(pixels, float).reshape(-1, 2),
+                np.asarray(slopes[:, by_way:by_way + 2], float).reshape(-1, 2, 2))
+
     def _undistortion(self, width: int, height: int) -> tuple[Any, Any]:
         model, D = self._distortion or ('', np.empty(0))
         module = cv2.fisheye if model == 'equidistant' else cv2
         first, second = module.initUndistortRectifyMap(
-            self._raw_K, D, np.eye(3), self.K, (width, height), cv2.CV_16SC2)
+            self.raw_K, D, np.eye(3), self.K, (width, height), cv2.CV_16SC2)
         return first, second
 
 

@@ -171,6 +171,11 @@ class Tracker:
             self._await()
         return []
 
+    @property
+    def camera(self) -> Camera | None:
+        """Give the camera of the newest CameraInfo; None where that can't be used."""
+        return self._camera
+
     def expect(self, message: Any) -> None:
         """
         Begin with an image that is to come after the next one, beside the work on that one.
