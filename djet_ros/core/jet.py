@@ -271,22 +271,6 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     return Residuals(e / root, sign, jacobian, tangents)
 
 
-def on_lines(problem: JetProblem, R: Array, t: Array) -> Array:
-    """
-    Rays (3, N) of the likeliest places on the epipolar lines of a pose, for all matches.
-
-    Paper: the optimum v_opt of "Epipolar Constrained Tracking" in closed form, from the minimum
-    along S g, which is where the covariance S of the place leads. Next to the epipole it stays.
-    """
-    lines = skew(t) @ R @ problem.rays_x
-    s11, s12, s22 = problem.spread
-    way = np.stack([s11 * lines[0] + s12 * lines[1], s12 * lines[0] + s22 * lines[1]])
-    variance = np.abs((way * lines[:2]).sum(0)) + problem.blur
-    places = problem.rays_y.copy()
-    places[:2] -= (problem.rays_y * lines).sum(0) / np.maximum(variance, 1e-24) * way
-    return places
-
-
 def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
              max_steps: int = MAX_STEPS) -> Solution:
     """

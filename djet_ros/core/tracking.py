@@ -35,7 +35,6 @@ from djet_ros.core.jet import (
     Loss,
     MAX_STEPS,
     minimise,
-    on_lines,
     Residuals,
     Solution,
     with_places,
@@ -253,7 +252,6 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
     assert begun is not None  # there is at least one iteration
     minima = paraboloids.minima()
     minima[voting] = (K @ problem.rays_y)[:2].T
-    optimum[voting] = (K @ on_lines(problem, pose.R, pose.t))[:2].T
     return Track(pose, loss, solution.residuals, voting, minima, optimum, losses, no_minimum,
                  iteration, rivals), begun
 
