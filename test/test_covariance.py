@@ -15,6 +15,7 @@ from djet_ros.lab.scenes.pair import render_pair
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 import yaml
 
 BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
@@ -126,3 +127,27 @@ def test_minima_stay_where_they_are_when_their_keypoints_are_displaced_a_little(
         drawn.append((moved * off[right]).sum() / (off[right]**2).sum())
     # As fitted, paraboloids draw them along by a quarter of the way.
     assert abs(np.mean(drawn)) < 0.1
+
+
+@pytest.mark.parametrize('reach', [0, 40, 80])
+def test_errors_that_reach_over_many_patches_are_counted_as_the_few_that_they_are(reach):
+    # Half of the noise is a field that hardly changes within so many pixels: were each patch to
+    # err by itself, a tenth of the poses would lie within the ellipsoid that ought to hold 95 %.
+    rng, t, squares = np.random.default_rng(0), np.array([0.0, 0, 1]), []
+    for _ in range(60):
+        places = rng.uniform(0, 1, (1500, 2)) * [1200, 400]
+        u, v = (places / [600, 200] - 1).T
+        near = rng.uniform(0, 1, 1500)
+        J = np.stack([np.ones(1500), u, v, near * u, near * v])
+        noise = rng.normal(size=1500)
+        if reach:
+            waves, phases = rng.normal(size=(60, 2)) / reach, rng.uniform(0, 2 * np.pi, 60)
+            field = np.sqrt(2 / 60) * np.cos(places @ waves.T + phases).sum(1)
+            noise = np.sqrt(0.5) * (noise + field)
+        error = np.linalg.solve(J @ J.T, J @ noise)
+        residuals = Residuals(noise - error @ J, np.ones(1500), J, sphere_tangents(t))
+        covariance = pose_covariance(residuals, Loss(), places, t, False)[0]
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(np.array(squares) < chi2.ppf(0.95, 5)) > 0.9
+    # Nor are they taken to be far larger than they are.
+    assert np.median(squares) / chi2.median(5) > (0.1 if reach else 0.4)

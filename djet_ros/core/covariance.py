@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 from djet_ros.core.cells import beginnings
 from djet_ros.core.geometry import rotation_log, sphere_tangents
@@ -22,11 +24,13 @@ _LARGE_CELLS = 20
 # Sides of large cells over that; several, for a few cells tell how much they vary to a third only.
 _SIDES = (2 / 3, 3 / 2)
 
-# chosen: so many neighbouring small cells err together.
-_ALIKE = 3
+# Of a covariance that v independent errors tell, squared errors are Hotelling's T^2: the bound of
+# 99.9 % grows by about 1 + 20 / v + 300 / v^2. By powers of the errors' share in one direction.
+_HARDLY_TOLD = 20 / 5, 300 / 25
 
-# Pixels; chosen: what an image's sampling, its lens and its rolling rows are good for.
-_SHIFT = 0.006
+# chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large
+# cell by, as a share of the noise of a match.
+_SHIFT = 0.12
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -61,14 +65,11 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     they lie in too few cells.
 
     The noise is that of the residuals themselves, in whichever of the two images it arose: see
-    `_jackknife`. Many small cells tell the shape of the covariance. Larger ones, which hold what
-    errs together from one small cell to the next, tell its size: with C of the small and C' of
-    larger ones, tr(C^-1 C') / 5 is how much larger the variances are on average over the five
-    directions, and 1 where the small cells err each by itself; q is its mean over the sizes of the
-    larger. The image is about as many large cells wide as these are small ones, and what errs
-    together all over it shows in none; its variance is taken to grow by q once more.
-    The pose takes five freedoms of n independent errors, so that its variance grows by 1 + 5 / n.
-    What no residual shows comes to that: all that is seen in a large cell may be shifted a little.
+    `_jackknife`. Many small cells tell the shape of the covariance, and of how many errors: where
+    few decide about a direction, it is less sure than they say. Larger ones, which hold what errs
+    together from one small cell to the next, tell how the size grows with theirs, see `_growth`;
+    it is that of one as large as the image. What no residual shows comes to that: all that is seen
+    in a large cell may be shifted a little.
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -78,18 +79,17 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return UNKNOWN
-    inverse = np.asarray(np.linalg.inv(H))
-    cells = _Cells.of(places, J, weights, residuals.r)
-    small_cells = _jackknife(H, inverse, cells)
-    large = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
-    larger = cells.in_larger(large)
-    large_cells = _jackknife(H, inverse, larger)
-    if small_cells is None or large_cells is None:
+    cells = _Cells.of(H, places, J, weights, residuals.r)
+    side = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
+    large = cells.in_larger(side)
+    if cells.without is None or large.without is None:
         return UNKNOWN
-    correlated = _correlated(H, inverse, cells, small_cells, large_cells, large)
-    freedoms = 1 + 5 * _ALIKE / len(cells.places)
-    shifts = _SHIFT * inverse @ larger.pulls
-    covariance = freedoms * (correlated / flattening)**2 * small_cells + shifts @ shifts.T
+    others = [cells.in_larger(other) for other in (2 * CELL, *(size * side for size in _SIDES))]
+    reach = float(np.ptp(places, axis=0).max())
+    growth = _growth(cells.size(cells.without), [large, *others], reach) / flattening**2
+    noise = (weights * squared).sum() / weights.sum()
+    shifts = _SHIFT * cells.inverse @ large.pulls
+    covariance = growth * _jackknife(cells, cells.without) + noise * shifts @ shifts.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
@@ -98,36 +98,45 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
-class _Cells(NamedTuple):
+@dataclass(frozen=True)
+class _Cells:
     """
     What the matches of C cells tell together.
 
-    places: (C, 2) middles of the cells; sums: (25, C), one row after the other the upper triangle
-    of H (5, 5) of their loss, its gradient (5,), and how that changes where all residuals of a
-    cell grow alike (5,).
+    whole: (5, 5) H of all, and its inverse; side: of a cell in pixels; places: (C, 2) in them;
+    sums: (25, C), one row after the other the upper triangle of H (5, 5) of their loss, its
+    gradient (5,), and how that changes where all residuals of a cell grow alike (5,).
     """
 
+    whole: Array
+    inverse: Array
+    side: float
     places: Array
     sums: Array
 
     @classmethod
-    def of(cls, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
+    def of(cls, H: Array, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
         """Sum matches at pixels (N, 2) by small cells, with their J (5, N), weights and r (N,)."""
         order, first = _by_cell(places, CELL)
         J, weights, r = J[:, order], weights[order], r[order]
         weighed = J * weights
         rows, columns = _UPPER
         terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed])
-        return cls((places[order[first]] // CELL + 0.5) * CELL,
+        return cls(H, np.asarray(np.linalg.inv(H)), CELL,
+                   (places[order[first]] // CELL + 0.5) * CELL,
                    np.add.reduceat(terms, first, axis=1))
 
     def in_larger(self, side: float) -> _Cells:
         """Give larger cells, each made of whole small ones; places are those of one of them."""
+        side = max(side, CELL)
         order, first = _by_cell(self.places, side)
-        return _Cells(self.places[order[first]],
+        return _Cells(self.whole, self.inverse, side, self.places[order[first]],
                       np.add.reduceat(self.sums[:, order], first, axis=1))
 
-    @property
+    def __len__(self) -> int:
+        return len(self.places)
+
+    @cached_property
     def H(self) -> Array:
         """Give (C, 5, 5)."""
         return self.sums[_WHOLE].T.reshape(-1, 5, 5)
@@ -142,17 +151,61 @@ class _Cells(NamedTuple):
         """Give (5, C)."""
         return self.sums[-5:]
 
+    @cached_property
+    def without(self) -> Array | None:
+        """
+        Inverses (C, 5, 5) of what is left of the whole without each cell.
 
-def _correlated(H: Array, inverse: Array, cells: _Cells, small_cells: Array, large_cells: Array,
-                large: float) -> float:
-    """Give q of `pose_covariance`, by large cells of a side in pixels and by others still."""
-    others = (_jackknife(H, inverse, cells.in_larger(side))
-              for side in (2 * CELL, *(max(size * large, CELL) for size in _SIDES)))
-    # Exact matches leave no noise at all.
-    noise = small_cells + _LEAST_VARIANCE * np.eye(5)
-    ratios = [np.trace(np.linalg.solve(noise, larger)) / 5
-              for larger in (large_cells, *others) if larger is not None]
-    return max(1.0, float(np.mean(ratios)))
+        None where cells are too few, or one alone decides.
+        """
+        if len(self) <= 5:  # so many are gone with the pose's own freedom
+            return None
+        # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
+        weighty = self.H[self.H.reshape(-1, 25) @ self.inverse.ravel() > _WEIGHTY]
+        if len(weighty):
+            whitening = np.linalg.inv(np.linalg.cholesky(self.whole))
+            shares = np.linalg.eigvalsh(whitening @ weighty @ whitening.T)
+            if (shares > 1 - _LEAST_SUPPORT).any():
+                return None
+        return np.asarray(np.linalg.inv(self.whole - self.H))
+
+    @cached_property
+    def shares(self) -> Array:
+        """Tell what each cell is of the whole, H^-1 H_c (C, 5, 5)."""
+        return np.asarray(self.inverse @ self.H)
+
+    def errors(self) -> float:
+        """Tell how many independent errors there are, were cells all alike (Satterthwaite)."""
+        return 25 / float((self.shares * self.shares.transpose(0, 2, 1)).sum())
+
+    def size(self, without: Array) -> float:
+        """
+        Size of the covariance that is told, over H^-1, summed over the five directions.
+
+        Where cells err by themselves, it is the same for any size of them: by (H - H_c)^-1 in
+        place of H^-1 it has no bias (Bell and McCaffrey, Survey Methodology 2002).
+        """
+        moves = np.einsum('cij,jc->ic', without, self.gradients)
+        return float((moves * self.gradients).sum()) + _LEAST_VARIANCE
+
+
+def _growth(least: float, larger: Sequence[_Cells], reach: float) -> float:
+    """
+    Tell how much larger the variances are than small cells have them, which do not err one by one.
+
+    They grow by a power of the side of cells, which several larger ones tell, each as well as it
+    has independent errors. least: size by small ones; reach: in pixels, between the outermost
+    matches: as large as the cell that holds all.
+    """
+    octaves, sizes, errors = [], [], []
+    for cells in larger:
+        if cells.without is not None:
+            octaves.append(np.log2(cells.side / CELL))
+            sizes.append(np.log2(cells.size(cells.without) / least))
+            errors.append(cells.errors())
+    weighed = np.array(errors) * octaves
+    power = max(weighed @ sizes / max(weighed @ octaves, 1e-9), 0.0)
+    return float(max(reach / CELL, 1.0)**power)
 
 
 def difference(R: Array, t: Array, other: Pose) -> Array:
@@ -188,31 +241,25 @@ def lift(tangents: Array) -> Array:
     return lifted
 
 
-def _jackknife(H: Array, inverse: Array, cells: _Cells) -> Array | None:
+def _jackknife(cells: _Cells, without: Array) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
-    H, inverse: (5, 5) of all. A delete-a-group jackknife, to first order (Bell and McCaffrey,
-    Survey Methodology 2002). Where few cells decide about a direction, their moves say little; so
-    the mean is taken of the moves that are seen and of those that noise would make, which are
-    large there, at the size that has the seen ones on average. None where cells are too few, or
-    one alone decides.
+    without: (C, 5, 5), see ``_Cells``. A delete-a-group jackknife, to first order (Bell and
+    McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their moves say
+    little; so the mean is taken of the moves that are seen and of those that noise would make,
+    which are large there, at the size that has the seen ones on average. The fewer decide, the
+    less is known of that mean too.
     """
-    count, H_cells = len(cells.places), cells.H
-    if count <= 5:  # so many are gone with the pose's own freedom
-        return None
-    # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
-    weighty = H_cells[H_cells.reshape(-1, 25) @ inverse.ravel() > _WEIGHTY]
-    if len(weighty):
-        whitening = np.linalg.inv(np.linalg.cholesky(H))
-        if (np.linalg.eigvalsh(whitening @ weighty @ whitening.T) > 1 - _LEAST_SUPPORT).any():
-            return None
-    without = np.linalg.inv(H - H_cells)
     moves = np.einsum('cij,jc->ic', without, cells.gradients)
     seen = moves @ moves.T
-    by_noise = without.sum(0) - count * inverse
+    by_noise = without.sum(0) - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    return np.asarray((1 - 1 / count) * (seen + by_noise) / 2)
+    few = (cells.shares @ cells.shares).sum(0)
+    first, second = _HARDLY_TOLD
+    hardly_told = (first * few + second * few @ few) @ cells.inverse
+    return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2
+                      + cells.size(without) / 5 * hardly_told)
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:

@@ -81,11 +81,11 @@ class Track:
     Where Algorithm 1 ended.
 
     pose; loss: the robust loss in force; residuals: those of the voting matches at the pose;
-    voting: (N,) bool, matches that took part; minima: (N, 2) the surfaces' own minima y*;
-    placed: (N, 2) where gray levels have y, through the last warp, or y itself where that was not
-    asked; y_opt: (N, 2) the final step onto the epipolar line; losses: (N,) last known surface
-    values; rivals: other motions that explain the voting matches; guess: whether that is so
-    because two bodies move, and nothing tells which is the world.
+    voting: (N,) bool, matches that took part; placed: (N, 2) where gray levels have y, through the
+    last warp, or y itself where that was not asked; minima: (N, 2) the surfaces' own minima y*,
+    joined with these for matches that voted; y_opt: (N, 2) the final step onto the epipolar line;
+    losses: (N,) last known surface values; rivals: other motions that explain the voting matches;
+    guess: whether that is so because two bodies move, and nothing tells which is the world.
     """
 
     pose: Pose
@@ -251,8 +251,10 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         if config.warp_reference:
             warp, plausible = _warps(pose, K, surface.x, optimum)
     assert begun is not None  # there is at least one iteration
-    return Track(pose, loss, solution.residuals, voting, paraboloids.minima(), placed, optimum,
-                 losses, no_minimum, iteration, rivals), begun
+    minima = paraboloids.minima()
+    minima[voting] = (K @ problem.rays_y)[:2].T
+    return Track(pose, loss, solution.residuals, voting, minima, placed, optimum, losses,
+                 no_minimum, iteration, rivals), begun
 
 
 def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
