@@ -91,9 +91,10 @@ def test_a_direction_about_which_one_match_decides_is_no_surer_than_that_match()
         residuals = Residuals(noise - error @ J, np.ones(300), J, sphere_tangents(t))
         covariance = pose_covariance(residuals, Loss(), places, t, False)[0]
         off.append(error / np.sqrt(np.diag(covariance)))
-    # Its residual is a hundredth of its noise; errors are nevertheless no larger than claimed.
+    # Its residual is a hundredth of its noise; errors are nevertheless no larger than claimed,
+    # and those of the other parameters hardly smaller.
     typical = np.median(np.abs(off), axis=0) / 0.6745
-    assert np.all(np.abs(typical[:4] - 1) < 0.15) and typical[4] < 1
+    assert np.all((typical[:4] > 0.8) & (typical[:4] < 1.05)) and typical[4] < 1
 
 
 def test_a_pose_that_hangs_on_one_match_is_not_known():

@@ -86,10 +86,11 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
         return UNKNOWN
     others = [cells.in_larger(other) for other in (2 * CELL, *(size * side for size in _SIDES))]
     reach = float(np.ptp(places, axis=0).max())
-    growth = _growth(cells.size(cells.without), [large, *others], reach) / flattening**2
+    growth = _growth(cells.size(cells.without), [large, *others], reach)
     noise = (weights * squared).sum() / weights.sum()
     shifts = _SHIFT * cells.inverse @ large.pulls
-    covariance = growth * _jackknife(cells, cells.without) + noise * shifts @ shifts.T
+    covariance = (growth / flattening**2 * _jackknife(cells, cells.without, growth)
+                  + noise * shifts @ shifts.T)
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
@@ -241,7 +242,7 @@ def lift(tangents: Array) -> Array:
     return lifted
 
 
-def _jackknife(cells: _Cells, without: Array) -> Array:
+def _jackknife(cells: _Cells, without: Array, together: float) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
@@ -249,13 +250,14 @@ def _jackknife(cells: _Cells, without: Array) -> Array:
     McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their moves say
     little; so the mean is taken of the moves that are seen and of those that noise would make,
     which are large there, at the size that has the seen ones on average. The fewer decide, the
-    less is known of that mean too.
+    less is known of that mean too. together: by what the variances grow as cells err together;
+    chosen: that leaves its root fewer errors.
     """
     moves = np.einsum('cij,jc->ic', without, cells.gradients)
     seen = moves @ moves.T
     by_noise = without.sum(0) - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    few = (cells.shares @ cells.shares).sum(0)
+    few = np.sqrt(together) * (cells.shares @ cells.shares).sum(0)
     first, second = _HARDLY_TOLD
     hardly_told = (first * few + second * few @ few) @ cells.inverse
     return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2
