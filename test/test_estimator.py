@@ -54,9 +54,10 @@ MOTIONS = {'sideways': SIDEWAYS, 'forward': FORWARD, 'backward': BACKWARD}
 NOISE = 0.5  # pixels, in each coordinate of y
 TRIALS = 200
 
-# The factor by which the covariance exceeds what independent matches would give: twenty large
-# cells tell its size to a sixth, and it is never taken to be smaller than small ones tell.
-CAUTION = 1.2
+# The factor by which the covariance exceeds what 300 independent matches would give. It is never
+# taken to be smaller than small cells tell, and they tell of some 150 errors (Hotelling's T^2);
+# and all that is seen in one of twenty large cells may be shifted by 0.12 of a match's noise.
+CAUTION = 1.1 * (1 + 20 / 150) + 0.12**2 * 300 / 20
 
 
 def errors_of(result, R, t):
