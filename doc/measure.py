@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 import hashlib
@@ -27,6 +28,7 @@ from time import perf_counter
 from typing import Any
 
 import djet_ros
+from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
@@ -42,9 +44,13 @@ from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.recording import open_recording
 from djet_ros.replay.drift import drift
 from djet_ros.replay.pair_errors import motion_errors
+from djet_ros.replay.replay import Replay
+from djet_ros.replay.results import ResultsFolder
 import numpy as np
 from scipy.stats import chi2
 
@@ -56,8 +62,16 @@ LIBRARIES = ('numpy', 'scipy', 'opencv-python-headless', 'poselib')
 PAPER_METHODS = ('djet', 'rpe')
 CLOSED = ('djet', 'pjet', 'rpe')
 CLOSURE_FRAMES = 150
-ABLATED_FRAMES = 51
+ABLATED = ('road', 'indoor', 'handheld', 'forest')
+ABLATED_FRAMES, ABLATED_SEEDS = 7, 3
 ABLATED_WINDOWS = (3, 5, 7, 15)
+# What pairs are chained of over whole drives.
+CHAINED = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
+# Metres; a drive that is shorter has no drift by KITTI's measure.
+DRIVE = 100.0
+# How drives are replayed; the camera's height over the road is KITTI's own word.
+REPLAYED = {'images alone': {},
+            '`camera_height`': {'odometry.scale': 'camera_height', 'odometry.camera_height': 1.65}}
 BENCH_PAIRS = 40
 # An error that a true covariance of five degrees of freedom allows in one pair of a thousand.
 SURPRISING = float(chi2.ppf(0.999, 5))
@@ -200,7 +214,10 @@ def missing(results: dict[str, Any], args: argparse.Namespace
         jobs.append(Job(title(folder), (), folder, args.real_frames, used))
     work: dict[str, Callable[[], dict[str, Any]]] = {
         job.name: partial(measured, job) for job in sorted(jobs, key=lambda job: -job.cost)}
-    work['ablation'] = partial(ablation, args.data, args.real_frames)
+    work['ablation'] = partial(ablation, args.seeds[:ABLATED_SEEDS])
+    for folder in kitti(args.data):
+        if length(folder) > DRIVE:
+            work[f'drive {title(folder)}'] = partial(drive, folder)
     for name, action in work.items():
         if name not in results['parts'] and (not args.only or name in args.only):
             yield name, action
@@ -310,15 +327,42 @@ def tracked(dataset: Dataset) -> Iterator[Outcome]:
                       else float('nan'))
 
 
-def ablation(data: Path | None, most: int | None) -> dict[str, Any]:
-    """Measure variants of D-JET on KITTI's frames, or on a street if there are none."""
-    started, frames = perf_counter(), min(most or ABLATED_FRAMES, ABLATED_FRAMES)
+def drive(folder: Path) -> dict[str, Any]:
+    """Measure all of a drive: its pairs in a chain, method by method, and as it is replayed."""
+    started = perf_counter()
     with TemporaryDirectory() as name:
-        jobs = [Job(title(folder), (), folder, frames, 0) for folder in kitti(data)]
-        jobs = jobs or [Job('road', (0,), None, frames, 0)]
-        datasets = [dataset for job in jobs for dataset in opened_for(job, Path(name))]
+        datasets = open_datasets([folder], Selection(), Path(name))
+        found = {'frames': datasets[0].pairs + 1, 'length': rounded(length(folder)),
+                 'chained': by_method(datasets, make_methods(CHAINED, ['best'], {})),
+                 'replays': {how: replayed(folder, values, Path(name) / str(number))
+                             for number, (how, values) in enumerate(REPLAYED.items())}}
+    return {'seconds': rounded(perf_counter() - started), **found}
+
+
+def replayed(folder: Path, values: dict[str, Any], output: Path) -> dict[str, Any]:
+    """Replay a sequence with some parameters; gives what its summary tells of the whole way."""
+    config = from_flat(values)
+    with closing(open_recording(folder)) as recording, ResultsFolder(output, config) as results:
+        summary = Replay(recording, config, results, folder.name).run().summary
+    return {what: {name: rounded(value) if value is not None else None
+                   for name, value in summary[what].items()} for what in ('drift', 'positions')}
+
+
+def length(folder: Path) -> float:
+    """Metres of a KITTI sequence's true way; 0 where that is not known."""
+    poses = KittiSequence(folder).poses
+    return 0.0 if poses is None else float(
+        np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def ablation(seeds: tuple[int, ...]) -> dict[str, Any]:
+    """Measure variants of D-JET on rendered scenes, whose truth is exact enough to tell them."""
+    started = perf_counter()
+    with TemporaryDirectory() as name:
+        datasets = [dataset for scene in ABLATED for dataset in opened_for(
+            Job(scene, seeds, None, ABLATED_FRAMES, 0), Path(name) / scene)]
         methods = ablation_methods(['best'], PARTS, ABLATED_WINDOWS, {})
-        found = {'of': [job.name for job in jobs], 'frames': frames,
+        found = {'of': list(ABLATED), 'frames': ABLATED_FRAMES, 'seeds': list(seeds),
                  'variants': by_method(datasets, methods)}
     return {'seconds': rounded(perf_counter() - started), **found}
 

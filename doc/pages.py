@@ -234,14 +234,29 @@ def odometry(results: Any) -> str:
 
 
 def drift(results: Any) -> str:
-    rows = [(name, TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
-             number(one['drift']['translation_percent']),
-             number(one['drift']['rotation_deg_per_100m']),
-             f'{one["drift"]["segments"]}, to {one["drift"]["longest"]} m')
-            for name, part in sequences(results) for one in part['methods'] if 'drift' in one]
-    if not rows:
-        return 'No sequence that was measured is over 100 m long.\n'
-    return table(('', 'method', 'preset', 't_rel, %', 'r_rel, ° per 100 m', 'segments'), rows)
+    """Lay out whole drives: chains of pairs by method, and replays with lengths of their own."""
+    drives = [(known_as(name.removeprefix('drive ')), part)
+              for name, part in results['parts'].items() if name.startswith('drive ')]
+    if not drives:
+        return 'No drive of over 100 m was measured.\n'
+    chained = [(name, TITLES[one['method']], *(number(one['drift'][what]) for what in (
+        'translation_percent', 'rotation_deg_per_100m')))
+        for name, part in drives for one in part['chained']]
+    replays = [(f'{name}, {how}', number(one['positions']['rmse_m'], 2),
+                number(one['positions']['scale_change']),
+                # Without metres t_rel says nothing.
+                number(one['drift']['translation_percent'], 2),
+                number(one['drift']['rotation_deg_per_100m']))
+               for name, part in drives for how, one in part['replays'].items()]
+    whole = ', '.join(f'{name} ({part["frames"]} frames, {part["length"]:.0f} m)'
+                      for name, part in drives)
+    return (paragraph(f'Of {whole}. Pairs chained, each by itself, with the lengths of the ground '
+                      'truth:')
+            + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
+            + paragraph('As `djet replay` has them, with lengths of its own; positions after '
+                        'alignment with one scale:')
+            + table(('', 'positions off, rmse in m', 'scale, end over start', 't_rel, %',
+                     'r_rel, ° per 100 m'), replays))
 
 
 def surprise(results: Any) -> str:
@@ -277,8 +292,8 @@ def ablation(results: Any) -> str:
         return 'Not measured yet.\n'
     rows = [(TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
              pair_of(one, 'median')) for one in part['variants']]
-    return (paragraph(f'Over the first {part["frames"]} frames of '
-                      f'{", ".join(map(known_as, part["of"]))}.')
+    return (paragraph(f'Over {part["variants"][0]["pairs"]} pairs: the first {part["frames"]} '
+                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each.')
             + table(('method', 'change', 'mean (failed)', 'median'), rows))
 
 

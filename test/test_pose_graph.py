@@ -290,6 +290,21 @@ def test_the_files_read_back_to_the_graph(results, tmp_path):
     assert np.array_equal(np.loadtxt(tmp_path / 'kitti').reshape(-1, 3, 4), graph.poses[:, :3])
 
 
+def test_in_a_graph_steps_are_as_unsure_as_long_chains_of_them_are(results, tmp_path):
+    graph, out = read_results(results), tmp_path / 'chained.csv'
+    djet('export', results, '--format', 'csv', '--chained', '--output', out)
+    # Errors that agree by 0.25 with those of the next pair, by nine tenths of that with those of
+    # the one after it, and so on: the variance of the sum of a thousand, over that of as many
+    # independent ones.
+    apart = np.abs(np.subtract.outer(np.arange(1000), np.arange(1000)))
+    alike = np.where(apart > 0, 0.25 * 0.9**apart, 1.0)
+    factor = alike.sum() / 1000
+    for row, edge in zip(csv.DictReader(out.open()), graph.edges, strict=True):
+        assert float(row['cov_y_rz']) == pytest.approx(factor * edge.covariance[1, 5], rel=0.02)
+    unknown = replace(graph.edges[0], kind='unknown')
+    assert unknown.in_graph() is unknown
+
+
 def test_the_command_refuses_to_overwrite_and_says_of_lengths_that_are_unknown(
         unscaled, tmp_path):
     out = tmp_path / 'graph.g2o'

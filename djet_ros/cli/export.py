@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from djet_ros.cli.options import add_output
@@ -14,7 +15,8 @@ DESCRIPTION = """\
 Write the pose graph of a replay: a vertex for each tracked frame, and an edge for each pair with
 its relative pose and information matrix (inverse covariance). Where the scale is unknown, the
 information along the translation is weak. g2o files are read by GTSAM and g2o; csv has the
-covariances; tum and kitti have the poses alone.
+covariances; tum and kitti have the poses alone. Neighbouring pairs err alike, which a graph does
+not know: see --chained.
 """
 
 
@@ -24,12 +26,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder that 'djet replay' wrote")
     parser.add_argument('--format', choices=tuple(FORMATS), default='g2o',
                         help='default: %(default)s')
+    parser.add_argument('--chained', action='store_true',
+                        help='make edges of the odometry as unsure as they have to be where long '
+                        'chains of them meet, as djet slam does, in place of what each pair is by '
+                        'itself')
     add_output(parser, 'where the graph goes', metavar='FILE')
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
     graph = read_results(args.results)
+    if args.chained:
+        graph = replace(graph, edges=tuple(edge.in_graph() for edge in graph.edges))
     write_graph(graph, args.output, args.format, args.overwrite)
     kinds = Counter(edge.kind for edge in graph.edges)
     unscaled = sum(not edge.scale_known for edge in graph.edges)

@@ -208,9 +208,9 @@ class Config:
     """
 
     preset: str = parameter(
-        'best', 'defaults of the estimator: best (everything known to help), fast (two thirds of '
-        'the time, for small computers) or paper (the algorithm as printed); values given for '
-        'the estimator come on top', choices=PRESETS)
+        'best', 'defaults of the estimator: best (everything known to help), fast (fewer '
+        'matches in about 0.7 of the time, for small computers) or paper (the algorithm as '
+        'printed); values given for the estimator come on top', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     slam: SlamConfig = field(default_factory=SlamConfig)

@@ -24,8 +24,10 @@ _LARGE_CELLS = 20
 # Sides of large cells over that; several, for a few cells tell how much they vary to a third only.
 _SIDES = (2 / 3, 3 / 2)
 
-# Of a covariance that v independent errors tell, squared errors are Hotelling's T^2: the bound of
-# 99.9 % grows by about 1 + 20 / v + 300 / v^2. By powers of the errors' share in one direction.
+# Squared errors over a covariance that v normal errors tell are Hotelling's T^2: its bound of 99.9
+# % in five directions is that of chi^2 times 1 + 13 / v + 220 / v^2, where v is above 15. Chosen:
+# somewhat more, 1 + 20 / v + 300 / v^2, as errors have longer tails than normal ones. C cells that
+# are alike tell v = 5 C errors; their shares of the whole, squared and summed up, are 1 / C.
 _HARDLY_TOLD = 20 / 5, 300 / 25
 
 # chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large

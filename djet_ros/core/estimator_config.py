@@ -17,7 +17,7 @@ class EstimatorConfig:
     Everything that somebody would turn on the way from two images to a pose.
 
     The defaults are the preset ``best`` (everything known to help); ``preset('fast')`` takes
-    two thirds of the time, and ``preset('paper')`` gives the algorithm as printed. Raises
+    about 0.7 of the time, and ``preset('paper')`` gives the algorithm as printed. Raises
     ValueError on a value outside its described range.
     """
 

@@ -174,7 +174,7 @@ def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pos
     return replace(track, rivals=(Rival(other, 0.0),), guess=True) if guess else track
 
 
-class _Begun(NamedTuple):
+class _FirstRound(NamedTuple):
     """
     The first round: its problem, the pixels (M, 2) of its matches, and (N,) bool which.
 
@@ -191,7 +191,7 @@ class _Begun(NamedTuple):
 def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
            config: EstimatorConfig, prior: Pose | None, observe: Observer | None,
            turn: Turn | None, alive: NDArray[np.bool_],
-           ahead: Ahead | None = None) -> tuple[Track, _Begun] | None:
+           ahead: Ahead | None = None) -> tuple[Track, _FirstRound] | None:
     """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
     keypoints, placed, losses = y.copy(), y.copy(), np.full(len(y), np.nan)
     poses, begun = starts, None
@@ -219,7 +219,7 @@ def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
         problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
         basin = _basin(problem, places, poses, config, prior, turn, ahead)
-        begun = begun or _Begun(problem, places, voting, basin.rivals, basin.scale)
+        begun = begun or _FirstRound(problem, places, voting, basin.rivals, basin.scale)
         rival_poses = rival_poses or basin.rivals
         loss = Loss(config.loss, config.loss_scale * basin.scale)
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.uncertainty import compose, in_a_chain, rotated, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import compose, rotated, UNKNOWN_MOTION
 from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
@@ -208,8 +208,7 @@ class KeyframeMap:
         assert self.newest is not None
         assert self._newest_step is not None
         edges = tuple(replace(
-            edge, source=edge.source - self.first, target=edge.target - self.first,
-            covariance=in_a_chain(edge.covariance) if edge.kind == 'odometry' else edge.covariance)
+            edge.in_graph(), source=edge.source - self.first, target=edge.target - self.first)
             for edge in self.edges)
         optimised = optimise(PoseGraph(
             np.array([one.stamp_ns for one in self.keyframes]),

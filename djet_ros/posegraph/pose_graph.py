@@ -7,11 +7,11 @@ covariance (6, 6) is over (x, y, z, rotation about x, y, z) along the axes of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.uncertainty import rotated
+from djet_ros.odometry.uncertainty import in_a_chain, rotated
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,6 +104,12 @@ class Edge(Motion):
     kind: str = 'odometry'
     scale_known: bool = True
     stretch: tuple[float, float] | None = None
+
+    def in_graph(self) -> Edge:
+        """Give the edge as sure as a graph should take it, whose edges err independently."""
+        if self.kind != 'odometry':
+            return self
+        return replace(self, covariance=in_a_chain(self.covariance))
 
 
 @dataclass(frozen=True)
