@@ -26,6 +26,7 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.hamming import dense_descriptors
+from djet_ros.core.pair import Pair
 from djet_ros.core.starts import five_point, planar, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
@@ -417,8 +418,7 @@ def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
     astray = Pose(Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix(), np.array([1.0, 0.0, 0.0]))
     x, y = alone.x[:60], alone.y[:60]
     began = perf_counter()
-    stages: dict[str, float] = {}
-    estimator.estimate_matched(a, b, x, y, timings=stages, ahead=astray)
+    stages = estimator.estimate_pair(Pair(a, b, x, y, ahead=astray)).timings
     took = perf_counter() - began
     assert stages['starts'] > 0
     assert 0.8 * took < sum(stages.values()) < took

@@ -1,0 +1,33 @@
+"""All that is given of a pair, before anything is estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from djet_ros.core.starts import Known
+from djet_ros.core.tracking import Observer
+from djet_ros.core.types import Array, Pose, View
+
+
+@dataclass(frozen=True)
+class Pair:
+    """
+    Two views, matches of them, and what is known of their motion.
+
+    x, y: (N, 2) matched pixels of the previous and the current view, the surest first; before: the
+    motion before this one; known: what others than the images tell; ahead: a motion from which the
+    matches were followed, so that its basin will do as a start where none other comes near, its t
+    may be zeros; bits: (N,) in which descriptors at x and y differ, where that is known already;
+    observe: is shown each round of Algorithm 1; timings: gets the seconds of each stage.
+    """
+
+    previous: View
+    current: View
+    x: Array
+    y: Array
+    before: Pose | None = None
+    known: Known = field(default_factory=Known)
+    ahead: Pose | None = None
+    bits: Array | None = None
+    observe: Observer | None = None
+    timings: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,132 @@
+"""What is to be believed of a pair: direction of t, covariance, status."""
+
+from __future__ import annotations
+
+from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import (
+    epipolar_lines,
+    facing,
+    fit_rotation,
+    fundamental,
+    line_distances,
+    rays,
+)
+from djet_ros.core.hamming import match_distances
+from djet_ros.core.pair import Pair
+from djet_ros.core.paraboloid import quantile
+from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
+from djet_ros.core.tracking import Track, TUNING
+from djet_ros.core.types import Array, Pose, RelativePose, Status
+import numpy as np
+from scipy.special import ndtr
+
+# Bits that differ between the descriptors of matches beyond which they are no better than chance:
+# 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
+_CHANCE_BITS = 112
+
+# Parallax has to exceed the noise of the matches by this factor to be believed.
+_OUT_OF_NOISE = 3.0
+
+# Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
+_SURPRISING = 20.5
+
+# chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
+_TRUSTED = 0.5
+
+# rad; no ellipsoid spans two motions that are further from one another, as the sphere of
+# directions is bent: up to here chord and arc agree to a twentieth.
+_FAR = 0.5
+
+
+def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
+    """
+    Settle which way t points, how sure the pose is, and whether it is to be believed.
+
+    track: where Algorithm 1 ended, on the matches of the pair.
+    """
+    x, K, R = pair.x, pair.current.K, track.pose.R
+    inliers = track.inliers()
+    # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
+    rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
+    sign = facing(R, track.pose.t, rays_x, rays_y)
+    t = sign * track.pose.t
+
+    covariances = pose_covariance(
+        track.residuals, track.loss, x[track.voting], t, sign < 0)
+    hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
+                              None if pair.bits is None else (pair.y, pair.bits))
+    status = Status.OK
+    if (inliers.sum() < config.min_matches or not np.isfinite(covariances[0]).all()
+            or _by_chance(hamming[inliers])):
+        status, t = Status.DEGENERATE, np.zeros(3)
+    elif _false_alarm(track, int(inliers.sum()), pair.current.gray.shape, config):
+        status = Status.TOO_FEW_INLIERS
+    else:
+        # Where a rotation alone explains the matches, any direction of t would do.
+        R_alone = fit_rotation(rays_x, rays_y)
+        parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
+        if parallax < max(config.min_parallax, _OUT_OF_NOISE * track.scale()):
+            status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
+        else:
+            status, covariances = _judged(Pose(R, t), covariances, track, pair.before)
+    lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
+    return RelativePose(
+        status, R, t, *covariances, x=x, y=pair.y, placed=track.placed,
+        y_opt=track.y_opt, inliers=inliers, voting=track.voting,
+        residuals=line_distances(lines, pair.y),
+        hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
+        indefinite=track.indefinite, iterations=track.iterations,
+        rivals=tuple(rival.pose for rival in track.rivals))
+
+
+def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
+                 config: EstimatorConfig) -> bool:
+    """
+    Tell whether false matches would bring about a motion that as many agree with.
+
+    One that may be anywhere in a disc of the search radius r lies within w of a line through
+    its middle with a probability of at most 4 w / (pi r).
+    """
+    radius = min(config.search_radius, 0.5) * max(shape)
+    chance = 4 * TUNING.inlier * track.scale() / (np.pi * radius)
+    return false_alarms(agreeing, len(track.voting), chance) > 0
+
+
+def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
+            before: Pose | None) -> tuple[Status, tuple[Array, Array]]:
+    """
+    Tell whether rivals leave a pose unsure, and widen its covariances to span them.
+
+    Those that the covariance allows of are spanned by it already. Any other is the true motion
+    with the probability that the preference comes from noise.
+    """
+    status = Status.TWO_MOTIONS if track.guess else Status.OK
+    for rival in track.rivals:
+        off = difference(pose.R, pose.t, rival.pose)
+        if squared_distance(covariances[0], off) < _SURPRISING:
+            continue
+        undecided = rival.preference < DECIDED and not _goes_on(before, pose, rival.pose)
+        if undecided and np.linalg.norm(off) > _FAR and not track.guess:
+            status = Status.AMBIGUOUS
+        covariances = spanning(covariances[0], pose.t, off,
+                               float(ndtr(-_TRUSTED * rival.preference)))
+    return status, covariances
+
+
+def _goes_on(before: Pose | None, pose: Pose, rival: Pose) -> bool:
+    """Tell whether the motion before decides for a pose, whichever sign a rival's t may have."""
+    return before is not None and all(
+        goes_on(before, pose, Pose(rival.R, sign * rival.t)) for sign in (1, -1))
+
+
+def _by_chance(hamming: Array) -> bool:
+    """Tell of descriptor distances (N,), NaN where there is none, whether chance explains them."""
+    known = hamming[np.isfinite(hamming)]
+    return bool(known.size and np.median(known) > _CHANCE_BITS)
+
+
+def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
+    """Upper quartile of the distances in pixels of y from where rotation alone would bring x."""
+    rotated = rays_x @ (K @ R).T
+    return quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
