@@ -267,7 +267,8 @@ class Wall:
             config = replace(whole, step=step, step_share=0.2, max_iterations=rounds,
                              epsilon=1e-12, cull_outside=False, join_matches=False)
             surface = WatchedSurface(*views, x, config)
-            self.tracks.append(track_jointly(surface, camera, x, [sideways], config))
+            self.tracks.append(track_jointly(Pair(*views, x, x), surface, [sideways],
+                                             config))
             self.keypoints.append(surface.asked[-1])
             assert len(surface.asked) == self.tracks[-1].iterations == rounds
 

@@ -17,7 +17,7 @@ from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
 from djet_ros.core.memory import keep_freed_memory
-from djet_ros.core.pair import Pair
+from djet_ros.core.pair import Observer, Pair
 from djet_ros.core.parallel import both
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
@@ -27,7 +27,7 @@ from djet_ros.core.surfaces import (
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.tracking import hold, Observer, Track, track_jointly
+from djet_ros.core.tracking import hold, Track, track_jointly
 from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
 from djet_ros.core.verdict import verdict
 import numpy as np
@@ -197,8 +197,7 @@ class TwoViewEstimator:
         with _timed(pair.timings, 'jet'):
             if self.config.method == 'five_point':
                 return hold(surface, pair.current.K, pair.y, starts[0])
-            return track_jointly(surface, pair.current.K, pair.y, starts, self.config,
-                                 pair.before, pair.observe, pair.known.turn, ahead)
+            return track_jointly(pair, surface, starts, self.config, ahead)
 
     def _verdict(self, pair: Pair, track: Track) -> RelativePose:
         with _timed(pair.timings, 'result'):

@@ -1,12 +1,33 @@
-"""All that is given of a pair, before anything is estimated."""
+"""All that is given of a pair, before anything is estimated, and who looks on."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.starts import Known
-from djet_ros.core.tracking import Observer
 from djet_ros.core.types import Array, Pose, View
+
+
+@dataclass(frozen=True)
+class Round:
+    """
+    One round of Algorithm 1 on N matches, as an observer is shown it.
+
+    keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
+    warp: (N, 3, 2) through which the reference patches were seen, None where they were not warped;
+    pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
+    """
+
+    keypoints: Array
+    fits: Paraboloids
+    warp: Array | None
+    pose: Pose
+    optimum: Array
+
+
+Observer = Callable[[Round], None]
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from djet_ros.core.basins import (
     Ahead,
-    Basin,
     basin_ahead,
     basin_of,
     judged,
@@ -39,9 +36,11 @@ from djet_ros.core.jet import (
     Solution,
     with_places,
 )
+from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
 from djet_ros.core.slants import slopes_of_all
+from djet_ros.core.starts import Known
 from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -113,158 +112,188 @@ class Track:
         return inliers
 
 
-@dataclass(frozen=True)
-class Round:
-    """
-    One round of Algorithm 1 on N matches, as an observer is shown it.
-
-    keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
-    warp: (N, 3, 2) through which the reference patches were seen, None where they were not warped;
-    pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
-    """
-
-    keypoints: Array
-    fits: Paraboloids
-    warp: Array | None
-    pose: Pose
-    optimum: Array
-
-
-Observer = Callable[[Round], None]
-
-
-def track_jointly(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-                  config: EstimatorConfig, prior: Pose | None = None,
-                  observe: Observer | None = None, turn: Turn | None = None,
-                  ahead: Ahead | None = None) -> Track | None:
+def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
+                  config: EstimatorConfig, ahead: Ahead | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
-    y: (N, 2) initial keypoints in the current image. The cheapest of the refined `starts` goes
-    on; of those that the matches do not decide between, the one next to the prior, the previous
-    motion. Without any starts they are looked for around the pose ahead. Where two bodies move, it
-    is the camera's motion, as far as that can be told. None where too few matches have a usable
-    surface. observe: is called at the end of each round; turn: a rotation that was measured, which
-    tells basins and bodies apart; ahead: a pose that is likely, from which the keypoints were
-    followed: exactly enough for the first round to go by them alone.
+    surface: on the matches of the pair. The cheapest of the refined `starts` goes on; of those
+    that the matches do not decide between, the one next to the motion before. Without any starts
+    they are looked for around the pose ahead, which is likely, and from which the keypoints were
+    followed: exactly enough for the first round to go by them alone. Where two bodies move, it is
+    the camera's motion, as far as that can be told. None where too few matches have a usable
+    surface.
     """
-    found = _track(surface, K, y, starts, config, prior, observe, turn, np.ones(len(y), bool),
-                   ahead)
-    if found is None:
-        return None
-    track, begun = found
-    if len(starts) == 1:
+    everything, turn = np.ones(len(pair.y), bool), pair.known.turn
+    algorithm = _Algorithm(pair, surface, config, everything)
+    track = algorithm.run(starts, ahead)
+    if track is None or len(starts) == 1:
         return track
+    first = algorithm.first
+    untold = replace(pair, known=Known())
     if turn is not None and not turn.may_be(track.pose.R):
-        for rival in begun.rivals:
-            led = _track(surface, K, y, [rival], config, prior, observe, None,
-                         np.ones(len(y), bool))
-            if led is not None and turn.prefers(led[0].pose.R, track.pose.R):
-                track = led[0]
-    second = second_motion(begun.problem, begun.places, track.pose, begun.scale,
+        for rival in first.rivals:
+            led = _Algorithm(untold, surface, config, everything).run([rival])
+            if led is not None and turn.prefers(led.pose.R, track.pose.R):
+                track = led
+    second = second_motion(first.problem, first.places, track.pose, algorithm.noise,
                            config.min_matches)
     if second is None:
         return track
-    taken, other, guess = _of_the_camera(second, prior, turn)
+    taken, other, guess = _of_the_camera(second, pair.before, turn)
     if taken is second.pose:
-        members = np.zeros(len(y), bool)
-        members[begun.voting] = second.members
-        again = _track(surface, K, y, [taken], config, prior, observe, None, members)
-        track = again[0] if again is not None else track
+        members = np.zeros(len(pair.y), bool)
+        members[first.voting] = second.members
+        track = _Algorithm(untold, surface, config, members).run([taken]) or track
     return replace(track, rivals=(Rival(other, 0.0),), guess=True) if guess else track
 
 
-class _FirstRound(NamedTuple):
+@dataclass(frozen=True)
+class _Optimised:
     """
-    The first round: its problem, the pixels (M, 2) of its matches, and (N,) bool which.
+    Step 2 of a round: the problem of the M matches that voted, and its solution.
 
-    rivals: the poses of other basins; scale: noise of the surfaces alone, at the end.
+    voting: (N,) bool, which they are; places: (M, 2) their pixels in the previous image; rivals:
+    the poses of other basins.
     """
 
-    problem: JetProblem
-    places: Array
     voting: NDArray[np.bool_]
+    places: Array
+    problem: JetProblem
+    loss: Loss
+    solution: Solution
+    converged: bool
     rivals: tuple[Pose, ...]
-    scale: float
 
 
-def _track(surface: ResidualSurface, K: Array, y: Array, starts: list[Pose],
-           config: EstimatorConfig, prior: Pose | None, observe: Observer | None,
-           turn: Turn | None, alive: NDArray[np.bool_],
-           ahead: Ahead | None = None) -> tuple[Track, _FirstRound] | None:
-    """Run Algorithm 1 on the matches that are alive, a mask (N,) bool."""
-    keypoints, placed, losses = y.copy(), y.copy(), np.full(len(y), np.nan)
-    poses, begun = starts, None
-    # Places that were followed tell the pose well enough to sample surfaces only once: around them
-    # on its lines, as it stretches the patches.
-    by_places = ahead is not None and config.max_iterations > 1
-    warp: Array | None = None
-    rival_poses: tuple[Pose, ...] = ()
-    rivals: tuple[Rival, ...] = ()
-    plausible, ours = np.ones(len(y), bool), np.ones(len(y), bool)
-    for iteration in range(1, config.max_iterations + 1):
-        # Step 1: update the local residuals around the keypoints and fit A', b, c.
-        fits = (ReprojectionSurface(surface.x, y) if by_places else surface).around(keypoints,
-                                                                                    warp)
-        paraboloids, no_minimum = with_minimum(fits, config.indefinite)
-        # Match culling: a keypoint without a surface is out, and keeps its last loss.
-        alive = alive & paraboloids.usable
-        voting = alive & plausible & ours & (
-            # The rest is extrapolation.
-            paraboloids.minimum_within(config.window // 2) | (not config.cull_outside))
-        if voting.sum() < config.min_matches:
-            return None
-        # Step 2: global pose optimisation.
-        places = surface.x[voting]
-        problem = jet_problem(K, places, paraboloids.of(voting), TUNING.epipole_blur,
+class _Algorithm:
+    """
+    Algorithm 1 of the paper on those matches (N,) of a pair that are alive.
+
+    first: step 2 of the first round; noise: of the surfaces alone, at the end, in pixels.
+    """
+
+    first: _Optimised
+    noise: float
+
+    def __init__(self, pair: Pair, surface: ResidualSurface, config: EstimatorConfig,
+                 alive: NDArray[np.bool_]) -> None:
+        self._pair, self._surface, self._config = pair, surface, config
+        self._K = pair.current.K
+        self._keypoints, self._losses = pair.y.copy(), np.full(len(pair.y), np.nan)
+        self._alive = alive
+        self._plausible, self._ours = np.ones(len(pair.y), bool), np.ones(len(pair.y), bool)
+        self._warp: Array | None = None
+
+    def run(self, starts: list[Pose], ahead: Ahead | None = None) -> Track | None:
+        """Take rounds until the pose rests; None where too few matches have a surface."""
+        poses, most = starts, self._config.max_iterations
+        # Places that were followed tell the pose well enough to sample surfaces only once: around
+        # them on its lines, as it stretches the patches.
+        by_places = ahead is not None and most > 1
+        for number in range(1, most + 1):
+            # Step 1: update the local residuals around the keypoints and fit A', b, c.
+            fits = self._fits(by_places)
+            paraboloids, no_minimum = with_minimum(fits, self._config.indefinite)
+            # Match culling: a keypoint without a surface is out, and keeps its last loss.
+            voting = self._voting(paraboloids)
+            if voting.sum() < self._config.min_matches:
+                return None
+            # Step 2: global pose optimisation.
+            found = self._optimised(paraboloids, voting, poses, ahead,
+                                    TUNING.steps_by_places if by_places else MAX_STEPS)
+            if number == 1:
+                self.first = found
+            last = found.converged or number == most
+            if last:
+                found, placed, rivals = self._concluded(found)
+            # Keypoints go towards their optimum on the epipolar line of the new pose.
+            pose = found.solution.pose
+            optimum = _optimum_on_line(paraboloids, self._surface.x,
+                                       fundamental(self._K, pose.R, pose.t))
+            self._losses[self._alive] = paraboloids.values(optimum)[self._alive]
+            if self._pair.observe is not None:
+                self._pair.observe(Round(self._keypoints, fits, self._warp, pose, optimum))
+            if last:
+                break
+            self._advance(pose, optimum)
+            poses, by_places = [pose], False
+        minima = paraboloids.minima()
+        minima[voting] = (self._K @ found.problem.rays_y)[:2].T
+        return Track(pose, found.loss, found.solution.residuals, voting, minima, placed, optimum,
+                     self._losses, no_minimum, number, rivals)
+
+    def _fits(self, by_places: bool) -> Paraboloids:
+        """Fit surfaces around the keypoints, or take these as they are."""
+        surface = (ReprojectionSurface(self._surface.x, self._pair.y) if by_places
+                   else self._surface)
+        return surface.around(self._keypoints, self._warp)
+
+    def _voting(self, paraboloids: Paraboloids) -> NDArray[np.bool_]:
+        """Tell which matches (N,) take part in the pose; those without a surface are dead."""
+        self._alive = self._alive & paraboloids.usable
+        # Outside of the window a minimum is extrapolated.
+        within = (paraboloids.minimum_within(self._config.window // 2)
+                  | (not self._config.cull_outside))
+        return np.asarray(self._alive & self._plausible & self._ours & within)
+
+    def _optimised(self, paraboloids: Paraboloids, voting: NDArray[np.bool_], poses: list[Pose],
+                   ahead: Ahead | None, steps: int) -> _Optimised:
+        """Find the pose in the right basin of some."""
+        config, places = self._config, self._surface.x[voting]
+        problem = jet_problem(self._K, places, paraboloids.of(voting), TUNING.epipole_blur,
                               config.weigh_by_fit)
-        basin = _basin(problem, places, poses, config, prior, turn, ahead)
-        begun = begun or _FirstRound(problem, places, voting, basin.rivals, basin.scale)
-        rival_poses = rival_poses or basin.rivals
+        if len(poses) > 1:
+            basin = right_basin(problem, places, poses, config, self._pair.before,
+                                self._pair.known.turn)
+        elif not poses and ahead is not None:
+            basin = basin_ahead(problem, places, ahead, config)
+        else:
+            basin = basin_of(problem, poses[0])
         loss = Loss(config.loss, config.loss_scale * basin.scale)
-        solution = minimise(problem, basin.pose.R, basin.pose.t, loss,
-                            TUNING.steps_by_places if by_places else MAX_STEPS, basin.residuals)
+        solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps, basin.residuals)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
-        last = converged or iteration == config.max_iterations
-        if last:
-            begun = begun._replace(scale=_scale(solution.residuals.r))
-        if last and config.join_matches and config.method != 'rpe':
-            # Step 2 once more: where matches are found is a measurement of its own.
-            placed[voting] = y[voting] if warp is None else surface.placed(y, warp, voting)
-            problem, solution, loss = _joined(problem, K, placed[voting], solution, loss, config)
-        if last and rival_poses:
-            # Judge again between the basins, on all that is known.
-            solution, rivals = judged(problem, places, solution, rival_poses, loss, prior)
-        pose = solution.pose
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
-            ours[voting] = np.abs(solution.residuals.r) < TUNING.by_itself * loss.scale
-        # Keypoints go towards their optimum on the epipolar line of the new pose.
-        optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-        losses[alive] = paraboloids.values(optimum)[alive]
-        if observe is not None:
-            observe(Round(keypoints, fits, warp, pose, optimum))
-        poses, by_places = [pose], False
-        if last:
-            break
-        keypoints = np.where(alive[:, None], _advance(keypoints, optimum, config), keypoints)
-        if config.warp_reference:
-            warp, plausible = _warps(pose, K, surface.x, optimum)
-    assert begun is not None  # there is at least one iteration
-    minima = paraboloids.minima()
-    minima[voting] = (K @ problem.rays_y)[:2].T
-    return Track(pose, loss, solution.residuals, voting, minima, placed, optimum, losses,
-                 no_minimum, iteration, rivals), begun
+            self._ours[voting] = np.abs(solution.residuals.r) < TUNING.by_itself * loss.scale
+        return _Optimised(voting, places, problem, loss, solution, converged, basin.rivals)
+
+    def _concluded(self, found: _Optimised) -> tuple[_Optimised, Array, tuple[Rival, ...]]:
+        """Take in at the end where matches are found, and hold the pose against its rivals."""
+        pair, voting = self._pair, found.voting
+        rivals: tuple[Rival, ...] = ()
+        self.noise = _scale(found.solution.residuals.r)
+        placed = pair.y.copy()
+        if self._config.join_matches and self._config.method != 'rpe':
+            # Step 2 once more: where matches are found is a measurement of its own.
+            if self._warp is not None:
+                placed[voting] = self._surface.placed(pair.y, self._warp, voting)
+            found = _joined(found, self._K, placed[voting], self._config)
+        if self.first.rivals:
+            # Judge again between the basins, on all that is known.
+            solution, rivals = judged(found.problem, found.places, found.solution,
+                                      self.first.rivals, found.loss, pair.before)
+            found = replace(found, solution=solution)
+        return found, placed, rivals
+
+    def _advance(self, pose: Pose, optimum: Array) -> None:
+        """Move keypoints to where the next round samples, seen as the pose has it."""
+        self._keypoints = np.where(self._alive[:, None],
+                                   _advanced(self._keypoints, optimum, self._config),
+                                   self._keypoints)
+        if self._config.warp_reference:
+            self._warp, self._plausible = _warps(pose, self._K, self._surface.x, optimum)
 
 
-def _joined(problem: JetProblem, K: Array, y: Array, solution: Solution, loss: Loss,
-            config: EstimatorConfig) -> tuple[JetProblem, Solution, Loss]:
-    """Optimise the pose by surfaces and by where matches were found, y (N, 2), together."""
-    problem = with_places(problem, solution, K, y)
-    agreeing = np.abs(solution.residuals.r) < loss.scale
+def _joined(found: _Optimised, K: Array, y: Array, config: EstimatorConfig) -> _Optimised:
+    """Optimise the pose by surfaces and by where matches were found, y (M, 2), together."""
+    solution = found.solution
+    problem = with_places(found.problem, solution, K, y)
+    agreeing = np.abs(solution.residuals.r) < found.loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t)
-    loss = replace(loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
-    return problem, minimise(problem, solution.R, solution.t, loss, MAX_STEPS, residuals), loss
+    loss = replace(found.loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
+    return replace(found, problem=problem, loss=loss, solution=minimise(
+        problem, solution.R, solution.t, loss, MAX_STEPS, residuals))
 
 
 def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
@@ -275,16 +304,6 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
     return Track(pose, Loss(), residuals, voting, paraboloids.minima(), y, optimum,
                  paraboloids.values(optimum), 0, 0)
-
-
-def _basin(problem: JetProblem, places: Array, poses: list[Pose], config: EstimatorConfig,
-           prior: Pose | None, turn: Turn | None, ahead: Ahead | None) -> Basin:
-    """Take the right basin of several poses, of those around one ahead, or of the only one."""
-    if len(poses) > 1:
-        return right_basin(problem, places, poses, config, prior, turn)
-    if not poses and ahead is not None:
-        return basin_ahead(problem, places, ahead, config)
-    return basin_of(problem, poses[0])
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None
@@ -334,7 +353,7 @@ def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
     return np.asarray(paraboloids.centres + v)
 
 
-def _advance(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array:
+def _advanced(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array:
     """Move keypoints towards their optimum by the chosen strategy ("Keypoint iterations")."""
     way = optimum - keypoints
     if config.step == 'share':

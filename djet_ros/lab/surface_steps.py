@@ -10,9 +10,9 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import epipolar_lines, fundamental, line_distances
 from djet_ros.core.hamming import describable
+from djet_ros.core.pair import Round
 from djet_ros.core.paraboloid import indefinite
 from djet_ros.core.surfaces import DescriptorDistances
-from djet_ros.core.tracking import Round
 from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.errors import DjetError
 from djet_ros.lab import panels
