@@ -1,12 +1,8 @@
-"""How the programs use threads and memory; to be called before NumPy and OpenCV are imported."""
+"""How the programs use threads; to be called before NumPy and OpenCV are imported."""
 
 from __future__ import annotations
 
-import ctypes
 import os
-
-# Parameters of glibc's mallopt: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, in bytes.
-_LARGEST_KEPT, _MOST_KEPT = -3, -1
 
 # Rounds in which OpenCV's threads look for work, or for the end of it, before they sleep.
 _LOOKING = ('OPENCV_THREAD_POOL_ACTIVE_WAIT_MAIN', 'OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER')
@@ -34,16 +30,3 @@ def sleep_while_waiting() -> None:
     """
     for variable in _LOOKING:
         os.environ.setdefault(variable, '0')
-
-
-def keep_freed_memory() -> None:
-    """
-    Have the C library keep what one frame has freed for the next, where it is glibc.
-
-    It gives arrays of some size back to the system at once, and fresh pages for the same arrays of
-    each frame took a fifteenth of the time. Programs hold up to 64 MB more for it.
-    """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt is not None:
-        mallopt(_LARGEST_KEPT, 1 << 26)
-        mallopt(_MOST_KEPT, 1 << 26)

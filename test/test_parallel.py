@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from threading import Barrier, BrokenBarrierError, Event, get_ident
 
 import cv2
-from djet_ros.core.parallel import begun, both, each
+from djet_ros.core.parallel import both, each, started_beside
 import pytest
 
 
@@ -53,22 +53,22 @@ def test_many_things_within_one_another_wait_for_none_that_was_not_begun(threads
 
 def test_what_is_begun_is_under_way_before_it_is_needed(threads: int) -> None:
     done = Event()
-    wait_for_it = begun(lambda: done.set() or get_ident())
+    wait_for_it = started_beside(lambda: done.set() or get_ident())
     assert done.wait(20 if threads == 2 else 0.05) is (threads == 2)
     assert (wait_for_it() == get_ident()) is (threads == 1)
 
 
 def test_an_error_in_what_was_begun_comes_out_where_it_is_needed(threads: int) -> None:
-    later = begun(lambda: 1 // 0)
+    later = started_beside(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         later()
 
 
 def test_what_was_begun_leaves_the_other_core_to_what_is_done_meanwhile(threads: int) -> None:
-    here, there = begun(lambda: both(get_ident, get_ident))()
+    here, there = started_beside(lambda: both(get_ident, get_ident))()
     assert here == there
 
 
 def test_more_may_be_begun_than_there_are_threads(threads: int) -> None:
-    later = [begun(lambda number=number: number**2) for number in range(40)]
+    later = [started_beside(lambda number=number: number**2) for number in range(40)]
     assert [one() for one in later] == [number**2 for number in range(40)]

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from djet_ros import __version__
 from djet_ros.errors import DjetError
-from djet_ros.threads import keep_freed_memory, one_blas_thread, sleep_while_waiting
+from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 # Only the module of the command that is called gets imported: help is quick, and no command
 # needs the libraries of another.
@@ -61,7 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code is 2 for what the user can mend, 130 for Ctrl-C."""
     one_blas_thread()
     sleep_while_waiting()
-    keep_freed_memory()
     try:
         code = run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()

@@ -9,7 +9,7 @@ import signal
 import sys
 from threading import Event
 
-from djet_ros.threads import keep_freed_memory, one_blas_thread, sleep_while_waiting
+from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
 Topics, parameters and the rest are given as to every ROS node:
@@ -40,7 +40,6 @@ def _run(name: str, description: str, *, without_ros: str,
     """
     one_blas_thread()
     sleep_while_waiting()
-    keep_freed_memory()
     stop = Event()
     # First of all: the imports take their time, and end no worse than anything later.
     for number in (signal.SIGINT, signal.SIGTERM):

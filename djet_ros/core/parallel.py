@@ -54,9 +54,9 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
     return [shares[i % 2][i // 2] for i in range(len(tasks))]
 
 
-def begun(work: Callable[[], Result]) -> Callable[[], Result]:
+def started_beside(work: Callable[[], Result]) -> Callable[[], Result]:
     """
-    Begin something that is needed later; gives what waits for its result, to be called once.
+    Start something that is needed later; gives what waits for its result, to be called once.
 
     Where there is one thread, or none had time to begin it, it is done when it is needed.
     """

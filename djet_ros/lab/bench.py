@@ -17,7 +17,7 @@ import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.orb_pattern import REACH
-from djet_ros.core.parallel import begun
+from djet_ros.core.parallel import started_beside
 from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
@@ -111,7 +111,7 @@ class _Pipeline:
         start = perf_counter()
         view = self._ahead or self._view_of(index)
         last = len(self._sequence) - 1
-        following = begun(lambda: self._view_of(min(index + 1, last)))
+        following = started_beside(lambda: self._view_of(min(index + 1, last)))
         if self._view is not None:
             self._prior = self._estimator.estimate(self._view, view, self._prior)
         self._view, self._ahead = view, following()

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.parallel import begun
+from djet_ros.core.parallel import started_beside
 from djet_ros.core.types import Array, STARTED, TRACKED, View
 from djet_ros.odometry.beside import Beside
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
@@ -188,7 +188,7 @@ class Tracker:
         camera, estimator = self._camera, self._odometry.estimator
         # What is left out of an image may not be known yet.
         whole = not (self._hides or self.config.odometry.mask)
-        self._expected.append(_Expected(message, camera, estimator, begun(
+        self._expected.append(_Expected(message, camera, estimator, started_beside(
             lambda: _seen(message, camera, estimator if whole else None))))
 
     def _see(self, message: Any, camera: Camera) -> _Seen:

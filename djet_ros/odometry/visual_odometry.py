@@ -179,7 +179,7 @@ class VisualOdometry:
         if self._stands_still(frame, relative):
             return self._stay(frame, relative, self._one_scale.of_rest(span))
         relative = self._weighed(frame, self._by_depths(relative), known.turn)
-        relative = self._begun(frame, relative)
+        relative = self._doubted_at_rest(frame, relative)
         if relative.status not in TRACKED:
             return self._lose(frame, view, relative, self._one_scale.of_rest(span))
 
@@ -243,7 +243,7 @@ class VisualOdometry:
         return fused(relative, turn) if agreed else replace(
             relative, status=Status.DEGENERATE, t=np.zeros(3))
 
-    def _begun(self, frame: Frame, relative: RelativePose) -> RelativePose:
+    def _doubted_at_rest(self, frame: Frame, relative: RelativePose) -> RelativePose:
         """
         Doubt that a camera has begun to move whose gyro feels nothing.
 
