@@ -9,6 +9,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import jet_problem, Loss
+from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import false_alarms, goes_on, preferences
 from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import all_round
@@ -126,10 +127,8 @@ def test_the_motion_before_decides_between_them() -> None:
 
 def going_on(x: np.ndarray, y: np.ndarray, before: Pose) -> RelativePose:
     """Estimate from matches that were found where a motion before foresaw them."""
-    residuals = np.random.default_rng(7).normal(0, NOISE, len(x))
-    prior = RelativePose(Status.OK, before.R, before.t, residuals=residuals)
-    return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
-        uniform_view(), uniform_view(), x, y, prior, ahead=before)
+    return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_pair(
+        Pair(uniform_view(), uniform_view(), x, y, before, ahead=before))
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
