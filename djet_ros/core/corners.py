@@ -163,7 +163,7 @@ def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
     points = _exact_peaks(slopes, rows, columns)
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
     inside = describable(_pixels(points), image.shape) & ~at(mask, (points + 0.5) * zoom - 0.5)
-    points, rows, columns = points[inside], rows[inside], columns[inside]
+    points, rows, columns = points.compress(inside, axis=0), rows[inside], columns[inside]
     strengths = slopes[rows, columns]
     chosen = spread_out(_pixels(points), strengths, most, lonely[rows, columns])
     points, strengths = points[chosen], strengths[chosen]

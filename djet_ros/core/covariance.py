@@ -121,7 +121,7 @@ class _Cells:
     def of(cls, H: Array, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
         """Sum matches at pixels (N, 2) by small cells, with their J (5, N), weights and r (N,)."""
         order, first = _by_cell(places, CELL)
-        J, weights, r = J[:, order], weights[order], r[order]
+        J, weights, r = J.take(order, axis=1), weights[order], r[order]
         weighed = J * weights
         rows, columns = _UPPER
         terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed])
@@ -134,7 +134,7 @@ class _Cells:
         side = max(side, CELL)
         order, first = _by_cell(self.places, side)
         return _Cells(self.whole, self.inverse, side, self.places[order[first]],
-                      np.add.reduceat(self.sums[:, order], first, axis=1))
+                      np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
 
     def __len__(self) -> int:
         return len(self.places)
@@ -269,7 +269,7 @@ def _jackknife(cells: _Cells, without: Array, together: float) -> Array:
 def summed_by_cell(places: Array, values: Array) -> Array:
     """Sum values (V, N) of matches at pixels (N, 2) over the C small cells in use, (V, C)."""
     order, first = _by_cell(places, CELL)
-    return np.asarray(np.add.reduceat(values[:, order], first, axis=1))
+    return np.asarray(np.add.reduceat(values.take(order, axis=1), first, axis=1))
 
 
 def _by_cell(places: Array, side: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -223,8 +223,8 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
         same = (np.rint(known[0]) == y_pixels).all(1)
         distances[same] = known[1][same]
         wanted &= ~same
-    differing = (descriptor_bits(smoothed_a, x_pixels[wanted])
-                 != descriptor_bits(smoothed_b, y_pixels[wanted]))
+    differing = (descriptor_bits(smoothed_a, x_pixels.compress(wanted, axis=0))
+                 != descriptor_bits(smoothed_b, y_pixels.compress(wanted, axis=0)))
     distances[wanted] = differing.view(np.uint8).sum(0, dtype=np.uint16)
     return distances
 

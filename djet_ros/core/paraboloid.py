@@ -51,8 +51,10 @@ class Paraboloids:
 
     def of(self, chosen: NDArray[Any]) -> Paraboloids:
         """Give those at some places, a mask (N,) bool or indices."""
-        return Paraboloids(self.centres[chosen], self.A[chosen], self.b[chosen], self.c[chosen],
-                           self.usable[chosen])
+        # To take is three to six times as fast as to index, of whatever has several axes.
+        places = np.arange(len(self.c))[chosen]
+        return Paraboloids(*(values.take(places, axis=0) for values in (
+            self.centres, self.A, self.b, self.c, self.usable)))
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
         """(N,) bool mask of those whose minimum lies at most so far off, along either axis."""

@@ -47,7 +47,7 @@ def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Arr
     Gives pixels (N, 2). R: (3, 3) its next turn; before: its motion up to the previous image. A
     feature moves beyond the turn as the nearest inlier of that motion will.
     """
-    x, y = before.x[before.inliers], before.y_opt[before.inliers]
+    x, y = (places.compress(before.inliers, axis=0) for places in (before.x, before.y_opt))
     turned = rays(K, previous.points) @ R.T
     if not before.t.any() or not len(x):
         return _seen(K, turned)

@@ -101,7 +101,8 @@ class _OfImages:
 
     def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
         """Places (M, 2) by gray levels."""
-        return place_exactly(self._there, self._here, self.x[chosen], y[chosen], warp[chosen])
+        return place_exactly(self._there, self._here, *(
+            values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
 
 class DescriptorSurface(_OfImages):
@@ -138,8 +139,9 @@ class DescriptorSurface(_OfImages):
         # Most matches rest from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
+        there, here, seen = (values.compress(anew, axis=0) for values in (self.x, y, warp))
         return self._kept(anew, usable, y, self._distances.between_pixels(
-            self._previous.floating, self.x[anew], self._current, y[anew], warp[anew],
+            self._previous.floating, there, self._current, here, seen,
             self._contrast_around(y, usable), CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
@@ -374,6 +376,7 @@ def _put(paraboloids: Paraboloids, fitted: Paraboloids,
          places: NDArray[np.bool_]) -> Paraboloids:
     """Give the paraboloids with those at some places (N,) bool replaced by fitted ones."""
     arrays = {name: getattr(paraboloids, name).copy() for name in ('centres', 'A', 'b', 'c')}
+    indices = np.flatnonzero(places)
     for name, array in arrays.items():
-        array[places] = getattr(fitted, name)
+        array[indices] = getattr(fitted, name)
     return replace(paraboloids, **arrays)

@@ -379,10 +379,10 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     warp = np.where(plausible[:, None, None], warp, np.eye(3, 2))
     # Neighbours tell how the surface leans that a patch is on.
     there = np.flatnonzero(plausible)
-    x, y = x[there], y[there]
-    rho, sigma = inverse_depths(pose.R, pose.t, rays_x[there], rays_y[there])
+    x, y, rays_x, rays_y = (places.take(there, axis=0) for places in (x, y, rays_x, rays_y))
+    rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
     slopes = slopes_of_all(x, rho, TUNING.off / K[0, 0] * sigma)
-    leaning = warp[there] + slant_warp(K, pose.t, y, seen[there], slopes)
+    leaning = warp.take(there, axis=0) + slant_warp(K, pose.t, y, seen[there], slopes)
     alike = comparable(leaning)
     warp[there[alike]] = leaning[alike]
     return warp, plausible
