@@ -12,7 +12,12 @@ from djet_ros.odometry.messages import MessageType
 
 @dataclass(frozen=True)
 class Profile:
-    """Quality of service; depth None keeps all, which makes a reliable publisher wait."""
+    """
+    Quality of service; depth None keeps what comes until it is taken.
+
+    Where it is not taken, that makes reliable publishers wait which keep all, too, or it loses
+    the oldest: see ``Middleware.senders_wait``.
+    """
 
     reliable: bool = True
     depth: int | None = 10
@@ -71,6 +76,9 @@ class Middleware(Protocol):
 
     # What to set where a publisher's quality of service does not fit.
     qos_remedy: str
+
+    # Whether publishers can be made to wait for a subscription that does not take messages.
+    senders_wait: bool
 
     @property
     def node(self) -> str:

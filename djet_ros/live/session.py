@@ -33,6 +33,13 @@ _DIAGNOSTICS_PERIOD = 1.0
 # Messages of what comes beside the images that may wait for the next one.
 _WAITING_BESIDE = 10_000
 
+# Bytes of images that may wait, and of what came beside them. By bytes, as a thousand small images
+# are a short delay, and a thousand large ones more memory than a robot has.
+ROOM = 500_000_000
+
+# Bytes that a message takes beside its pixels, about.
+_MESSAGE = 4_000
+
 # Seconds for which an image waits for what belongs to it: the gyro's rates, its mask.
 _PATIENCE = 0.1
 
@@ -122,9 +129,9 @@ class Session:
     Works on images in a thread of its own, in the order in which they come.
 
     topics: resolved names of 'image' and 'camera_info', for people. Messages may come from any
-    one thread; everything else may be called from any thread. With the queue policy 'every'
-    ``image`` waits where the queue is full. What is published for one image is published as a
-    whole or not at all, and nothing of before a reset or a stop after it.
+    one thread, and never have to wait: images beyond ROOM are dropped and counted. Everything else
+    may be called from any thread. What is published for one image is published as a whole or not
+    at all, and nothing of before a reset or a stop after it.
     """
 
     def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
@@ -132,17 +139,17 @@ class Session:
         self._tracker = tracker
         self._wiring = wiring
         self._topics = topics
-        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size)
+        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size, ROOM)
         # Held while an image is worked on and published, and by what happens in between.
         self._lock = Lock()
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
         # What came beside the images, each with the name of the tracker's method that takes it.
-        self._beside: deque[tuple[str, Any]] = deque(maxlen=_WAITING_BESIDE)
+        self._beside: FrameQueue[tuple[str, Any]] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
         self._came = Event()
         self._came_at = -np.inf
-        self._counted_drops = self._lost = 0
+        self._counted_drops = self._lost = self._counted_lost = 0
         self._said_drops = False
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
@@ -178,13 +185,13 @@ class Session:
 
     @property
     def has_room(self) -> bool:
-        """Whether an image would be taken at once; with the policy 'every' it may have to wait."""
+        """Whether an image is welcome; with the policy 'every' its sender had better wait."""
         return self._queue.has_room
 
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""
         self._last_image = monotonic()
-        self._queue.put(_Received(message, self._newest_info, self._last_image))
+        self._queue.put(_Received(message, self._newest_info, self._last_image), _bytes(message))
 
     def camera_info(self, message: Any) -> None:
         """Take a CameraInfo; it holds for the images that come after it."""
@@ -215,7 +222,7 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._beside.append((what, message))
+        self._beside.put((what, message), _bytes(message))
         self._came_at = monotonic()
         self._came.set()
 
@@ -235,7 +242,7 @@ class Session:
             self._beside.clear()
             self._latencies.clear()
             self._log.clear()
-            self._counted_drops, self._lost = self._queue.dropped, 0
+            self._counted_drops, self._lost, self._counted_lost = self._queue.dropped, 0, 0
             self._said_drops = False
             self._tracker.reset()
             self._say()
@@ -322,8 +329,9 @@ class Session:
                     if received.at > self._forgotten:
                         self._process(received)
         finally:
-            # Nobody may wait for room that no one will make.
+            # What comes from now on is kept for nobody.
             self._queue.close()
+            self._beside.close()
 
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
@@ -363,8 +371,8 @@ class Session:
 
     def _hand_on(self) -> None:
         """Give the tracker what came beside the images."""
-        while self._beside:
-            what, message = self._beside.popleft()
+        while (one := self._beside.get(timeout=0)) is not None:
+            what, message = one
             getattr(self._tracker, what)(message)
 
     def _mount_beside(self, image_frame: str) -> None:
@@ -378,6 +386,9 @@ class Session:
             self._note(found)
 
     def _count_drops(self) -> None:
+        if lost := self._lost - self._counted_lost:
+            self._counted_lost += lost
+            self._tracker.count_lost(lost)
         new = self._queue.dropped - self._counted_drops
         if new:
             self._counted_drops += new
@@ -428,3 +439,8 @@ class Session:
             if one.name not in self._complained:
                 self._log.warn(one.name, f'{one.name}: {one.text}')
         self._complained = {one.name for one in complaints}
+
+
+def _bytes(message: Any) -> int:
+    """Tell about how much memory a message takes; of those that come, images alone are large."""
+    return _MESSAGE + len(getattr(message, 'data', ()))

@@ -316,6 +316,10 @@ class Tracker:
         self.counts.dropped[reason] += number
         self._health.dropped(reason, number)
 
+    def count_lost(self, number: int) -> None:
+        """Take notice of images that were sent and never came."""
+        self._health.dropped('lost', number)
+
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
