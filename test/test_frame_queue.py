@@ -89,16 +89,14 @@ def test_what_is_heavier_than_the_room_is_taken_by_itself(policy):
 
 
 def test_every_tells_when_a_sender_had_better_wait():
-    queue = FrameQueue('every', 2, room=10)
-    assert queue.has_room
-    queue.put('light', 1)
-    queue.put('light', 1)
+    queue = FrameQueue('every', 1, room=10)
+    for taken in range(5):
+        assert queue.has_room
+        assert queue.weight == 2 * taken
+        queue.put('light', 2)
     assert not queue.has_room
     queue.get()
     assert queue.has_room
-    queue.put('heavy', 11)
-    queue.get()
-    assert not queue.has_room
 
 
 def test_the_newest_is_always_welcome():

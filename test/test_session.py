@@ -178,6 +178,8 @@ def test_a_sender_without_end_fills_no_memory_and_is_complained_of(live, drive, 
     assert 'images dropped under load' in one.graph.heard('/diagnostics')[-1].status[0].message
     assert 'lower their rate (that of a player, too)' in one.graph.said()[
         'to mend: images dropped under load']
+    assert any('MB of images wait to be worked on' in line for line in one.graph.lines)
+    assert 'to mend: images pile up' not in one.graph.said()
 
 
 def test_images_that_were_lost_on_the_way_are_complained_of(live, drive):

@@ -180,11 +180,11 @@ class NodeConfig:
         'number of its own)', minimum=1, maximum=1000)
     queue_policy: str = parameter(
         'latest', 'latest (under load old frames are dropped and counted) or every (none is '
-        'dropped before 500 MB of them wait: for a bag played into the node)',
+        'dropped unless 500 MB of them wait: for a bag played into the node)',
         choices=('latest', 'every'))
     queue_size: int = parameter(
-        2, 'frames that may wait; beyond it latest drops the oldest, and every lets senders wait '
-        'that can (without ROS; to ROS none can)', minimum=1, maximum=1000)
+        2, 'frames that may wait with queue_policy latest; beyond it the oldest is dropped',
+        minimum=1, maximum=1000)
     publish_tf: bool = parameter(
         False, 'whether the integrated pose is also published as odom_frame -> camera frame on tf')
     publish_path: bool = parameter(

@@ -15,7 +15,7 @@ class FrameQueue(Generic[Item]):
     First in, first out, for any number of threads; whoever puts something in never waits.
 
     Policy 'latest': where ``size`` items wait already, the oldest is dropped and counted.
-    Policy 'every': all wait, and ``has_room`` tells from ``size`` on that a sender had better wait.
+    Policy 'every': all wait, however many.
     Where those that wait weigh ``room`` or more, one is dropped and counted with either policy:
     the oldest with 'latest', with 'every' the one that comes.
     """
@@ -71,10 +71,15 @@ class FrameQueue(Generic[Item]):
 
     @property
     def has_room(self) -> bool:
-        """Whether an item is welcome now; with policy 'latest' it always is."""
+        """Whether an item would be taken now; with policy 'latest' any is."""
         with self._changed:
-            return self._drops or self._closed or (
-                len(self._items) < self._size and self._weight < self._room)
+            return self._drops or self._closed or self._weight < self._room
+
+    @property
+    def weight(self) -> float:
+        """Weigh the items that wait."""
+        with self._changed:
+            return self._weight
 
     def clear(self) -> int:
         """Throw away what waits, and tell how many items that was."""

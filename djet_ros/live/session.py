@@ -18,6 +18,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.diagnostics import LEVELS, State
+from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -185,7 +186,7 @@ class Session:
 
     @property
     def has_room(self) -> bool:
-        """Whether an image is welcome; with the policy 'every' its sender had better wait."""
+        """Whether an image would be taken; with the policy 'every' it may be better to wait."""
         return self._queue.has_room
 
     def image(self, message: Any) -> None:
@@ -336,7 +337,7 @@ class Session:
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
-        tracker.face_values = self._face_values()
+        self._tell_of_the_face()
         self._take_info(received.info)
         self._hand_on()
         frame = received.image.header.frame_id
@@ -406,6 +407,16 @@ class Session:
             self._publish(self._tracker.camera_info(info))
             self._log_trouble()
 
+    def _tell_of_the_face(self) -> None:
+        self._tracker.face_values = self._face_values()
+        waiting = self._queue.weight
+        # To be said before anything is lost.
+        self._tracker.face_complaints = [] if waiting < ROOM / 2 else [Complaint(
+            'images pile up', 'WARN', (
+                f'{waiting * 1e-6:.0f} MB of images wait to be worked on; from {ROOM * 1e-6:.0f} '
+                'MB on senders wait that can, and what others send is lost; lower their rate '
+                '(that of a player, too), their size or estimator.max_features'))]
+
     def _face_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
                 'queue policy': self._tracker.config.ros.queue_policy,
@@ -419,7 +430,7 @@ class Session:
         self._wiring.publish(outgoing)
 
     def _say(self) -> None:
-        self._tracker.face_values = self._face_values()
+        self._tell_of_the_face()
         self._publish([self._tracker.diagnostics(time_ns())])
 
     def _log_trouble(self) -> None:

@@ -84,6 +84,7 @@ class Tracker:
         self.config = config
         # What a face adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
+        self.face_complaints: list[Complaint] = []
         self._message_type = message_type
         self._image_topic = image_topic
         self._speed_topics = speed_topics
@@ -323,7 +324,8 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside]
+        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside,
+                *self.face_complaints]
 
     @property
     def complaints_beside(self) -> list[Complaint]:
