@@ -400,6 +400,15 @@ def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
         Graph({**ENVIRONMENT, 'ROS_DOMAIN_ID': '232', 'CYCLONEDDS_URI': uri}).close()
 
 
+def test_a_graph_that_was_left_can_be_entered_again():
+    from djet_ros.dds.graph import Graph
+    elsewhere = {**ENVIRONMENT, 'ROS_DOMAIN_ID': '231'}
+    with Graph(elsewhere) as first:
+        pass
+    with Graph(elsewhere) as second:
+        assert second is not first
+
+
 # Without a graph
 
 def test_names_are_resolved_and_remapped_as_in_ros():

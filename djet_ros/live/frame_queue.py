@@ -46,7 +46,7 @@ class FrameQueue(Generic[Item]):
             if self._closed:
                 return False
             while self._items and (self._weight >= self._room
-                                   or self._drops and len(self._items) == self._size):
+                                   or (self._drops and len(self._items) == self._size)):
                 self._dropped += 1
                 if not self._drops:
                     return False
