@@ -36,7 +36,7 @@ _EVENTS_PERIOD = 1.0
 # Messages in the middleware of who keeps what comes. To ROS, KEEP_ALL has no bound that could be
 # set: Cyclone DDS takes gigabytes, and no publisher waits. All are taken as soon as Python gets to
 # run, for which this is enough.
-_KEPT = 32
+_KEPT = 50
 
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
