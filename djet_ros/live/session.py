@@ -31,8 +31,8 @@ _LOG_PERIOD = 5.0
 # Seconds after which diagnostics come also where no image makes the tracker say them.
 _DIAGNOSTICS_PERIOD = 1.0
 
-# Messages of what comes beside the images that may wait for the next one.
-_WAITING_BESIDE = 10_000
+# Messages of what comes beside the images that may wait for them: minutes of an IMU.
+_WAITING_BESIDE = 100_000
 
 # Bytes of images that may wait, and of what came beside them. By bytes, as a thousand small images
 # are a short delay, and a thousand large ones more memory than a robot has.
@@ -77,6 +77,14 @@ class _Received(NamedTuple):
 
     image: Any
     info: Any
+    at: float
+
+
+class _Beside(NamedTuple):
+    """A message beside the images, the tracker's method that takes it, and when it came."""
+
+    what: str
+    message: Any
     at: float
 
 
@@ -146,8 +154,7 @@ class Session:
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        # What came beside the images, each with the name of the tracker's method that takes it.
-        self._beside: FrameQueue[tuple[str, Any]] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
+        self._beside: FrameQueue[_Beside] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
         self._came = Event()
         self._came_at = -np.inf
         self._counted_drops = self._lost = self._counted_lost = 0
@@ -223,8 +230,8 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._beside.put((what, message), _bytes(message))
         self._came_at = monotonic()
+        self._beside.put(_Beside(what, message, self._came_at), _bytes(message))
         self._came.set()
 
     def count_lost(self, number: int) -> None:
@@ -302,6 +309,8 @@ class Session:
             return
         try:
             silent = monotonic() - self._last_image > SILENCE
+            if not len(self._queue):
+                self._hand_on(np.inf)
             if silent:
                 # No image waits that came before this CameraInfo.
                 self._take_info(self._newest_info)
@@ -339,7 +348,7 @@ class Session:
         self._count_drops()
         self._tell_of_the_face()
         self._take_info(received.info)
-        self._hand_on()
+        self._hand_on(self._present(received))
         frame = received.image.header.frame_id
         if not tracker.mounted:
             self._mount(frame)
@@ -362,19 +371,31 @@ class Session:
         while not self._stopping and received.at > self._forgotten:
             self._came.clear()
             with self._lock:
-                self._hand_on()
-                lacking = self._tracker.lacks(received.image)
+                self._hand_on(self._present(received))
+                while (lacking := self._tracker.lacks(received.image)) and self._hand_on_next(
+                        received.at + _LONGEST_PATIENCE):
+                    pass
             since = max(received.at, self._came_at) if patient else received.at
             left = min(since + _PATIENCE, latest) - monotonic()
             if not lacking or left <= 0:
                 return
             self._came.wait(left)
 
-    def _hand_on(self) -> None:
-        """Give the tracker what came beside the images."""
-        while (one := self._beside.get(timeout=0)) is not None:
-            what, message = one
-            getattr(self._tracker, what)(message)
+    def _present(self, received: _Received) -> float:
+        """Tell until when messages count for an image: what came later is for those that wait."""
+        return received.at if len(self._queue) else np.inf
+
+    def _hand_on(self, until: float) -> None:
+        """Give the tracker what came beside the images until a moment; it keeps but some of it."""
+        while self._hand_on_next(until):
+            pass
+
+    def _hand_on_next(self, until: float) -> bool:
+        waiting = self._beside.peek()
+        if waiting is None or waiting.at > until or (one := self._beside.get(timeout=0)) is None:
+            return False
+        getattr(self._tracker, one.what)(one.message)
+        return True
 
     def _mount_beside(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.wanted_mountings(image_frame).items():
