@@ -389,7 +389,8 @@ def live_loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
             found, memory = mapped_live(source, rate, graph, heard)
             row, share = live_row(source, heard, found)
             rows.append([f"{size.replace('x', '×')}, {rate} a second", *row, f'{memory:.0f} MB'])
-            kept.append(f"{share}, {found['relative poses missing']} relative poses missing")
+            kept.append(f"{share}, {found['relative poses missing']} relative poses missing, "
+                        f"{found['keyframes without image']} keyframes without image")
     return {'how': '`djet play`, `djet live`, the pose graph on Cyclone DDS, parameters as they '
                    'stand, and a listener as processes on two cores; the block driven twice, 427 '
                    'images. Lengths by structure alone: APE after alignment with scale. Frames '
