@@ -109,7 +109,7 @@ class Middleware(Protocol):
         Hand the messages on a topic, by its resolved name, to a callback.
 
         ready: asked before each message; while it says no, messages wait in the middleware, and
-        those of other topics go on.
+        those of other topics go on. Only to be asked where senders wait.
         """
 
     def offers(self, topic: str) -> Sequence[Offer]:
