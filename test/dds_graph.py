@@ -88,13 +88,13 @@ class Peer:
 
 
 class Command:
-    """A djet command in a process of its own, with what it writes."""
+    """A djet command in a process of its own; before: what its Python is to do first."""
 
-    def __init__(self, log: Path, *words: str | Path) -> None:
+    def __init__(self, log: Path, *words: str | Path, before: str = '') -> None:
         self.path = log
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [sys.executable, '-c', 'from djet_ros.cli.main import main; '
+                [sys.executable, '-c', f'{before}from djet_ros.cli.main import main; '
                  'raise SystemExit(main())', *map(str, words)],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 

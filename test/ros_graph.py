@@ -125,14 +125,14 @@ class NodeProcess:
     """The node under test in a process of its own, with its log."""
 
     def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any],
-                 name: str = 'vo_node') -> None:
+                 name: str = 'vo_node', before: str = '') -> None:
         """Start it with words for ROS, such as remappings, and with parameters by name."""
         self.path = log
         values = [word for name, value in parameters.items()
                   for word in ('-p', f'{name}:={json.dumps(value)}')]
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [*command(name), '--ros-args', *words, *values],
+                [*command(name, before), '--ros-args', *words, *values],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 
     @property
@@ -163,9 +163,11 @@ def nodes(folder: Path, image: str) -> Iterator[Callable[..., NodeProcess]]:
     """Give a function that starts a node on images, and end all of them with clean logs."""
     started: list[NodeProcess] = []
 
-    def start(*words: str, name: str = 'vo_node', **parameters: Any) -> NodeProcess:
+    def start(*words: str, name: str = 'vo_node', before: str = '',
+              **parameters: Any) -> NodeProcess:
         log = folder / f'{name}_{len(started)}.log'
-        started.append(NodeProcess(log, [*words, '-r', f'image:={image}'], parameters, name))
+        started.append(NodeProcess(log, [*words, '-r', f'image:={image}'], parameters, name,
+                                   before))
         return started[-1]
 
     yield start

@@ -303,6 +303,21 @@ def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Driv
     assert monotonic() - start < 3
 
 
+def test_images_that_pile_up_still_have_what_came_with_them(live: Any, drive: Drive) -> None:
+    session, one, graph = live(**{'odometry.mask': True})
+    all_free = np.full(SIZE[::-1], 255, np.uint8)
+    for i in range(200):
+        session.mask(drive.image(i, all_free))
+        session.image(drive.image(i, drive.images[i % len(drive.images)]))
+    wait_for(one, 200)
+    session.configure(one.config)  # let in when the last image is done with
+    assert one.counts.processed == 200
+    said = [status.message for topic, message in graph.published if topic == '/diagnostics'
+            for status in message.status]
+    assert said
+    assert not any('no mask in time' in line for line in said)
+
+
 # Masks
 
 def test_masked_pixels_give_no_feature_and_no_surface(drive: Drive) -> None:

@@ -67,8 +67,9 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
     """Give a function that starts a djet command; it has ended, without a traceback, at last."""
     started: list[Command] = []
 
-    def run(*words: str | Path) -> Command:
-        started.append(Command(tmp_path / f'{words[0]}_{len(started)}.log', *words))
+    def run(*words: str | Path, before: str = '') -> Command:
+        started.append(Command(tmp_path / f'{words[0]}_{len(started)}.log', *words,
+                               before=before))
         return started[-1]
 
     yield run
@@ -82,8 +83,8 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
 @pytest.fixture
 def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[..., Command]]:
     """Give a function that starts djet live, and waits until its topics are there."""
-    def run(*words: str, topic: str = IMAGE) -> Command:
-        one = start('live', '-r', f'image:={topic}', *words)
+    def run(*words: str, topic: str = IMAGE, before: str = '') -> Command:
+        one = start('live', '-r', f'image:={topic}', *words, before=before)
         for output in TYPES:
             graph_peer.wait(output, lambda output=output: graph_peer.graph.offers(output))
         for messages in graph_peer.heard.values():
@@ -162,6 +163,25 @@ def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
     assert int(peer.said()['frames processed']) > FRAMES // 2
     if reliability == 'reliable':
         assert peer.said()['frames lost on the way'] == '0'
+
+
+def test_a_sender_without_end_waits_and_nothing_is_lost(live, peer, drive):
+    # Each end keeps 32 images beside those that wait for work.
+    room = 10 * drive[0].nbytes
+    live(*EVERY, *FAST, before=f'from djet_ros.live import session; session.ROOM = {room}; ')
+    infos = peer.advertise(INFO, INFO_TYPE)
+    images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(depth=None))
+    infos.publish(camera_info(K, SIZE))
+    peer.spin(0.2)
+    sent, waited = 200, 0
+    for i in range(sent):
+        while not images.publish(image(drive[i % len(drive)], stamp_ns=stamp(i))):
+            waited += 1
+    assert waited
+    said = peer.wait('all images', lambda: peer.said(frames_received=str(sent)))
+    assert said['frames processed'] == str(sent)
+    assert any('images pile up' in message.status[0].message
+               for message in peer.heard['/diagnostics'])
 
 
 def test_the_node_survives_the_players_end_and_takes_the_next_one(live, start, peer, bag):
@@ -378,6 +398,15 @@ def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
                     '</Interfaces></General></Domain></CycloneDDS>')
     for uri in (file.read_text(), f'file://{file}'):
         Graph({**ENVIRONMENT, 'ROS_DOMAIN_ID': '232', 'CYCLONEDDS_URI': uri}).close()
+
+
+def test_a_graph_that_was_left_can_be_entered_again():
+    from djet_ros.dds.graph import Graph
+    elsewhere = {**ENVIRONMENT, 'ROS_DOMAIN_ID': '231'}
+    with Graph(elsewhere) as first:
+        pass
+    with Graph(elsewhere) as second:
+        assert second is not first
 
 
 # Without a graph

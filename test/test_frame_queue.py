@@ -36,8 +36,8 @@ def test_what_comes_next_can_be_looked_at_and_stays():
     assert [queue.get(), queue.get()] == ['first', 'second']
 
 
-def test_every_loses_nothing_however_slow_the_reader_is():
-    queue, got = FrameQueue('every', 3), []
+def test_every_loses_nothing_while_there_is_room():
+    queue, got = FrameQueue('every', 3, room=2000), []
 
     def read():
         while (item := queue.get()) is not None:
@@ -45,8 +45,7 @@ def test_every_loses_nothing_however_slow_the_reader_is():
 
     reader = in_thread(read)
     for i in range(2000):
-        assert queue.put(i)
-        assert len(queue) <= 3
+        assert queue.put(i, 1)
     queue.close()
     reader.join(5)
     assert got == list(range(2000))
@@ -72,13 +71,38 @@ def test_many_writers_and_readers_account_for_every_item():
     assert len(set(got)) == len(got)
 
 
-def test_a_full_queue_lets_the_sender_wait_as_long_as_it_wants():
-    queue = FrameQueue('every', 1)
-    assert queue.put('a')
-    start = monotonic()
-    assert not queue.put('b', timeout=0.05)
-    assert monotonic() - start >= 0.05
-    assert drained(queue) == ['a']
+@pytest.mark.parametrize('policy, left', [('every', [0, 1, 2, 3]), ('latest', [4, 5, 6, 7])])
+def test_what_waits_weighs_no_more_than_the_room_and_one(policy, left):
+    queue = FrameQueue(policy, 1000, room=10)
+    assert sum(queue.put(i, 3) for i in range(8)) == (4 if policy == 'every' else 8)
+    assert queue.dropped == 4
+    assert drained(queue) == left
+    assert queue.put('again', 3)
+
+
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_what_is_heavier_than_the_room_is_taken_by_itself(policy):
+    queue = FrameQueue(policy, 1000, room=10)
+    for item in ('first', 'second'):
+        assert queue.put(item, 11)
+        assert queue.get() == item
+
+
+def test_every_tells_when_a_sender_had_better_wait():
+    queue = FrameQueue('every', 1, room=10)
+    for taken in range(5):
+        assert queue.has_room
+        assert queue.weight == 2 * taken
+        queue.put('light', 2)
+    assert not queue.has_room
+    queue.get()
+    assert queue.has_room
+
+
+def test_the_newest_is_always_welcome():
+    queue = FrameQueue('latest', 1)
+    queue.put('old')
+    assert queue.has_room
 
 
 def test_an_empty_queue_lets_the_reader_wait_as_long_as_it_wants():
@@ -96,22 +120,21 @@ def test_closing_wakes_everybody_and_leaves_what_waits(policy):
     assert answers == [None]
     assert not queue.put('late')
 
-    queue = FrameQueue('every', 1)
+    queue = FrameQueue(policy, 2)
     queue.put('first')
-    writer = in_thread(lambda: answers.append(queue.put('second')))
     queue.close()
-    writer.join(5)
-    assert answers == [None, False]
+    assert not queue.put('second')
     assert drained(queue) == ['first']
 
 
 def test_clearing_makes_room():
-    queue = FrameQueue('every', 2)
-    queue.put(1)
-    queue.put(2)
+    queue = FrameQueue('every', 2, room=4)
+    queue.put(1, 2)
+    queue.put(2, 2)
+    assert not queue.put(3, 2)
     assert queue.clear() == 2
-    assert queue.put(3, timeout=0)
-    assert drained(queue) == [3]
+    assert queue.put(4, 2)
+    assert drained(queue) == [4]
 
 
 @pytest.mark.parametrize('policy, size', [('newest', 1), ('latest', 0)])

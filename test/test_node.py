@@ -680,6 +680,25 @@ def test_every_image_is_accounted_for_under_load(node, publisher, subscriber, dr
     assert int(last['frames processed']) + int(last['frames dropped']) == 48
 
 
+def test_what_comes_beyond_the_room_is_dropped_counted_and_complained_of(
+        node, publisher, subscriber, drive):
+    room, sent = 10 * drive[0].nbytes, 60
+    node(before=f'from djet_ros.live import session; session.ROOM = {room}; ',
+         **{'estimator.max_features': 5000, 'estimator.fast_threshold': 2,
+            'ros.queue_policy': 'every'})
+    camera(publisher)
+    for round_ in range(sent // len(drive)):
+        play(publisher, drive, first=100 * round_, pause=0.01)
+    last = subscriber.wait('all', lambda heard: next(
+        (values(m) for m in heard['/diagnostics'] if values(m)['frames received'] == str(sent)),
+        None))
+    assert int(last['frames dropped: queue_full']) > sent // 4
+    assert int(last['frames processed']) + int(last['frames dropped']) == sent
+    said = [m.status[0].message for m in subscriber.heard['/diagnostics']]
+    for complaint in ('images pile up', 'images dropped under load'):
+        assert any(complaint in message for message in said)
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('policy', ['latest', 'every'])
 def test_a_signal_in_mid_stream_ends_it_cleanly_within_a_second(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from sys import getrefcount
 from threading import Condition, Event, Thread
 from time import monotonic, sleep
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.live import session as sessions
-from djet_ros.live.session import Session
+from djet_ros.live.session import ROOM, Session
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
@@ -158,6 +159,42 @@ def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live,
     assert 'images dropped: they come faster than they are worked on' in one.graph.lines[0]
 
 
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_a_sender_without_end_fills_no_memory_and_is_complained_of(live, drive, policy):
+    one = live(**{'ros.queue_policy': policy, 'ros.queue_size': 1000})
+    one.graph.open.clear()
+    # Each message is another reference to the same one.
+    message = image(np.zeros((2000, 3000), np.uint8))
+    for _ in range(sent := 300):
+        one.session.image(message)
+        one.session.mask(message)
+    held = getrefcount(message) * len(message.data)
+    assert ROOM < held < 2.2 * ROOM
+    one.graph.open.set()
+    one.wait_for_images(sent)
+    counts = one.tracker.counts
+    assert counts.dropped['queue_full'] == pytest.approx(sent - ROOM / len(message.data), abs=3)
+    one.session.pause()
+    assert 'images dropped under load' in one.graph.heard('/diagnostics')[-1].status[0].message
+    assert 'lower their rate (that of a player, too)' in one.graph.said()[
+        'to mend: images dropped under load']
+    assert any('MB of images wait to be worked on' in line for line in one.graph.lines)
+    assert 'to mend: images pile up' not in one.graph.said()
+
+
+def test_images_that_were_lost_on_the_way_are_complained_of(live, drive):
+    one = live()
+    one.session.count_lost(30)
+    one.send(drive)
+    one.wait_for_images(len(drive))
+    one.session.pause()
+    said = one.graph.said()
+    assert said['frames lost on the way'] == '30'
+    assert '71% of the newest 42 images' in said['to mend: images lost on the way']
+    one.session.reset()
+    assert 'to mend: images lost on the way' not in one.graph.said()
+
+
 def test_a_camera_info_holds_for_the_images_after_it(live, drive):
     one = live(**{'ros.queue_size': 12})
     one.graph.open.clear()
@@ -263,12 +300,20 @@ def test_a_stop_does_not_wait_for_ever(live, drive):
     assert monotonic() - start < 5
 
 
-def test_images_that_wait_for_room_do_not_hold_up_a_stop(live, drive):
-    one = live(**{'ros.queue_size': 1})
-    one.graph.open.clear()
-    sender = Thread(target=one.send, args=[drive])
+def test_images_without_end_do_not_hold_up_a_stop(live, drive):
+    one, ended = live(**{'ros.queue_size': 1}), Event()
+
+    def send() -> None:
+        while not ended.is_set():
+            one.send(drive)
+
+    sender = Thread(target=send)
     sender.start()
-    one.session.stop(0.1)
+    one.graph.wait(lambda: one.graph.heard('relative_pose'))
+    start = monotonic()
+    one.session.stop()
+    assert monotonic() - start < 1
+    ended.set()
     sender.join(5)
     assert not sender.is_alive()
 

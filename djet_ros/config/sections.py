@@ -176,13 +176,14 @@ class NodeConfig:
         'best_effort', 'of the subscriptions; best_effort hears every publisher (queue_policy '
         'every subscribes reliably in any case)', choices=('best_effort', 'reliable'))
     qos_depth: int = parameter(
-        5, 'messages that the middleware keeps for each subscription (with queue_policy every: '
-        'all)', minimum=1, maximum=1000)
+        5, 'messages that the middleware keeps for each subscription (queue_policy every has a '
+        'number of its own)', minimum=1, maximum=1000)
     queue_policy: str = parameter(
         'latest', 'latest (under load old frames are dropped and counted) or every (none is '
-        'dropped: for a bag played into the node)', choices=('latest', 'every'))
+        'dropped unless 500 MB of them wait: for a bag played into the node)',
+        choices=('latest', 'every'))
     queue_size: int = parameter(
-        2, 'frames that may wait; beyond it latest drops the oldest, every lets the sender wait',
+        2, 'frames that may wait with queue_policy latest; beyond it the oldest is dropped',
         minimum=1, maximum=1000)
     publish_tf: bool = parameter(
         False, 'whether the integrated pose is also published as odom_frame -> camera frame on tf')

@@ -193,6 +193,8 @@ class Graph:
         # Cyclone deletes what Python has forgotten, and at its exit Python forgets nothing: the
         # others would take this participant for alive until its lease ends.
         self._participant.__del__()
+        # And where a domain is left behind, the process can't enter it again.
+        self._domain.__del__()
 
     def __enter__(self) -> Self:
         """Give the graph itself."""

@@ -35,6 +35,7 @@ class DdsMiddleware:
     """
 
     qos_remedy = 'ros.qos_reliability'
+    senders_wait = True
     message_type = staticmethod(message_type)
 
     def __init__(self, graph: Graph, names: Names, use_sim_time: bool = False) -> None:

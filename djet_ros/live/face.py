@@ -76,7 +76,7 @@ class Face:
         try:
             while not stop.is_set():
                 # Nothing wakes it up where an image has been worked on, and others wait for room.
-                self._middleware.spin(_PAUSE if self.session.has_room else _MOMENT)
+                self._middleware.spin(_PAUSE if self._takes_images() else _MOMENT)
                 if self.session.failed:
                     return 1
                 if monotonic() - self._last_tick >= _TICK:
@@ -152,15 +152,16 @@ class Face:
 
     def listen_to_camera(self, image: str, info: str, transport: str, profile: Profile) -> None:
         """Subscribe to images and their CameraInfo, which may be latched; the last inputs."""
-        def ready() -> bool:
-            return self.session.has_room
-
         self._info_topic = info
         # CameraInfo first: of two that wait, it is to be taken before its image; and none that
         # belongs to an image that has to wait. What comes beside them must not wait.
-        self.listen(info, INFO_TYPE, self.session.camera_info, profile, ready)
+        self.listen(info, INFO_TYPE, self.session.camera_info, profile, self._takes_images)
         self._images = self.listen(image, IMAGE_TYPES[transport], self.session.image, profile,
-                                   ready)
+                                   self._takes_images)
+
+    def _takes_images(self) -> bool:
+        """Tell whether images are to come now: always, where none waits without being lost."""
+        return not self._middleware.senders_wait or self.session.has_room
 
     # Once a second
 
@@ -203,7 +204,7 @@ def _transport_remedy(kinds: Collection[str]) -> str:
 
 
 def input_profile(config: NodeConfig) -> Profile:
-    """Profile of the inputs; to lose nothing takes a sender that repeats and room for it all."""
+    """Profile of the inputs; to lose nothing takes a sender that repeats, and one that waits."""
     every = config.queue_policy == 'every'
     return Profile(reliable=every or config.qos_reliability == 'reliable',
                    depth=None if every else config.qos_depth)

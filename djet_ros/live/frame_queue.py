@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import inf
 from threading import Condition
 from typing import Generic, TypeVar
 
@@ -11,20 +12,24 @@ Item = TypeVar('Item')
 
 class FrameQueue(Generic[Item]):
     """
-    First in, first out, for any number of threads.
+    First in, first out, for any number of threads; whoever puts something in never waits.
 
     Policy 'latest': where ``size`` items wait already, the oldest is dropped and counted.
-    Policy 'every': ``put`` waits for room instead, and nothing is dropped.
+    Policy 'every': all wait, however many.
+    Where those that wait weigh ``room`` or more, one is dropped and counted with either policy:
+    the oldest with 'latest', with 'every' the one that comes.
     """
 
-    def __init__(self, policy: str, size: int) -> None:
+    def __init__(self, policy: str, size: int, room: float = inf) -> None:
         """Make an empty queue; ValueError for an unknown policy or a size below one."""
         if policy not in ('latest', 'every') or size < 1:
             raise ValueError(f"queue policy '{policy}' with size {size}; it must be latest or "
                              'every, with at least 1')
         self._drops = policy == 'latest'
         self._size = size
-        self._items: deque[Item] = deque()
+        self._room = room
+        self._items: deque[tuple[Item, float]] = deque()
+        self._weight = 0.0
         self._changed = Condition()
         self._closed = False
         self._dropped = 0
@@ -35,23 +40,20 @@ class FrameQueue(Generic[Item]):
         with self._changed:
             return self._dropped
 
-    def put(self, item: Item, timeout: float | None = None) -> bool:
-        """
-        Append an item; False where the queue is closed, or stayed full for timeout seconds.
-
-        Only policy 'every' ever waits.
-        """
+    def put(self, item: Item, weight: float = 0.0) -> bool:
+        """Append an item of some weight; False where the queue is closed or does not take it."""
         with self._changed:
-            if self._drops:
-                if not self._closed and len(self._items) == self._size:
-                    self._items.popleft()
-                    self._dropped += 1
-            elif not self._changed.wait_for(self._has_room, timeout):
-                return False
             if self._closed:
                 return False
-            self._items.append(item)
-            self._changed.notify_all()
+            while self._items and (self._weight >= self._room
+                                   or (self._drops and len(self._items) == self._size)):
+                self._dropped += 1
+                if not self._drops:
+                    return False
+                self._pop()
+            self._items.append((item, weight))
+            self._weight += weight
+            self._changed.notify()
             return True
 
     def get(self, timeout: float | None = None) -> Item | None:
@@ -60,27 +62,31 @@ class FrameQueue(Generic[Item]):
             self._changed.wait_for(lambda: self._items or self._closed, timeout)
             if not self._items:
                 return None
-            item = self._items.popleft()
-            self._changed.notify_all()
-            return item
+            return self._pop()
 
     def peek(self) -> Item | None:
         """Give the oldest item without taking it; None where nothing waits."""
         with self._changed:
-            return self._items[0] if self._items else None
+            return self._items[0][0] if self._items else None
 
     @property
     def has_room(self) -> bool:
-        """Whether ``put`` would not have to wait."""
+        """Whether an item would be taken now; with policy 'latest' any is."""
         with self._changed:
-            return self._drops or self._has_room()
+            return self._drops or self._closed or self._weight < self._room
+
+    @property
+    def weight(self) -> float:
+        """Weigh the items that wait."""
+        with self._changed:
+            return self._weight
 
     def clear(self) -> int:
         """Throw away what waits, and tell how many items that was."""
         with self._changed:
             count = len(self._items)
             self._items.clear()
-            self._changed.notify_all()
+            self._weight = 0.0
             return count
 
     def close(self) -> None:
@@ -94,5 +100,7 @@ class FrameQueue(Generic[Item]):
         with self._changed:
             return len(self._items)
 
-    def _has_room(self) -> bool:
-        return self._closed or len(self._items) < self._size
+    def _pop(self) -> Item:
+        item, weight = self._items.popleft()
+        self._weight -= weight
+        return item

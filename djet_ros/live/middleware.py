@@ -12,7 +12,12 @@ from djet_ros.odometry.messages import MessageType
 
 @dataclass(frozen=True)
 class Profile:
-    """Quality of service; depth None keeps all, which makes a reliable publisher wait."""
+    """
+    Quality of service; depth None keeps what comes until it is taken.
+
+    Where it is not taken, that makes reliable publishers wait which keep all, too, or it loses
+    the oldest: see ``Middleware.senders_wait``.
+    """
 
     reliable: bool = True
     depth: int | None = 10
@@ -72,6 +77,9 @@ class Middleware(Protocol):
     # What to set where a publisher's quality of service does not fit.
     qos_remedy: str
 
+    # Whether publishers can be made to wait for a subscription that does not take messages.
+    senders_wait: bool
+
     @property
     def node(self) -> str:
         """Give the name of the node with its namespace, as in '/left/vo_node'."""
@@ -101,7 +109,7 @@ class Middleware(Protocol):
         Hand the messages on a topic, by its resolved name, to a callback.
 
         ready: asked before each message; while it says no, messages wait in the middleware, and
-        those of other topics go on.
+        those of other topics go on. Only to be asked where senders wait.
         """
 
     def offers(self, topic: str) -> Sequence[Offer]:

@@ -14,9 +14,9 @@ from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.mask_files import still_mask
 
-# Messages beside the images that the middleware keeps while an image waits for room: seconds of
-# the fastest IMU.
-_DEPTH = 2000
+# Messages beside the images that the middleware keeps while Python does not get to run: seconds of
+# the fastest IMU. Masks are as large as images, and as many.
+_DEPTH, _MASKS_DEPTH = 2000, 100
 
 # Those of /tf_static, of which each robot_state_publisher has one.
 _FRAMES_DEPTH = 100
@@ -69,7 +69,8 @@ class OdometryFace(Face):
             self._hears_beside.add(what)
             self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
                         getattr(self.session, what),
-                        replace(input_profile(config.ros), depth=_DEPTH))
+                        replace(input_profile(config.ros),
+                                depth=_MASKS_DEPTH if what == 'mask' else _DEPTH))
         if guess and odometry.guess_frame and not self._hears_tf:
             self._hears_tf = True
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,

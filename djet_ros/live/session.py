@@ -18,6 +18,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.diagnostics import LEVELS, State
+from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -30,8 +31,15 @@ _LOG_PERIOD = 5.0
 # Seconds after which diagnostics come also where no image makes the tracker say them.
 _DIAGNOSTICS_PERIOD = 1.0
 
-# Messages of what comes beside the images that may wait for the next one.
-_WAITING_BESIDE = 10_000
+# Messages of what comes beside the images that may wait for them: minutes of an IMU.
+_WAITING_BESIDE = 100_000
+
+# Bytes of images that may wait, and of what came beside them. By bytes, as a thousand small images
+# are a short delay, and a thousand large ones more memory than a robot has.
+ROOM = 500_000_000
+
+# Bytes that a message takes beside its pixels, about.
+_MESSAGE = 4_000
 
 # Seconds for which an image waits for what belongs to it: the gyro's rates, its mask.
 _PATIENCE = 0.1
@@ -69,6 +77,14 @@ class _Received(NamedTuple):
 
     image: Any
     info: Any
+    at: float
+
+
+class _Beside(NamedTuple):
+    """A message beside the images, the tracker's method that takes it, and when it came."""
+
+    what: str
+    message: Any
     at: float
 
 
@@ -122,9 +138,9 @@ class Session:
     Works on images in a thread of its own, in the order in which they come.
 
     topics: resolved names of 'image' and 'camera_info', for people. Messages may come from any
-    one thread; everything else may be called from any thread. With the queue policy 'every'
-    ``image`` waits where the queue is full. What is published for one image is published as a
-    whole or not at all, and nothing of before a reset or a stop after it.
+    one thread, and never have to wait: images beyond ROOM are dropped and counted. Everything else
+    may be called from any thread. What is published for one image is published as a whole or not
+    at all, and nothing of before a reset or a stop after it.
     """
 
     def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
@@ -132,17 +148,16 @@ class Session:
         self._tracker = tracker
         self._wiring = wiring
         self._topics = topics
-        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size)
+        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size, ROOM)
         # Held while an image is worked on and published, and by what happens in between.
         self._lock = Lock()
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        # What came beside the images, each with the name of the tracker's method that takes it.
-        self._beside: deque[tuple[str, Any]] = deque(maxlen=_WAITING_BESIDE)
+        self._beside: FrameQueue[_Beside] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
         self._came = Event()
         self._came_at = -np.inf
-        self._counted_drops = self._lost = 0
+        self._counted_drops = self._lost = self._counted_lost = 0
         self._said_drops = False
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
@@ -178,13 +193,13 @@ class Session:
 
     @property
     def has_room(self) -> bool:
-        """Whether an image would be taken at once; with the policy 'every' it may have to wait."""
+        """Whether an image would be taken; with the policy 'every' it may be better to wait."""
         return self._queue.has_room
 
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""
         self._last_image = monotonic()
-        self._queue.put(_Received(message, self._newest_info, self._last_image))
+        self._queue.put(_Received(message, self._newest_info, self._last_image), _bytes(message))
 
     def camera_info(self, message: Any) -> None:
         """Take a CameraInfo; it holds for the images that come after it."""
@@ -215,8 +230,8 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._beside.append((what, message))
         self._came_at = monotonic()
+        self._beside.put(_Beside(what, message, self._came_at), _bytes(message))
         self._came.set()
 
     def count_lost(self, number: int) -> None:
@@ -235,7 +250,7 @@ class Session:
             self._beside.clear()
             self._latencies.clear()
             self._log.clear()
-            self._counted_drops, self._lost = self._queue.dropped, 0
+            self._counted_drops, self._lost, self._counted_lost = self._queue.dropped, 0, 0
             self._said_drops = False
             self._tracker.reset()
             self._say()
@@ -294,6 +309,8 @@ class Session:
             return
         try:
             silent = monotonic() - self._last_image > SILENCE
+            if not len(self._queue):
+                self._hand_on(np.inf)
             if silent:
                 # No image waits that came before this CameraInfo.
                 self._take_info(self._newest_info)
@@ -322,15 +339,16 @@ class Session:
                     if received.at > self._forgotten:
                         self._process(received)
         finally:
-            # Nobody may wait for room that no one will make.
+            # What comes from now on is kept for nobody.
             self._queue.close()
+            self._beside.close()
 
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
-        tracker.face_values = self._face_values()
+        self._tell_of_the_face()
         self._take_info(received.info)
-        self._hand_on()
+        self._hand_on(self._present(received))
         frame = received.image.header.frame_id
         if not tracker.mounted:
             self._mount(frame)
@@ -353,19 +371,31 @@ class Session:
         while not self._stopping and received.at > self._forgotten:
             self._came.clear()
             with self._lock:
-                self._hand_on()
-                lacking = self._tracker.lacks(received.image)
+                self._hand_on(self._present(received))
+                while (lacking := self._tracker.lacks(received.image)) and self._hand_on_next(
+                        received.at + _LONGEST_PATIENCE):
+                    pass
             since = max(received.at, self._came_at) if patient else received.at
             left = min(since + _PATIENCE, latest) - monotonic()
             if not lacking or left <= 0:
                 return
             self._came.wait(left)
 
-    def _hand_on(self) -> None:
-        """Give the tracker what came beside the images."""
-        while self._beside:
-            what, message = self._beside.popleft()
-            getattr(self._tracker, what)(message)
+    def _present(self, received: _Received) -> float:
+        """Tell until when messages count for an image: what came later is for those that wait."""
+        return received.at if len(self._queue) else np.inf
+
+    def _hand_on(self, until: float) -> None:
+        """Give the tracker what came beside the images until a moment; it keeps but some of it."""
+        while self._hand_on_next(until):
+            pass
+
+    def _hand_on_next(self, until: float) -> bool:
+        waiting = self._beside.peek()
+        if waiting is None or waiting.at > until or (one := self._beside.get(timeout=0)) is None:
+            return False
+        getattr(self._tracker, one.what)(one.message)
+        return True
 
     def _mount_beside(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.wanted_mountings(image_frame).items():
@@ -378,6 +408,9 @@ class Session:
             self._note(found)
 
     def _count_drops(self) -> None:
+        if lost := self._lost - self._counted_lost:
+            self._counted_lost += lost
+            self._tracker.count_lost(lost)
         new = self._queue.dropped - self._counted_drops
         if new:
             self._counted_drops += new
@@ -395,6 +428,16 @@ class Session:
             self._publish(self._tracker.camera_info(info))
             self._log_trouble()
 
+    def _tell_of_the_face(self) -> None:
+        self._tracker.face_values = self._face_values()
+        waiting = self._queue.weight
+        # To be said before anything is lost.
+        self._tracker.face_complaints = [] if waiting < ROOM / 2 else [Complaint(
+            'images pile up', 'WARN', (
+                f'{waiting * 1e-6:.0f} MB of images wait to be worked on; from {ROOM * 1e-6:.0f} '
+                'MB on senders wait that can, and what others send is lost; lower their rate '
+                '(that of a player, too), their size or estimator.max_features'))]
+
     def _face_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
                 'queue policy': self._tracker.config.ros.queue_policy,
@@ -408,7 +451,7 @@ class Session:
         self._wiring.publish(outgoing)
 
     def _say(self) -> None:
-        self._tracker.face_values = self._face_values()
+        self._tell_of_the_face()
         self._publish([self._tracker.diagnostics(time_ns())])
 
     def _log_trouble(self) -> None:
@@ -428,3 +471,8 @@ class Session:
             if one.name not in self._complained:
                 self._log.warn(one.name, f'{one.name}: {one.text}')
         self._complained = {one.name for one in complaints}
+
+
+def _bytes(message: Any) -> int:
+    """Tell about how much memory a message takes; of those that come, images alone are large."""
+    return _MESSAGE + len(getattr(message, 'data', ()))

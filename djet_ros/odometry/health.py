@@ -70,7 +70,7 @@ class Health:
         """Say what there is to mend now; mounted: whether base_frame is known, if asked for."""
         return [one for one in (
             self._stamps(), self._frame(), None if mounted else self._mounting(),
-            self._length(scale), self._load(), self._order()) if one is not None]
+            self._length(scale), self._load(), self._way(), self._order()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
         if self._equal < _IN_A_ROW or self._last is None:
@@ -125,7 +125,15 @@ class Health:
             return None
         return Complaint('images dropped under load', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were dropped: they come faster '
-            'than they are worked on; lower their rate, their size or estimator.max_features'))
+            'than they are worked on; lower their rate (that of a player, too), their size or '
+            'estimator.max_features'))
+
+    def _way(self) -> Complaint | None:
+        if (share := self._share('lost')) < _SHARE:
+            return None
+        return Complaint('images lost on the way', 'WARN', (
+            f'{share:.0%} of the newest {len(self._fates)} images were sent and never came; lower '
+            'their rate or send them compressed, and have reliable senders keep more of them'))
 
     def _order(self) -> Complaint | None:
         if (share := self._share('late')) < _SHARE:

@@ -84,6 +84,7 @@ class Tracker:
         self.config = config
         # What a face adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
+        self.face_complaints: list[Complaint] = []
         self._message_type = message_type
         self._image_topic = image_topic
         self._speed_topics = speed_topics
@@ -316,10 +317,15 @@ class Tracker:
         self.counts.dropped[reason] += number
         self._health.dropped(reason, number)
 
+    def count_lost(self, number: int) -> None:
+        """Take notice of images that were sent and never came."""
+        self._health.dropped('lost', number)
+
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside]
+        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside,
+                *self.face_complaints]
 
     @property
     def complaints_beside(self) -> list[Complaint]:

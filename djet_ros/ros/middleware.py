@@ -33,6 +33,11 @@ from std_srvs.srv import Trigger
 # to wait for all of them took as long as all else that is waited for.
 _EVENTS_PERIOD = 1.0
 
+# Messages in the middleware of who keeps what comes. To ROS, KEEP_ALL has no bound that could be
+# set: Cyclone DDS takes gigabytes, and no publisher waits. All are taken as soon as Python gets to
+# run, for which this is enough.
+_KEPT = 50
+
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 
@@ -66,14 +71,14 @@ class RosPublisher:
 
 
 class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
-    """Leaves messages and events in the middleware for as long as nobody is ready for them."""
+    """Leaves events in the middleware for as long as nobody is ready for them."""
 
     def __init__(self, ready: Callable[[], bool]) -> None:
         super().__init__()
         self._ready = ready
 
     def can_execute(self, entity: Any) -> bool:
-        """Tell the executor whether to look for messages, and to hand one out."""
+        """Tell the executor whether to look for events, and to hand one out."""
         return self._ready() and bool(super().can_execute(entity))
 
 
@@ -81,13 +86,12 @@ class RosSubscription:
     """Hears one topic, and counts what its events tell."""
 
     def __init__(self, node: Node, topic: str, kind: str, callback: Callable[[Any], None],
-                 profile: Profile, ready: Callable[[], bool] | None) -> None:
+                 profile: Profile) -> None:
         self.topic = topic
         self._lost = self._refused = 0
         with _asked_for(node, topic):
             self._subscription = node.create_subscription(
                 message_type(kind), topic, callback, _qos(profile),
-                callback_group=None if ready is None else _WhenReady(ready),
                 event_callbacks=SubscriptionEventCallbacks(
                     incompatible_qos=self._note_refusal, message_lost=self._note_loss),
                 # Overrides are by topic; a latched subscription takes after the publisher.
@@ -119,6 +123,7 @@ class RosMiddleware:
     """The ROS graph as a node sees it."""
 
     qos_remedy = 'ros.qos_reliability or qos_overrides.{topic}.subscription.*'
+    senders_wait = False
     message_type = staticmethod(message_type)
 
     def __init__(self, node: Node) -> None:
@@ -166,8 +171,8 @@ class RosMiddleware:
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None) -> RosSubscription:
-        """Hand the messages on a topic to a callback; overrides as for ``advertise``."""
-        return RosSubscription(self._node, topic, kind, callback, profile, ready)
+        """Hand the messages on a topic to a callback, at once; overrides as for ``advertise``."""
+        return RosSubscription(self._node, topic, kind, callback, profile)
 
     def offers(self, topic: str) -> list[Offer]:
         """Give who publishes a topic."""
@@ -227,9 +232,7 @@ def _asked_for(node: Node, topic: str) -> Iterator[None]:
 
 def _qos(profile: Profile) -> QoSProfile:
     return QoSProfile(
-        history=(QoSHistoryPolicy.KEEP_ALL if profile.depth is None
-                 else QoSHistoryPolicy.KEEP_LAST),
-        depth=profile.depth or 1,
+        history=QoSHistoryPolicy.KEEP_LAST, depth=profile.depth or _KEPT,
         reliability=(QoSReliabilityPolicy.RELIABLE if profile.reliable
                      else QoSReliabilityPolicy.BEST_EFFORT),
         durability=(QoSDurabilityPolicy.TRANSIENT_LOCAL if profile.latched
