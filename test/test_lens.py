@@ -10,7 +10,7 @@ import cv2
 from djet_ros.cli.main import main
 from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp, unit
-from djet_ros.core.lens import by_radius, fit_lens, LensFit, MatchedPair, tell
+from djet_ros.core.lens import by_radius, fit_lens, LensFit, linearise, MatchedPair
 from djet_ros.core.types import Array, Pose
 from djet_ros.errors import DjetError
 from djet_ros.lab import lens

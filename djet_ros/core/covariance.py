@@ -19,7 +19,7 @@ CELL = 32
 
 # Into so many cells the matches are cut too. What errs together over longer distances, such as a
 # patch's perspective or a haze, is seen by these, each of which errs by itself.
-_LARGE_CELLS = 20
+LARGE_CELLS = 20
 
 # Sides of large cells over that; several, for a few cells tell how much they vary to a third only.
 _SIDES = (2 / 3, 3 / 2)
@@ -32,7 +32,7 @@ _HARDLY_TOLD = 20 / 5, 300 / 25
 
 # chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large
 # cell by, as a share of the noise of a match.
-_SHIFT = 0.12
+SHIFT = 0.12
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -82,7 +82,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
         return UNKNOWN
     cells = _Cells.of(H, places, J, weights, residuals.r)
-    side = max(np.sqrt(np.ptp(places, axis=0).prod() / _LARGE_CELLS), CELL)
+    side = max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL)
     large = cells.in_larger(side)
     if cells.without is None or large.without is None:
         return UNKNOWN
@@ -90,7 +90,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     reach = float(np.ptp(places, axis=0).max())
     growth = _growth(cells.size(cells.without), [large, *others], reach)
     noise = (weights * squared).sum() / weights.sum()
-    shifts = _SHIFT * cells.inverse @ large.pulls
+    shifts = SHIFT * cells.inverse @ large.pulls
     covariance = (growth / flattening**2 * _jackknife(cells, cells.without, growth)
                   + noise * shifts @ shifts.T)
     covariance = (covariance + covariance.T) / 2

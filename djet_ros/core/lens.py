@@ -3,7 +3,7 @@ What a calibration leaves of a lens's distortion, told by the epipolar lines of 
 
 The pose of a pair takes up most of what a wrong coefficient k1 does to its matches. What remains
 are distances from epipolar lines, in pairs whose motion carries points across the image: turns,
-above all. All pairs together tell k1 by least squares, each with a pose of its own:
+above all. k1 is found from all pairs together by least squares, each with a pose of its own:
 
     min over k1 and all (R, t) of   sum over pairs and matches of rho(r^2).
 
@@ -20,8 +20,17 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, Protocol
 
-from djet_ros.core.geometry import fit_rotation, inverses, rays, rotation_log
-from djet_ros.core.jet import core_scale, epipolar_residuals, JetProblem, Loss, minimise
+from djet_ros.core.cells import cells_of
+from djet_ros.core.covariance import LARGE_CELLS, SHIFT
+from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
+from djet_ros.core.jet import (
+    core_scale,
+    epipolar_residuals,
+    JetProblem,
+    Loss,
+    minimise,
+    Solution,
+)
 from djet_ros.core.paraboloid import times
 from djet_ros.core.tracking import TUNING
 from djet_ros.core.types import Array, Pose, RelativePose
@@ -30,7 +39,7 @@ import numpy as np
 # Matches of a pair that are kept, evenly among the surest and the least sure.
 MOST_MATCHES = 300
 
-# chosen: of a distortion's pixels, what a pair's pose has to leave over for the pair to tell it.
+# chosen: of a distortion's pixels, what a pair's pose has to leave over for the pair to take part.
 # On straight roads, where it is less, what is wrong otherwise looks like a distortion.
 LEAST_SHARE = 0.005
 
@@ -38,11 +47,22 @@ LEAST_SHARE = 0.005
 # does not, a way sideways passes for a turn, and a distortion makes it pass better.
 _OUT_OF_NOISE = 6.0
 
-# chosen: rounds, of which three are enough, and what k1 may still move then, in standard errors.
-_ROUNDS, _SETTLED = 10, 0.01
+# chosen: rounds, of which three are enough where k1 is small; and what k1 may still move in the
+# last one, in standard errors.
+_ROUNDS, _SETTLED = 20, 0.01
 
-# Newton's steps to a point that a lens shows at a pixel, from where it is by the calibration.
-_INVERSIONS = 3
+# What a step of k1 may move the outermost matches by, as a share of their distance from the
+# middle. Without distortion, -k1 r^2 = 4/27 folds the image there; a step is a quarter of that.
+_LONGEST = 1 / 27
+
+# Newton's steps to a point that a lens shows at a pixel, from where it is by the calibration:
+# three are enough far from a fold. They end with steps of so little in X/Z, and have arrived where
+# the pixel is met.
+_INVERSIONS, _NEXT_TO_NOTHING, _MET = 12, 1e-10, 1e-6
+
+# Distances are taken to first order. Over so large a share of the radius, the area that a pixel
+# sees may grow by a quarter at most: half of that is by what such a distance is off.
+_FARTHER, _EVEN = 0.01, 1.25
 
 # Step of k1 by which residuals are differentiated.
 _STEP = 1e-4
@@ -59,7 +79,7 @@ _LEAST_NOISE = 1e-4
 # Groups of pairs in a row of which the jackknife leaves out one at a time.
 _GROUPS = 10
 
-# Pairs by which a standard error can be told at all.
+# Pairs that a standard error needs at least.
 _FEW = 5
 
 
@@ -72,7 +92,7 @@ class Lens(Protocol):
 
     def pixels(self, places: Array, k1: float) -> tuple[Array, Array]:
         """
-        Tell where points X/Z, Y/Z (N, 2) are seen.
+        Project points X/Z, Y/Z (N, 2).
 
         Gives pixels (N, 2), and how these move with the points (N, 2, 2).
         """
@@ -96,8 +116,8 @@ class MatchedPair:
         """
         Take what the odometry found in undistorted images with a camera matrix K (3, 3).
 
-        Where gray levels have them, which go by no epipolar lines. All that voted and not
-        its inliers, as these are what the calibration at hand agrees with.
+        Uses ``placed``, which is measured without the epipolar line. Takes all voting matches:
+        inliers were selected with the calibration under test.
         """
         voting = np.flatnonzero(relative.voting)
         some = voting[::-(-len(voting) // MOST_MATCHES)]
@@ -110,19 +130,21 @@ class MatchedPair:
         return float(np.linalg.norm(rotation_log(self.pose.R)))
 
 
-class Told(NamedTuple):
+class Linearised(NamedTuple):
     """
-    What a pair tells of k1 once its pose is eliminated.
+    A pair about some k1, once its pose is eliminated.
 
     share: how much of a distortion its pose can't take up, as residuals over the pixels by which
     matches move; noise: robust standard deviation in pixels of what no k1 explains; by_match:
-    (2, N) of half the summed loss in units of noise, by k1, its second derivative and its first.
+    (2, N): second and first derivative of half the loss by k1, over noise^2; pulls: (N, 2) by how
+    much the first derivative changes where a match is seen farther in x and y by the noise.
     """
 
     pair: MatchedPair
     share: float
     noise: float
     by_match: Array
+    pulls: Array
 
 
 @dataclass(frozen=True)
@@ -130,35 +152,54 @@ class LensFit:
     """
     The coefficient k1 that suits all pairs best, and its standard error.
 
-    told: what each pair tells at k1; disagreement: by how many standard errors the pairs that
-    tell most differ from the others. Noise does not make them; something that is the same in many
-    pairs, and is no k1, is larger in those that tell least.
+    linearised: the pairs at k1; disagreement: by how many standard errors the more informative
+    pairs differ from the others. Noise does not make them; something that is the same in many
+    pairs, and is no k1, is larger in those that are less informative.
     """
 
     k1: float
     sigma: float
-    told: tuple[Told, ...]
+    linearised: tuple[Linearised, ...]
     disagreement: float
 
     @property
     def noise(self) -> float:
         """Give the usual distance of matches from their epipolar lines, in pixels."""
-        return float(np.median([one.noise for one in self.told]))
+        return float(np.median([one.noise for one in self.linearised]))
 
 
-def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit:
-    """Find k1 from pairs in the order of their recording, twice _FEW or more."""
-    k1 = lens.k1
+def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
+    """
+    Find k1 from pairs in the order of their recording, twice _FEW or more.
+
+    None where steps lead to where the image folds, or go on and on.
+    """
+    rim, k1 = outermost(pairs), lens.k1
+    if not _is_even(rim, lens, k1):
+        return None
     for _ in range(_ROUNDS):
-        told = [tell(pair, lens, k1) for pair in pairs]
-        pairs = [one.pair for one in told]
-        curvature, gradient = np.array([one.by_match.sum(1) for one in told]).T
-        step = -gradient.sum() / curvature.sum()
-        sigma = _standard_error(curvature, gradient)
-        k1 += float(step)
+        linearised = [linearise(pair, lens, k1) for pair in pairs]
+        curvature, gradient = np.array([one.by_match.sum(1) for one in linearised]).T
+        step = -float(gradient.sum() / curvature.sum())
+        sigma = float(np.hypot(_standard_error(curvature, gradient),
+                               _shift_error(linearised, lens)))
         if abs(step) < _SETTLED * sigma:
-            break
-    return LensFit(k1, sigma, tuple(told), _disagreement(told))
+            return LensFit(k1, sigma, tuple(linearised), _disagreement(linearised))
+        pairs = [one.pair for one in linearised]
+        k1 += _shortened(step, rim, lens, k1)
+    return None
+
+
+def outermost(pairs: Sequence[MatchedPair]) -> Array:
+    """Give the points X/Z, Y/Z (2P, 2) farthest from the middle in both views of P pairs."""
+    return np.array([points[np.argmax((points**2).sum(1))]
+                     for pair in pairs for points in (pair.x, pair.y)])
+
+
+def displacements(places: Array, lens: Lens, k1: float) -> Array:
+    """By how many pixels (N,) points (N, 2) move over k1."""
+    more, less = (lens.pixels(places, k1 + way)[0] for way in (_STEP, -_STEP))
+    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _STEP))
 
 
 def by_radius(fit: LensFit, edges: Array) -> Array:
@@ -169,8 +210,8 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
     """
     rows = []
     for inner, outer in pairwise(edges):
-        chosen = [one.by_match[:, (radii >= inner) & (radii < outer)].sum(1) for one in fit.told
-                  for radii in [np.linalg.norm(one.pair.y, axis=1)]]
+        chosen = [one.by_match[:, (radii >= inner) & (radii < outer)].sum(1)
+                  for one in fit.linearised for radii in [np.linalg.norm(one.pair.y, axis=1)]]
         curvature, gradient = np.array([sums for sums in chosen if sums[0] > 0]).reshape(-1, 2).T
         rows.append([fit.k1 - gradient.sum() / curvature.sum(),
                      _standard_error(curvature, gradient)]
@@ -178,46 +219,64 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
     return np.array(rows).T
 
 
-def tells(pair: MatchedPair, lens: Lens) -> bool:
-    """Tell whether a pair can say something of k1, by the calibration at hand."""
-    told = tell(pair, lens, lens.k1)
-    return told.share > LEAST_SHARE and _parallax(pair, lens) > _OUT_OF_NOISE * told.noise
+def is_informative(pair: MatchedPair, lens: Lens) -> bool:
+    """Whether a pair's pose leaves enough of a k1 to be seen, by the calibration at hand."""
+    linearised = linearise(pair, lens, lens.k1)
+    return (linearised.share > LEAST_SHARE
+            and _parallax(pair, lens) > _OUT_OF_NOISE * linearised.noise)
 
 
-def tell(pair: MatchedPair, lens: Lens, k1: float) -> Told:
-    """Tell what a pair says at some k1, from its own best pose there."""
-    problem = _problem(pair, lens, k1)
+def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
+    """Linearise a pair about some k1, at its own best pose there."""
+    problem, by_pixel = _problem(pair, lens, k1)
     R, t = pair.pose.R, pair.pose.t
     noise = max(core_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
     loss = Loss('geman_mcclure', _BEND * noise)
     solution = minimise(problem, R, t, loss)
-    r, J = solution.residuals.r, solution.residuals.jacobian
-    more, less = (epipolar_residuals(_problem(pair, lens, k1 + way), solution.R, solution.t).r
-                  for way in (_STEP, -_STEP))
-    by_k1 = (more - less) / (2 * _STEP)
+    r = solution.residuals.r
     weights = loss(r * r)[1]
-    # What the pose can't follow.
-    weighed = J * weights
-    left = by_k1 - np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0] @ J
+    left = _left_over(pair, lens, k1, solution, weights)
     squares = np.stack([left * left, left * r]) * weights
     by_own_k1 = r - left * (squares[1].sum() / max(squares[0].sum(), 1e-300))
     # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
     squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), _LEAST_CURVED)
-    moved = _displacements(problem.rays_y[:2].T, lens, k1)
+    moved = displacements(problem.rays_y[:2].T, lens, k1)
     share = np.sqrt((weights * left * left).sum() / max((weights * moved * moved).sum(), 1e-300))
-    return Told(replace(pair, pose=solution.pose), float(share), core_scale(by_own_k1),
-                squares / noise**2)
+    pulls = (weights * left / noise)[:, None] * _across(problem, solution, by_pixel)
+    return Linearised(replace(pair, pose=solution.pose), float(share), core_scale(by_own_k1),
+                      squares / noise**2, pulls)
 
 
-def _problem(pair: MatchedPair, lens: Lens, k1: float) -> JetProblem:
-    """Pose the pair's problem at some k1, with noise of a pixel in y as it comes."""
+def _left_over(pair: MatchedPair, lens: Lens, k1: float, solution: Solution, weights: Array
+               ) -> Array:
+    """By how many pixels (N,) residuals move over k1, as far as the pose can't follow."""
+    more, less = (epipolar_residuals(_problem(pair, lens, k1 + way)[0], solution.R, solution.t).r
+                  for way in (_STEP, -_STEP))
+    by_k1, J = (more - less) / (2 * _STEP), solution.residuals.jacobian
+    weighed = J * weights
+    followed = np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0]
+    return np.asarray(by_k1 - followed @ J)
+
+
+def _across(problem: JetProblem, solution: Solution, by_pixel: Array) -> Array:
+    """Directions (N, 2) in the image across the epipolar lines."""
+    lines = essential(solution.R, solution.t) @ problem.rays_x
+    return unit(np.einsum('kn,nki->ni', lines[:2], by_pixel))
+
+
+def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Array]:
+    """
+    Pose the pair's problem at some k1, with noise of a pixel in y as it comes.
+
+    Also gives how points y move with the pixels at which they are seen, (N, 2, 2).
+    """
     x, _ = _undistorted(pair.x, lens, k1)
     y, by_pixel = _undistorted(pair.y, lens, k1)
     S = by_pixel @ by_pixel.transpose(0, 2, 1)
     spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
     width = (spread[0] + spread[2]) / 2
     rays_x, rays_y = (np.vstack([one.T, np.ones(len(one))]) for one in (x, y))
-    return JetProblem(rays_x, rays_y, spread, TUNING.epipole_blur**2 * width**2)
+    return JetProblem(rays_x, rays_y, spread, TUNING.epipole_blur**2 * width**2), by_pixel
 
 
 def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
@@ -226,12 +285,50 @@ def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
 
     Also gives how they move with the pixels at which they are seen, (N, 2, 2).
     """
-    seen, _ = lens.pixels(places, lens.k1)
+    return _shown_at(lens.pixels(places, lens.k1)[0], places, lens, k1)
+
+
+def _shown_at(seen: Array, places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
+    """Give the points that a lens shows at pixels (N, 2), from next to them, and their slopes."""
     for _ in range(_INVERSIONS):
         there, slopes = lens.pixels(places, k1)
         by_pixel = inverses(slopes)
-        places = places + times(by_pixel, seen - there)
+        step = times(by_pixel, seen - there)
+        places = places + step
+        if np.abs(step).max() < _NEXT_TO_NOTHING:
+            break
     return places, by_pixel
+
+
+def _is_even(rim: Array, lens: Lens, k1: float) -> bool:
+    """
+    Whether k1 shows points (N, 2), the outermost of all, far enough from where the image folds.
+
+    There (1 + 3 k1 r^2 = 0) points move without bound from pixel to pixel. So does the noise that
+    they are said to have, and all residuals vanish: a minimum that is none.
+    """
+    seen, middle = lens.pixels(rim, lens.k1)[0], lens.pixels(np.zeros((1, 2)), k1)[0]
+    areas = []
+    # Beyond a fold, where there is no such point, numbers run away.
+    with np.errstate(all='ignore'):
+        for farther in (0.0, _FARTHER):
+            pixels = seen + farther * (seen - middle)
+            places, by_pixel = _shown_at(pixels, rim, lens, k1)
+            if not np.abs(lens.pixels(places, k1)[0] - pixels).max() < _MET:
+                return False
+            areas.append(np.linalg.det(by_pixel))
+        return bool((areas[0] > 0).all() and (areas[1] > 0).all()
+                    and (areas[1] / areas[0]).max() < _EVEN)
+
+
+def _shortened(step: float, rim: Array, lens: Lens, k1: float) -> float:
+    """Shorten a step of k1 to what moves the outermost points (N, 2) a little, without a fold."""
+    radii = np.linalg.norm(lens.pixels(rim, k1)[0] - lens.pixels(np.zeros((1, 2)), k1)[0], axis=1)
+    longest = _LONGEST * float((radii / displacements(rim, lens, k1)).min())
+    step = float(np.clip(step, -longest, longest))
+    while not _is_even(rim, lens, k1 + step):
+        step /= 2
+    return step
 
 
 def _parallax(pair: MatchedPair, lens: Lens) -> float:
@@ -243,23 +340,33 @@ def _parallax(pair: MatchedPair, lens: Lens) -> float:
     return float(np.median(np.linalg.norm(there - here, axis=1)))
 
 
-def _displacements(places: Array, lens: Lens, k1: float) -> Array:
-    """By how many pixels (N,) points (N, 2) move over k1."""
-    more, less = (lens.pixels(places, k1 + way)[0] for way in (_STEP, -_STEP))
-    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _STEP))
-
-
-def _disagreement(told: Sequence[Told]) -> float:
-    """Compare the pairs that tell most with the others: half of what is known by each."""
-    sums = np.array([one.by_match.sum(1) for one in told]).T
-    order = np.argsort([one.share for one in told], kind='stable')
+def _disagreement(linearised: Sequence[Linearised]) -> float:
+    """Compare the more informative pairs with the others: half of what is known by each."""
+    sums = np.array([one.by_match.sum(1) for one in linearised]).T
+    order = np.argsort([one.share for one in linearised], kind='stable')
     known = np.cumsum(sums[0, order])
-    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _FEW, len(told) - _FEW))
+    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _FEW, len(linearised) - _FEW))
     # Neighbours have to stay neighbours.
     halves = [sums[:, np.sort(half)] for half in (order[:first], order[first:])]
     off = [gradient.sum() / curvature.sum() for curvature, gradient in halves]
     one, other = (_standard_error(*half) for half in halves)
     return float(abs(off[0] - off[1]) / np.hypot(one, other))
+
+
+def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
+    """
+    Give the standard error of k1 by what no residual shows: all that is seen in a cell is shifted.
+
+    It is what covariances have too, but in all pairs alike, as sampling and the lens go with the
+    place in the image.
+    """
+    seen = np.concatenate([lens.pixels(one.pair.y, lens.k1)[0] for one in linearised])
+    side = max(float(np.sqrt(np.ptp(seen, axis=0).prod() / LARGE_CELLS)), 1.0)
+    _, cell = np.unique(cells_of(seen, side), return_inverse=True)
+    together = np.array([np.bincount(cell, along) for along in
+                         np.concatenate([one.pulls for one in linearised]).T])
+    curvature = sum(one.by_match[0].sum() for one in linearised)
+    return float(SHIFT * np.sqrt((together**2).sum()) / curvature)
 
 
 def _standard_error(curvature: Array, gradient: Array) -> float:
