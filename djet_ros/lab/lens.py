@@ -1,4 +1,4 @@
-"""What the images of a recording say of their calibration: the distortion that it leaves."""
+"""What a calibration leaves of distortion in the images of a recording."""
 
 from __future__ import annotations
 
@@ -8,26 +8,35 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import Config
-from djet_ros.core.geometry import rays
-from djet_ros.core.lens import by_radius, fit_lens, LensFit, MatchedPair, tells
+from djet_ros.core.lens import (
+    by_radius,
+    fit_lens,
+    is_informative,
+    LensFit,
+    MatchedPair,
+    outermost,
+)
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.style import COLOURS, figure
-from djet_ros.odometry.camera import Camera
-from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
 import numpy as np
 import yaml
 
-# Pairs that have to tell, so that there are groups to compare; of more, every other one is kept.
+# Informative pairs that are needed, so that there are groups to compare; of more, every other one
+# is kept.
 LEAST_PAIRS, MOST_PAIRS = 20, 2000
 
-# Standard errors, and pixels at the corners, from which on a coefficient is worth changing.
-_SURE, _VISIBLE = 3.0, 0.3
+# Standard errors, and pixels at the outermost matches, from which on a coefficient is worth
+# changing. By ten groups, errors are of a Student distribution of nine degrees of freedom, and 4.1
+# is there what three is of a normal one.
+_SURE, _VISIBLE = 4.1, 0.3
 
-# Standard errors by which pairs that tell much and little may differ.
+# Standard errors by which more and less informative pairs may differ.
 _AGREE = 3.0
 
 # chosen: share by which a coefficient may change how far the camera turns; 0.07 was seen where
@@ -44,14 +53,15 @@ _RINGS = 8
 @dataclass(frozen=True)
 class LensReport:
     """
-    What a recording tells of its camera's distortion.
+    What was found of a camera's distortion.
 
-    size: (width, height) of its images; pairs: how many were tracked in all; the fit is that of
-    those that tell.
+    info: its CameraInfo; rectified: whether its images come rectified, so that they have no
+    distortion by it; pairs: how many were tracked in all; the fit is that of the informative ones.
     """
 
     camera: Camera
-    size: tuple[int, int]
+    info: Any
+    rectified: bool
     pairs: int
     fit: LensFit
 
@@ -62,14 +72,12 @@ class LensReport:
 
     @property
     def turned_deg(self) -> float:
-        """By how much the camera turns in the pairs that tell, all in all."""
-        return float(np.degrees(sum(one.pair.angle for one in self.fit.told)))
+        """By how much the camera turns in the informative pairs, all in all."""
+        return float(np.degrees(sum(one.pair.angle for one in self.fit.linearised)))
 
-    def corner_pixels(self, k1: float) -> float:
-        """By how many pixels a coefficient moves what is seen in the corners, at most."""
-        width, height = self.size
-        corners = np.array([(x, y) for x in (0, width - 1) for y in (0, height - 1)], float)
-        places = rays(self.camera.K, corners)[:, :2]
+    def moved_pixels(self, k1: float) -> float:
+        """By how many pixels a coefficient moves the outermost matches, at most."""
+        places = outermost([one.pair for one in self.fit.linearised])
         moved = self.camera.pixels(places, k1)[0] - self.camera.pixels(places, self.camera.k1)[0]
         return float(np.linalg.norm(moved, axis=1).max())
 
@@ -77,65 +85,87 @@ class LensReport:
     def worth_correcting(self) -> bool:
         """Whether the calibration is wrong for certain, and by what can be seen."""
         return (abs(self.fit.k1 - self.camera.k1) > _SURE * self.fit.sigma
-                and self.corner_pixels(self.fit.k1) > _VISIBLE)
+                and self.moved_pixels(self.fit.k1) > _VISIBLE)
 
 
 def examine(recording: Recording, config: Config, advance: Callable[[], None]) -> LensReport:
     """
     Run a recording through the odometry, and find the coefficient k1 that suits its pairs.
 
-    At most 2000 pairs of 300 matches are held, spread over all of it. DjetError where the camera
-    moves in no way that would tell.
+    At most 2000 pairs of 300 matches are held, spread over all of it. DjetError where they do not
+    determine it.
     """
-    telling, pairs, every = list[MatchedPair](), 0, 1
+    informative, pairs, every = list[MatchedPair](), 0, 1
     for seen in _pairs(recording, config, advance):
         pairs += 1
         pair = MatchedPair.of(seen.relative, seen.camera.K)
-        if pairs % every == 0 and tells(pair, seen.camera):
-            telling.append(pair)
-        if len(telling) > MOST_PAIRS:
-            del telling[::2]
+        if pairs % every == 0 and is_informative(pair, seen.camera):
+            informative.append(pair)
+        if len(informative) > MOST_PAIRS:
+            del informative[::2]
             every *= 2
-    if len(telling) < LEAST_PAIRS:
-        raise DjetError(f'{len(telling)} of {pairs} pairs tell of the lens, and {LEAST_PAIRS} are '
-                        'needed; record turns, or ways sideways, past what is near and far: '
-                        'straight ahead tells nothing')
-    fit = fit_lens(telling, seen.camera)
-    _check(fit, telling)
-    return LensReport(seen.camera, seen.size, pairs, fit)
+    if len(informative) < LEAST_PAIRS:
+        raise DjetError(_too_few(len(informative), pairs))
+    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
+    return LensReport(seen.camera, seen.info, rectified, pairs,
+                      trusted_fit(informative, seen.camera))
 
 
-def _check(fit: LensFit, pairs: Sequence[MatchedPair]) -> None:
-    """Raise DjetError where something else than a k1 seems to be wrong with the pairs."""
+def _too_few(informative: int, pairs: int) -> str:
+    """Say what is missing: where most pairs are informative, there are just too few of them."""
+    said = (f'{informative} of {pairs} pairs are informative about the lens, and {LEAST_PAIRS} '
+            'are needed')
+    if 2 * informative > pairs:
+        return f'{said}; record for longer'
+    return (f'{said}; record turns, or ways sideways, past what is near and far: straight ahead '
+            'tells nothing')
+
+
+def trusted_fit(pairs: Sequence[MatchedPair], camera: Camera) -> LensFit:
+    """Find k1, and raise DjetError where something else seems to be wrong with the pairs."""
+    fit = fit_lens(pairs, camera)
+    if fit is None:
+        raise DjetError(f'no k1 was found, from {camera.k1:.4g} on, that suits the pairs and does '
+                        'not fold the image: the camera matrix or other coefficients may be '
+                        'wrong; calibrate with a target first')
     before, after = (sum(pair.angle for pair in some)
-                     for some in (pairs, [one.pair for one in fit.told]))
+                     for some in (pairs, [one.pair for one in fit.linearised]))
     if abs(after - before) > _SAME_TURN * before + _HARDLY_TURNED * len(pairs):
         raise DjetError(f'with k1 = {fit.k1:.2g} the camera would turn by {np.degrees(after):.0f} '
                         f'degrees, not {np.degrees(before):.0f}: turns pass for ways sideways '
                         'here; record turns past what is near and far, without blur')
     if fit.disagreement > _AGREE:
-        raise DjetError('the pairs that tell most of the lens are at odds with the others, by '
+        raise DjetError('the more informative pairs are at odds with the others, by '
                         f'{fit.disagreement:.1f} standard errors: no k1 explains that, but '
                         'rolling rows, blur or a wrong camera matrix may; record slower turns')
+    return fit
 
 
 class _Pair(NamedTuple):
-    """A pair that was tracked in images of a size (width, height)."""
+    """A pair that was tracked, by a camera with a CameraInfo."""
 
     camera: Camera
-    size: tuple[int, int]
+    info: Any
     relative: RelativePose
 
 
 def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:
     """Yield what the odometry makes of a recording; DjetError where another camera goes on."""
-    config = replace(config, odometry=replace(config.odometry, scale='none'))
-    tracker = Tracker(config, message_type, image_topic=recording.image_topic)
+    if config.odometry.mask:
+        raise DjetError('odometry.mask is true, and masks by stamp are not read here; give '
+                        'odometry.mask_file, or none')
+    # Lengths are of no use here, and what measures them is not read.
+    config = replace(config, odometry=replace(config.odometry, scale='none', imu=False,
+                                              guess=False))
+    tracker = Tracker(config, message_type, image_topic=recording.image_topic,
+                      still_mask=still_mask(config.odometry.mask_file))
     camera: Camera | None = None
+    info: Any = None
     for topic, _, message in recording.messages():
         if topic == recording.info_topic:
             tracker.camera_info(message)
-            camera = camera or tracker.camera
+            if camera is None:
+                camera, info = tracker.camera, message
             if tracker.counts.rejected_infos and tracker.problem is not None:
                 raise tracker.problem
             if tracker.camera is not camera:
@@ -148,8 +178,7 @@ def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) ->
                 last = tracker.last
             if camera is not None and last is not None and last.status is Status.OK \
                     and last.relative is not None:
-                height, width = gray_image(message).shape
-                yield _Pair(camera, (width, height), last.relative)
+                yield _Pair(camera, info, last.relative)
     if not tracker.counts.processed:
         raise tracker.problem or DjetError(
             f'none of {tracker.counts.received} images came after a CameraInfo on '
@@ -157,27 +186,31 @@ def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) ->
 
 
 def calibration(report: LensReport) -> str:
-    """Word the camera with the k1 that was found as YAML, as ROS's camera_calibration has it."""
-    camera, (width, height) = report.camera, report.size
-    projection = np.column_stack([camera.K, np.zeros(3)])
+    """
+    Word the CameraInfo as YAML, as camera_info_manager reads it, with the k1 that was found.
+
+    All else stays, as it is of the full resolution and perhaps of a stereo pair. Only of images
+    that come raw: the CameraInfo of rectified ones is about those before the rectification.
+    """
+    info = report.info
     return str(yaml.safe_dump({
-        'image_width': width, 'image_height': height, 'camera_name': 'camera',
-        'camera_matrix': _matrix(camera.raw_K),
-        'distortion_model': camera.distortion[0],
-        'distortion_coefficients': _matrix(np.array([report.coefficients])),
-        'rectification_matrix': _matrix(np.eye(3)),
-        'projection_matrix': _matrix(projection)}, sort_keys=False, default_flow_style=None))
+        'image_width': int(info.width), 'image_height': int(info.height), 'camera_name': 'camera',
+        'camera_matrix': _matrix(info.k, 3),
+        'distortion_model': report.camera.distortion[0],
+        'distortion_coefficients': _matrix(report.coefficients, 1),
+        'rectification_matrix': _matrix(info.r, 3),
+        'projection_matrix': _matrix(info.p, 3)}, sort_keys=False, default_flow_style=None))
 
 
-def _matrix(values: Array) -> dict[str, Any]:
-    rows, columns = values.shape
-    return {'rows': rows, 'cols': columns, 'data': values.ravel().tolist()}
+def _matrix(values: Sequence[float], rows: int) -> dict[str, Any]:
+    data = np.asarray(values, float).ravel().tolist()
+    return {'rows': rows, 'cols': len(data) // rows, 'data': data}
 
 
 def plot_lens(path: Path, title: str, report: LensReport) -> None:
     """Draw by how many pixels matches are off along the radius, and what k1 makes of that."""
     fit, camera = report.fit, report.camera
-    radii = np.concatenate([np.linalg.norm(one.pair.y, axis=1) for one in fit.told])
+    radii = np.concatenate([np.linalg.norm(one.pair.y, axis=1) for one in fit.linearised])
     edges = np.linspace(0, float(np.quantile(radii, 0.999)), _RINGS + 1)
     middles, fine = (edges[:-1] + edges[1:]) / 2, np.linspace(0, edges[-1], 100)
     k1, sigma = by_radius(fit, edges)
@@ -186,10 +219,11 @@ def plot_lens(path: Path, title: str, report: LensReport) -> None:
         axes.axhline(0, color='black', lw=0.8, label='as calibrated')
         axes.plot(_radius(camera, fine), _outwards(camera, fine, fit.k1), color=COLOURS['rpe'],
                   label=f'k1 = {fit.k1:.4f} ± {fit.sigma:.4f}')
-        off, width = (np.array([_outwards(camera, at, one) for at, one in zip(middles, values)])
+        off, width = (np.concatenate([_outwards(camera, at, one)
+                                      for at, one in zip(middles[:, None], values)])
                       for values in (k1, camera.k1 + sigma))
         axes.errorbar(_radius(camera, middles), off, np.abs(width), fmt='o', ms=4,
-                      color=COLOURS['djet'], label='what matches in rings say')
+                      color=COLOURS['djet'], label='by matches in rings')
         axes.set_xlabel('distance from the principal point, px')
         axes.set_ylabel('seen too far out, px')
         axes.set_title(title)
@@ -197,13 +231,15 @@ def plot_lens(path: Path, title: str, report: LensReport) -> None:
 
 
 def _radius(camera: Camera, radii: Array) -> Array:
-    """Pixels (N,) from the principal point at which points of radii X/Z are seen."""
-    return np.asarray(radii * camera.raw_K[0, 0])
+    """Pixels (N,) from the middle at which points of radii X/Z (N,) are seen, as calibrated."""
+    return np.asarray(_along(camera, radii, camera.k1) - _along(camera, np.zeros(1), camera.k1))
 
 
 def _outwards(camera: Camera, radii: Array, k1: float) -> Array:
-    """By how many pixels a coefficient moves points of radii X/Z outwards."""
-    radii = np.atleast_1d(radii)
-    places = np.stack([radii, np.zeros_like(radii)], axis=-1)
-    moved = camera.pixels(places, k1)[0] - camera.pixels(places, camera.k1)[0]
-    return np.squeeze(moved[:, 0])
+    """By how many pixels (N,) a coefficient moves points of radii X/Z (N,) outwards."""
+    return np.asarray(_along(camera, radii, k1) - _along(camera, radii, camera.k1))
+
+
+def _along(camera: Camera, radii: Array, k1: float) -> Array:
+    """Columns (N,) in which points of X/Z (N,) and Y/Z = 0 are seen."""
+    return camera.pixels(np.stack([radii, np.zeros_like(radii)], axis=-1), k1)[0][:, 0]

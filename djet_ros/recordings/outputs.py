@@ -36,6 +36,17 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
     Raises DjetError where the folder is somebody else's, or ours and not to be overwritten;
     OSError where it can't be made.
     """
+    for path in check_room(folder, ours, overwrite, marks):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def check_room(folder: Path, ours: Collection[str], overwrite: bool,
+               marks: Collection[str] = ()) -> list[Path]:
+    """Raise DjetError as ``make_room`` does; give what it would remove, and touch nothing."""
     if folder.exists() and not folder.is_dir():
         raise DjetError(f'{folder} exists and is no folder; choose another --output')
     if marks and folder.is_dir() and any(folder.iterdir()) \
@@ -46,12 +57,7 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
     if present and not overwrite:
         raise DjetError(f'{folder} holds earlier results; choose another --output, or replace '
                         'them with --overwrite')
-    for path in present:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-    folder.mkdir(parents=True, exist_ok=True)
+    return present
 
 
 def write_whole(path: Path, text: str) -> None:
