@@ -149,16 +149,20 @@ class _Pair(NamedTuple):
     relative: RelativePose
 
 
-def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:
-    """Yield what the odometry makes of a recording; DjetError where another camera goes on."""
+def _tracker(recording: Recording, config: Config) -> Tracker:
     if config.odometry.mask:
         raise DjetError('odometry.mask is true, and masks by stamp are not read here; give '
                         'odometry.mask_file, or none')
     # Lengths are of no use here, and what measures them is not read.
     config = replace(config, odometry=replace(config.odometry, scale='none', imu=False,
                                               guess=False))
-    tracker = Tracker(config, message_type, image_topic=recording.image_topic,
-                      still_mask=still_mask(config.odometry.mask_file))
+    return Tracker(config, message_type, image_topic=recording.image_topic,
+                   still_mask=still_mask(config.odometry.mask_file))
+
+
+def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:
+    """Yield what the odometry makes of a recording; DjetError where another camera goes on."""
+    tracker = _tracker(recording, config)
     camera: Camera | None = None
     info: Any = None
     for topic, _, message in recording.messages():
