@@ -239,7 +239,7 @@ def test_a_file_for_a_driver_differs_in_the_distortion_alone() -> None:
     info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 60, 20, 1280, 960
     info.r = rotation_exp(np.array([0.0, 0.02, 0.0])).ravel()
     info.p = np.array([1000, 0, 630, -120.0, 0, 1000, 480, 0, 0, 0, 1, 0])
-    fit = LensFit(0.12, 0.001, (), 0.0)
+    fit = LensFit(0.12, 0.001, 0.12, (), 0.0)
     report = lens.LensReport(Camera.from_info(info, rectified=False), info, False, 40, fit)
     written = yaml.safe_load(lens.calibration(report))
     assert (written['image_width'], written['image_height']) == (1400, 1000)

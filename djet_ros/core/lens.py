@@ -48,8 +48,8 @@ LEAST_SHARE = 0.005
 _OUT_OF_NOISE = 6.0
 
 # chosen: rounds, of which three are enough where k1 is small; and what k1 may still move in the
-# last one, in standard errors.
-_ROUNDS, _SETTLED = 20, 0.01
+# last one, in standard errors. It may tremble by half of that, as each tells the noise anew.
+_ROUNDS, _SETTLED = 20, 0.1
 
 # What a step of k1 may move the outermost matches by, as a share of their distance from the
 # middle. Without distortion, -k1 r^2 = 4/27 folds the image there; a step is a quarter of that.
@@ -152,13 +152,14 @@ class LensFit:
     """
     The coefficient k1 that suits all pairs best, and its standard error.
 
-    linearised: the pairs at k1; disagreement: by how many standard errors the more informative
-    pairs differ from the others. Noise does not make them; something that is the same in many
-    pairs, and is no k1, is larger in those that are less informative.
+    about: a k1 next to it; linearised: the pairs about that; disagreement: by how many standard
+    errors the more informative pairs differ from the others. Noise does not make them; something
+    that is the same in many pairs, and is no k1, is larger in those that are less informative.
     """
 
     k1: float
     sigma: float
+    about: float
     linearised: tuple[Linearised, ...]
     disagreement: float
 
@@ -184,7 +185,7 @@ def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
         sigma = float(np.hypot(_standard_error(curvature, gradient),
                                _shift_error(linearised, lens)))
         if abs(step) < _SETTLED * sigma:
-            return LensFit(k1, sigma, tuple(linearised), _disagreement(linearised))
+            return LensFit(k1 + step, sigma, k1, tuple(linearised), _disagreement(linearised))
         pairs = [one.pair for one in linearised]
         k1 += _shortened(step, rim, lens, k1)
     return None
@@ -213,7 +214,7 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
         chosen = [one.by_match[:, (radii >= inner) & (radii < outer)].sum(1)
                   for one in fit.linearised for radii in [np.linalg.norm(one.pair.y, axis=1)]]
         curvature, gradient = np.array([sums for sums in chosen if sums[0] > 0]).reshape(-1, 2).T
-        rows.append([fit.k1 - gradient.sum() / curvature.sum(),
+        rows.append([fit.about - gradient.sum() / curvature.sum(),
                      _standard_error(curvature, gradient)]
                     if len(curvature) >= _FEW else [np.nan, np.nan])
     return np.array(rows).T
