@@ -8,7 +8,7 @@ import struct
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.camera import Camera, check_lens
 from djet_ros.odometry.images import BadMessage, decoded, jpeg_size
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
 from djet_ros.recordings.imu import ImuTrack
@@ -46,6 +46,10 @@ class FrameSequence:
         self.poses = poses
         self.imu = imu
         self._images = images
+        try:
+            check_lens(K, images.size)
+        except BadMessage as error:
+            raise DjetError(f'{name}: {error}') from None
         self._camera = Camera(K, self.distortion, images.size, model)
 
     def __len__(self) -> int:
