@@ -378,6 +378,40 @@ def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp
     assert mended(one)[2] == {}
 
 
+@pytest.mark.parametrize('prepared', [False, True])
+def test_a_camera_of_12_bits_is_said_and_gives_the_same_once_its_range_is_known(drive, prepared):
+    def sent(one, first):
+        messages = [image(gray.astype('<u2') * 16, 'mono16', ns(0.1 * (first + i)))
+                    for i, gray in enumerate(drive)]
+        for message, after in zip(messages, [*messages[1:], None]):
+            if prepared and after is not None:
+                one.expect(after)
+            one.image(message)
+        return one.last.pose
+
+    one, eight, told = tracker(), tracker(), tracker(**{'odometry.gray_range': '0 4095'})
+    sent(one, 0)
+    text = mended(one)[2]['few gray levels']
+    assert re.match(r'\d+ images of 16 bits in a row became 1?\d gray levels with odometry'
+                    r'.gray_range 0 65535; their values lie between \d+ and \d+: set', text)
+    play(eight, drive)
+    assert np.array_equal(sent(told, 0), eight.last.pose)
+    assert mended(told)[2] == {}
+    # and while it runs
+    one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
+    sent(one, len(drive))
+    assert mended(one)[2] == {}
+
+
+def test_a_change_of_the_gray_range_holds_for_an_image_that_was_begun_before(drive):
+    message = image(drive[0].astype('<u2') * 16, 'mono16', 1)
+    one = tracker()
+    one.expect(message)
+    one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
+    one.image(message)
+    assert np.array_equal(one._frame.gray, drive[0])
+
+
 def test_one_image_that_comes_twice_is_nothing_to_mend(drive):
     one = tracker()
     for i, gray in enumerate(drive):

@@ -80,6 +80,10 @@ class OdometryConfig:
         'auto', 'whether images come rectified: true (camera is P), false (camera is K, D), auto '
         "(true where the image topic's last name has 'rect' in it, else false)",
         choices=('auto', 'true', 'false'))
+    gray_range: str = parameter(
+        '0 65535', "'low high': of images of 16 bits, the values that become black and white; all "
+        'others go in equal steps between them. A camera of 12 bits wants 0 4095. Images of 8 '
+        'bits stay as they are')
     frame_convention: str = parameter(
         'body', 'axes of all poses in messages: body (x forward, y left, z up, as REP 103 has it '
         'for what moves) or optical (z forward, x right, y down, as it has it for images)',
@@ -98,6 +102,7 @@ class OdometryConfig:
         """Refuse values outside their described range."""
         check(self)
         self.imu_quaternion()
+        self.gray_limits()
 
     def imu_quaternion(self) -> tuple[float, ...] | None:
         """Give the quaternion x y z w of imu_rotation, of length one; None where tf is asked."""
@@ -112,6 +117,15 @@ class OdometryConfig:
             raise ValueError(f"imu_rotation is '{self.imu_rotation:.80}'; give a quaternion "
                              "'x y z w' of length 1, or nothing")
         return tuple(value / length for value in values)
+
+    def gray_limits(self) -> tuple[int, int]:
+        """Give the two values of gray_range."""
+        words = self.gray_range.replace(',', ' ').split()
+        values = [int(word) for word in words if word.isdecimal() and len(word) < 6]
+        if len(values) != len(words) or len(values) != 2 or not values[0] < values[1] < 65536:
+            raise ValueError(f"gray_range is '{self.gray_range:.80}'; give 'low high', whole "
+                             'numbers from 0 to 65535 such as 0 4095')
+        return values[0], values[1]
 
 
 @dataclass(frozen=True)

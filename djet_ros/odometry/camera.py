@@ -126,10 +126,10 @@ class Camera:
     def _check_distortion(self, width: int, height: int) -> None:
         """Refuse a distortion by which hardly anything of the image would be seen."""
         x, y = np.meshgrid(*((np.arange(_GRID) + 0.5) * side / _GRID for side in (width, height)))
-        rays = np.linalg.solve(self.K, np.stack([x.ravel(), y.ravel(), np.ones(x.size)]))
+        rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
         # What is too far off for a number is not seen.
         with np.errstate(all='ignore'):
-            seen, _ = self.pixels(rays[:2].T, self.k1)
+            seen, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
         inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
         if inside.mean() < _LEAST_SEEN:
             coefficients = ' '.join(f'{value:g}' for value in self.distortion[1])

@@ -143,7 +143,7 @@ class Replay:
         self._evaluate(summary)
         self._folder.finish(summary)
         return Outcome(summary, problem or None, tuple(
-            f'{one.name}: {one.text}' for one in self._tracker.complaints_beside))
+            f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content))
 
     def _take(self, message: BagMessage) -> int:
         """Hand one message on; give how many images were worked on."""
