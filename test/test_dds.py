@@ -427,6 +427,7 @@ def test_names_are_resolved_and_remapped_as_in_ros():
     (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
     (['-p', 'ros.queue_size:=many'], {}, 'must be of type int'),
     (['-p', 'odometry.scale:=ground_truth'], {}, 'only a recording has'),
+    (['-p', 'odometry.scale:=constant'], {}, 'give the metres of each translation'),
     ([], {'ROS_DOMAIN_ID': 'home'}, "ROS_DOMAIN_ID is 'home'"),
     ([], {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'HOUSE'}, 'choose from LOCALHOST, SUBNET'),
     ([], {'CYCLONEDDS_URI': '<Cyclone'}, 'check CYCLONEDDS_URI'),

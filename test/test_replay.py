@@ -468,6 +468,8 @@ def bad_config(tmp_path, bag):
     (bad_config, "did you mean 'estimator.window'"),
     (lambda t, b: [b, '--method', 'sift'], "'sift'"),
     (lambda t, b: [b, '--scale', 'speed'], 'speed'),
+    (lambda t, b: [b, '--scale', 'camera_height'], 'give the metres from the ground'),
+    (lambda t, b: [b, '--scale', 'constant'], 'scale_value is 0; give the metres of each'),
     (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
 ])
 def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
@@ -475,6 +477,13 @@ def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith('djet: error: ')
     assert message in done.stderr
+
+
+def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_path):
+    file = tmp_path / 'car.yaml'
+    file.write_text('odometry: {scale: constant}\n')
+    djet('replay', bag, '--config', file, '--scale-value', '0.5', '--output', tmp_path / 'out')
+    assert summary(tmp_path / 'out')['scale_kind'] == 'metric'
 
 
 def test_a_truncated_bag_leaves_what_was_before_the_cut(bag, tmp_path):

@@ -250,7 +250,8 @@ def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
 # What a backend needs
 
 def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
-    one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant'})
+    one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant',
+                     'odometry.scale_value': 1.0})
     black = np.zeros_like(drive[0])
     images = [drive[0], drive[1], drive[1], drive[2], black, drive[3], black, black, drive[4],
               drive[5]]
@@ -448,7 +449,7 @@ def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(dri
 
 
 def test_ground_that_is_never_seen_is_said_too(drive):
-    one = tracker(**{'odometry.scale': 'camera_height'})
+    one = tracker(**{'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0})
     play(one, [np.rot90(gray, 2) for gray in drive])
     assert 'no level ground' in mended(one)[2]['no metric length']
 

@@ -36,15 +36,15 @@ class OdometryConfig:
         choices=('structure', 'none', 'constant', 'speed', 'camera_height', 'guess',
                  'ground_truth'))
     scale_value: float = parameter(
-        1.0, 'length of each translation in metres, for scale constant',
-        minimum=1e-6, maximum=1e6)
+        0.0, 'length of each translation in metres, which scale constant needs; 0 says none',
+        minimum=0.0, maximum=1e6)
     scale_uncertainty: float = parameter(
         0.05, 'standard deviation of a known length, as a share of it; for scale camera_height '
         'that of the height, and what the images leave uncertain comes on top',
         minimum=1e-6, maximum=10.0)
     camera_height: float = parameter(
-        1.0, 'metres from flat ground up to the camera, for scale camera_height',
-        minimum=0.01, maximum=1000.0)
+        0.0, 'metres from flat ground up to the camera, which scale camera_height needs; 0 says '
+        'none', minimum=0.0, maximum=1000.0)
     camera_pitch: float = parameter(
         0.0, 'degrees by which the camera looks down, to within 2, for scale camera_height; it '
         'must not roll', minimum=-30.0, maximum=80.0)
