@@ -452,4 +452,4 @@ def test_without_cyclone_dds_the_commands_say_how_to_get_it(monkeypatch, capsys)
     assert main(['echo']) == 2
     assert capsys.readouterr().err == (
         "djet: error: this command needs the Python module 'cyclonedds', which is not installed: "
-        'pip install cyclonedds\n')
+        "pip install './djet_ros[dds]' (the folder with the README)\n")
