@@ -371,8 +371,27 @@ def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):
     live(*EVERY, *FAST, topic=RECTIFIED)
     peer.spin(0.5)
     start('play', bag, '--rate', '10').finish()
-    peer.wait('the lines', lambda: len(echo.log.splitlines()) == FRAMES)
-    assert all(len(line.split()) == 8 for line in echo.log.splitlines())
+
+    def lines():
+        return [line for line in echo.log.splitlines() if not line.startswith('waiting for ')]
+
+    peer.wait('the lines', lambda: len(lines()) == FRAMES)
+    assert all(len(line.split()) == 8 for line in lines())
+
+
+@pytest.mark.parametrize('words', [(), ('--diagnostics',)])
+def test_echo_says_over_which_topic_nothing_comes(start, peer, words):
+    echo = start('echo', *words)
+    peer.wait('a line', lambda: echo.log)
+    assert echo.log == 'waiting for /vo_node/odometry: nobody publishes it\n'
+    front = peer.graph.advertise('/front/vo_node/odometry', 'nav_msgs/msg/Odometry')
+    other = start('echo', *words)
+    peer.wait('a line', lambda: other.log)
+    assert other.log == ('waiting for /vo_node/odometry: nobody publishes it; did you mean '
+                         '/front/vo_node/odometry?\n')
+    assert front.listeners == 0
+    assert echo.end()[0] == 0
+    assert echo.log.count('\n') == 1
 
 
 def call(peer: Peer, service: str, number: int) -> bytes:
