@@ -479,6 +479,20 @@ def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     assert message in done.stderr
 
 
+@pytest.mark.parametrize('verb', [('replay',), ('lab', 'evaluate'), ('lab', 'surfaces')])
+def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_of(
+        verb, folder, tmp_path):
+    file = tmp_path / 'bad.yaml'
+    file.write_text('')
+    for place, why in ((file / 'x.png', f'{file} exists and is no folder; choose another'),
+                       ('/proc/x/y.png', 'could not be made: ')):
+        said = djet(*verb, folder, '--output', place, expect=2).stderr
+        assert why in said
+        assert said.count('\n') == 1
+        assert 'readable' not in said
+    assert file.read_text() == ''
+
+
 def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_path):
     file = tmp_path / 'car.yaml'
     file.write_text('odometry: {scale: constant}\n')
