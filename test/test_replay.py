@@ -526,7 +526,7 @@ def test_a_recording_in_which_nothing_can_be_tracked_is_no_silent_success(tmp_pa
 
 
 def test_a_camera_that_stands_has_words_of_its_own(tmp_path):
-    source, poses = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
+    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert (f'djet: warning: the camera stood or only turned in all {FRAMES - 1} pairs '
             '(NO_PARALLAX)') in done.stderr
