@@ -19,7 +19,7 @@ import pytest
 # For the modules that use this one. A skip at their import would end more than them: plugins
 # import all modules of a folder while they collect it.
 needs_dds = pytest.mark.skipif(find_spec('cyclonedds') is None,
-                               reason="cyclonedds is missing: pip install 'djet_ros[dds]'")
+                               reason="cyclonedds is missing: pip install '.[dds]'")
 
 PATIENCE = 30.0
 NODE = '/vo_node'

@@ -4,7 +4,7 @@ Coverage-guided fuzzing of everything that reads what strangers made, for a boun
     python test/fuzz.py [--seconds N] [TARGET ...]     each target in turn, N seconds each
     python test/fuzz.py --input FILE TARGET            one input again, with its traceback
 
-Needs atheris (``pip install 'djet_ros[fuzz]'``). What was learnt stays in fuzz/TARGET/ for the
+Needs atheris (``pip install '.[fuzz]'``). What was learnt stays in fuzz/TARGET/ for the
 next run, and an input that breaks something is kept beside it. The exit code is 1 if one does.
 """
 

@@ -161,7 +161,19 @@ def info_seeds() -> list[bytes]:
     fish = camera_info(K, SIZE, distortion_model='equidistant', d=np.full(4, 0.01))
     binned = camera_info(K * [[2], [2], [1]], (320, 240), binning_x=2, binning_y=2)
     part = camera_info(K, (640, 480), roi=roi(10, 20, *SIZE))
-    return [*map(serialised, (camera_info(K, SIZE), distorted, fish, binned, part))]
+    return [*map(serialised, (camera_info(K, SIZE), distorted, fish, binned, part, *absurd()))]
+
+
+def absurd() -> Iterator[Any]:
+    """Say numbers that are finite, and no camera's."""
+    for value in (1e300, 1e6, 1e-300):
+        for at in ((0, 0), (0, 2), (0, 1)):
+            matrix = K.copy()
+            matrix[at] = value
+            yield camera_info(matrix, SIZE)
+            yield camera_info(matrix, (0, 0))
+        yield camera_info(K, SIZE, d=np.array([value, 0, 0, 0, 0]))
+        yield camera_info(K, SIZE, distortion_model='equidistant', d=np.array([value, 0, 0, 0]))
 
 
 def stream_of(data: bytes) -> None:

@@ -146,6 +146,58 @@ def test_a_camera_info_without_a_size_takes_any_image():
         assert camera.undistort(np.zeros(shape, np.uint8)).shape == shape
 
 
+def with_number(at, value):
+    matrix = K.copy()
+    matrix[at] = value
+    return matrix
+
+
+# Of an image of 160 x 120: a focal length, the optical axis off the middle, a skew.
+NO_LENS = [((0, 0), 1.0), ((0, 0), 1e-300), ((1, 1), 2e5), ((0, 0), 1e300), ((0, 2), 1.8e3),
+           ((0, 2), -1e300), ((1, 2), 1e4), ((0, 1), 200.0), ((0, 1), -1e300)]
+
+
+@pytest.mark.parametrize('at, value', NO_LENS)
+def test_a_camera_matrix_of_no_lens_is_refused_wherever_it_stands(at, value):
+    wrong = with_number(at, value)
+    P = np.hstack([wrong, np.zeros((3, 1))]).ravel()
+    assert reason(k=wrong.ravel()) == 'bad_calibration'
+    assert reason(True, p=P) == 'bad_calibration'
+    assert reason(p=P, d=DISTORTIONS['plumb_bob']) == 'bad_calibration'
+    # Where the CameraInfo has no size, the image tells it.
+    open_size = Camera.from_info(camera_info(wrong, (0, 0)), False)
+    with pytest.raises(BadMessage, match='calibrate the camera anew'):
+        open_size.undistort(np.zeros(SIZE[::-1], np.uint8))
+
+
+def test_a_telephoto_lens_and_a_small_part_of_a_large_sensor_are_cameras():
+    telephoto = with_number((0, 0), 5e4)
+    assert Camera.from_info(camera_info(telephoto, SIZE), False).K[0, 0] == 5e4
+    sensor = np.array([[4000.0, 0, 2000], [0, 4000, 1500], [0, 0, 1]])
+    corner = camera_info(sensor, (4000, 3000), roi=roi(3900, 2900, 64, 48))
+    camera = Camera.from_info(corner, False)
+    assert camera.undistort(np.zeros((48, 64), np.uint8)).shape == (48, 64)
+
+
+@pytest.mark.parametrize('model, first', [
+    ('plumb_bob', 1e300), ('plumb_bob', 500.0), ('plumb_bob', -1e4), ('equidistant', 1e300),
+    ('equidistant', -1e4)])
+def test_a_distortion_that_shows_next_to_nothing_of_the_image_is_refused(model, first):
+    D = np.zeros(len(DISTORTIONS[model]))
+    D[0] = first
+    camera = Camera(K, D, SIZE, model)
+    with pytest.raises(BadMessage, match=r'leaves \d+% of an image of 160x120') as caught:
+        camera.undistort(np.zeros(SIZE[::-1], np.uint8))
+    assert caught.value.reason == 'bad_calibration'
+
+
+def test_a_long_lens_may_have_large_coefficients():
+    long = K * [[10], [10], [1]] - [[0, 0, 9 * K[0, 2]], [0, 0, 9 * K[1, 2]], [0, 0, 0]]
+    D = np.array([-0.3, 60.0, 0, 0, -5e4])
+    bright = np.full(SIZE[::-1], 200, np.uint8)
+    assert (Camera(long, D, SIZE).undistort(bright) == 200).all()
+
+
 @pytest.mark.parametrize('changes, expected', [
     ({'k': np.zeros(9), 'p': np.zeros(12)}, 'uncalibrated'),
     ({'k': np.zeros(9)}, 'uncalibrated'),

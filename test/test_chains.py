@@ -208,7 +208,7 @@ def test_without_poselib_it_says_in_one_line_what_to_install(
     monkeypatch.setitem(sys.modules, 'poselib', None)
     monkeypatch.setattr(field, 'find_spec', lambda module: None if module == 'poselib' else 1)
     with pytest.raises(DjetError, match=rf"method '{name}' needs the module 'poselib'.*"
-                                        r"pip install 'djet_ros\[peers\]'") as caught:
+                                        r"pip install './djet_ros\[peers\]'") as caught:
         make_methods([name], ['best'], {})
     assert '\n' not in str(caught.value)
     assert name not in field.default_methods()

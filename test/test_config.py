@@ -45,6 +45,17 @@ def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
     assert '# method: "djet"' in SHIPPED.read_text()
 
 
+@pytest.mark.parametrize('text', ['', '0', '1 1', '9 3', '0 65536', '-1 5', '0 1e3', '0 5 9',
+                                  'low high', '0 ' + '9' * 5000])
+def test_a_gray_range_is_two_values_in_order(text):
+    with pytest.raises(DjetError, match="odometry.gray_range is '.*'; give 'low high', whole"):
+        from_flat({'odometry.gray_range': text})
+
+
+def test_a_gray_range_may_have_a_comma():
+    assert from_flat({'odometry.gray_range': '0, 4095'}).odometry.gray_limits() == (0, 4095)
+
+
 def test_every_parameter_says_what_it_means():
     for item in flat(Config()).values():
         assert len(item.description.text) > 10, item.name

@@ -128,6 +128,18 @@ def test_a_distorted_sequence_is_replayed_as_its_raw_images_with_their_distortio
     assert np.array_equal(camera.undistort(texture), euroc(asl).image(2))
 
 
+def test_files_of_16_bits_are_replayed_with_all_of_them(asl):
+    values = np.random.default_rng(0).integers(0, 4096, SIZE[::-1], np.uint16)
+    pincushion(asl, values)
+    recording = open_recording(asl)
+    message = next(message for topic, _, message in recording.messages()
+                   if topic == recording.image_topic)
+    assert message.encoding == 'mono16'
+    assert np.array_equal(gray_image(message, (0, 4095)), values // 16)
+    assert np.array_equal(euroc(asl).raw(0), values)
+    assert euroc(asl).image(0).max() <= 15
+
+
 def test_euroc_ground_truth_is_the_cameras_and_starts_where_it_is_known(asl):
     poses = euroc(asl).poses
     assert np.isnan(poses[0]).all()

@@ -371,8 +371,27 @@ def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):
     live(*EVERY, *FAST, topic=RECTIFIED)
     peer.spin(0.5)
     start('play', bag, '--rate', '10').finish()
-    peer.wait('the lines', lambda: len(echo.log.splitlines()) == FRAMES)
-    assert all(len(line.split()) == 8 for line in echo.log.splitlines())
+
+    def lines():
+        return [line for line in echo.log.splitlines() if not line.startswith('waiting for ')]
+
+    peer.wait('the lines', lambda: len(lines()) == FRAMES)
+    assert all(len(line.split()) == 8 for line in lines())
+
+
+@pytest.mark.parametrize('words', [(), ('--diagnostics',)])
+def test_echo_says_over_which_topic_nothing_comes(start, peer, words):
+    echo = start('echo', *words)
+    peer.wait('a line', lambda: echo.log)
+    assert echo.log == 'waiting for /vo_node/odometry: nobody publishes it\n'
+    front = peer.graph.advertise('/front/vo_node/odometry', 'nav_msgs/msg/Odometry')
+    other = start('echo', *words)
+    peer.wait('a line', lambda: other.log)
+    assert other.log == ('waiting for /vo_node/odometry: nobody publishes it; did you mean '
+                         '/front/vo_node/odometry?\n')
+    assert front.listeners == 0
+    assert echo.end()[0] == 0
+    assert echo.log.count('\n') == 1
 
 
 def call(peer: Peer, service: str, number: int) -> bytes:
@@ -427,6 +446,7 @@ def test_names_are_resolved_and_remapped_as_in_ros():
     (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
     (['-p', 'ros.queue_size:=many'], {}, 'must be of type int'),
     (['-p', 'odometry.scale:=ground_truth'], {}, 'only a recording has'),
+    (['-p', 'odometry.scale:=constant'], {}, 'give the metres of each translation'),
     ([], {'ROS_DOMAIN_ID': 'home'}, "ROS_DOMAIN_ID is 'home'"),
     ([], {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'HOUSE'}, 'choose from LOCALHOST, SUBNET'),
     ([], {'CYCLONEDDS_URI': '<Cyclone'}, 'check CYCLONEDDS_URI'),
@@ -451,4 +471,4 @@ def test_without_cyclone_dds_the_commands_say_how_to_get_it(monkeypatch, capsys)
     assert main(['echo']) == 2
     assert capsys.readouterr().err == (
         "djet: error: this command needs the Python module 'cyclonedds', which is not installed: "
-        'pip install cyclonedds\n')
+        "pip install './djet_ros[dds]' (the folder with the README)\n")

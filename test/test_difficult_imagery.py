@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from covariances import check_messages
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
@@ -69,6 +70,7 @@ def told(images: Iterable[Gray]) -> Iterator[Outcome]:
     odometry = VisualOdometry(preset('best'))
     for i, image in enumerate(images):
         result = odometry.process(Frame(image, K, (i + 1) * PERIOD_NS))
+        check_messages(result)
         if i:
             yield Outcome(result.status)
 
@@ -101,6 +103,7 @@ def drive(scene_name: str, change: Callable[[int, Gray], Gray] = lambda i, gray:
     for i in filter(keep, range(FRAMES)):
         image = change(i, scene.render(poses[i], i))
         result = odometry.process(Frame(image, scene.K, (i + 1) * PERIOD_NS))
+        check_messages(result)
         if result.previous_stamp_ns is None:
             continue
         previous = result.previous_stamp_ns // PERIOD_NS - 1

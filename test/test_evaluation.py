@@ -387,6 +387,35 @@ def test_an_interrupt_is_one_line_and_keeps_what_was_done(running, tmp_path):
     assert chunks(tmp_path)
 
 
+def cpu_seconds(process: int) -> float:
+    """CPU time of a process so far."""
+    user, system = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf('SC_CLK_TCK')
+
+
+# Each has work for many seconds in its first chunks.
+LONG = {'evaluate': ('ROAD',), 'coverage': ('--scenes', 'road', '--frames', '200'),
+        'lengths': ()}
+
+
+@pytest.mark.parametrize('moment', ['while a worker starts', 'in the middle of a chunk'])
+@pytest.mark.parametrize('verb', LONG)
+def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, moment, road, tmp_path):
+    words = [str(road) if word == 'ROAD' else word for word in LONG[verb]]
+    process = subprocess.Popen([*DJET, 'lab', verb, *words, '--output', str(tmp_path),
+                                '--workers', '2'], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.PIPE, text=True, start_new_session=True)
+    enough = 0.0 if moment == 'while a worker starts' else 2.5
+    wait_for(lambda: any(cpu_seconds(one) >= enough for one in workers_of(process)))
+    workers, begin = workers_of(process), monotonic()
+    # As a terminal does: to all of them.
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert monotonic() - begin < 3
+    assert (process.returncode, said) == (130, 'djet: interrupted\n')
+    wait_for(lambda: not any(Path(f'/proc/{worker}').exists() for worker in workers))
+
+
 @pytest.mark.slow
 def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--output', tmp_path)

@@ -216,7 +216,8 @@ def node(*words: str, before: str = '') -> subprocess.CompletedProcess[str]:
 def test_without_gtsam_it_says_in_one_line_how_to_get_it() -> None:
     done = node(before='import sys; sys.modules["gtsam"] = None; ')
     assert (done.returncode, done.stderr) == (
-        2, "pose_graph_node: error: gtsam is missing: pip install 'djet_ros[slam]'\n")
+        2, "pose_graph_node: error: gtsam is missing: pip install './djet_ros[slam]' (the "
+        'folder with the README)\n')
 
 
 def test_what_the_user_can_mend_ends_it_with_one_line() -> None:

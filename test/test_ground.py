@@ -320,7 +320,8 @@ def test_a_wrong_height_is_a_wrong_length_in_proportion(street):
 
 def test_the_choice_is_said_in_the_diagnostics(street):
     for name in ('none', 'camera_height'):
-        tracker = Tracker(from_flat({'odometry.scale': name}), message_type)
+        tracker = Tracker(from_flat({'odometry.scale': name, 'odometry.camera_height': 1.65}),
+                          message_type)
         assert tracker.diagnosis().values['scale source'] == name
 
 

@@ -6,7 +6,7 @@ import struct
 import zlib
 
 import cv2
-from djet_ros.odometry.images import BadMessage, ENCODINGS, gray_image
+from djet_ros.odometry.images import BadMessage, coarse, ENCODINGS, gray_image
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -101,6 +101,57 @@ def test_big_endian_numbers_are_read_as_such(encoding):
     little = gray_image(image(wide(pixels), encoding))
     assert np.array_equal(
         gray_image(image(wide(pixels, big_endian=True), encoding, is_bigendian=1)), little)
+
+
+def small(pixels, gain=16, offset=0):
+    """Sixteen bits of which a camera uses few: gain for each gray level, from an offset on."""
+    return (pixels.astype(np.uint16) * gain + offset).astype('<u2')
+
+
+@pytest.mark.parametrize('gain, offset', [(16, 0), (4, 0), (1, 0), (5, 8000), (256, 0)])
+@pytest.mark.parametrize('pixels, encoding', [(GRAY, 'mono16'), (RGB, 'rgb16')])
+def test_a_range_of_16_bits_gives_the_gray_of_all_that_it_has(pixels, encoding, gain, offset):
+    limits = offset, offset + 256 * gain - 1
+    for big in (False, True):
+        values = small(pixels, gain, offset).astype('>u2' if big else '<u2')
+        message = image(values, encoding, is_bigendian=int(big), padding=2)
+        assert np.array_equal(gray_image(message, limits), GRAY)
+    png = compressed(encoded('.png', small(GRAY, gain, offset)), 'png')
+    assert np.array_equal(gray_image(png, limits), GRAY)
+
+
+def test_what_is_outside_the_range_is_black_or_white_and_all_else_in_equal_steps():
+    values = np.tile(np.array([0, 999, 1000, 1001, 1999, 2000, 2001, 65535], '<u2'), (16, 4))
+    found = gray_image(image(values, 'mono16'), (1000, 2000))[0, :8]
+    assert found.tolist() == [0, 0, 0, 0, 255, 255, 255, 255]
+    every = np.arange(65536, dtype='<u2').reshape(256, 256)
+    levels = np.bincount(gray_image(image(every, 'mono16'), (0, 4095)).ravel())
+    assert levels[:255].tolist() == [16] * 255
+
+
+def test_a_range_changes_no_image_of_8_bits():
+    for message in (image(GRAY), compressed(encoded('.png'), 'png')):
+        assert np.array_equal(gray_image(message, (0, 4095)), GRAY)
+        assert coarse(message, gray_image(message, (0, 4095)) // 128) is None
+
+
+@pytest.mark.parametrize('message', [
+    lambda pixels: image(pixels, 'mono16'),
+    lambda pixels: image(pixels.byteswap(), 'mono16', is_bigendian=1),
+    lambda pixels: compressed(encoded('.png', pixels), 'png')])
+def test_16_bits_that_become_few_levels_are_told_with_the_values_they_had(message):
+    dark = message(small(GRAY, 2, 8000))
+    levels, low, high = coarse(dark, gray_image(dark))
+    assert levels <= 3
+    assert 8000 <= low < high <= 8510
+    assert coarse(dark, gray_image(dark, (8000, 8511))) is None
+
+
+def test_a_few_broken_pixels_hide_no_lack_of_gray_levels():
+    values = np.full((480, 640), 100, '<u2')
+    values.ravel()[:40_000:1000] = np.arange(40) * 1600
+    message = image(values, 'mono16')
+    assert coarse(message, gray_image(message)) == (1, 100, 100)
 
 
 @pytest.mark.parametrize('kind', [lambda d: array('B', d.tobytes()), lambda d: d.tobytes(),

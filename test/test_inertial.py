@@ -158,7 +158,8 @@ def test_a_bag_that_begins_again_begins_the_samples_again_but_not_the_bias() -> 
     assert abs(bias[2] - 0.1) < 0.01
     gyro.add(0, np.zeros(3))
     gyro.add(5_000_000, np.zeros(3))
-    assert gyro.newest_ns == 5_000_000
+    assert gyro.turn(0, 5_000_000) is not None
+    assert gyro.turn(SECOND, SECOND + 5_000_000) is None
     assert np.array_equal(gyro.bias, bias)
 
 

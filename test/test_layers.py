@@ -11,7 +11,7 @@ import sys
 from xml.etree import ElementTree
 
 import djet_ros
-from djet_ros.cli.main import DISTRIBUTIONS
+from djet_ros.libraries import EXTRAS, REQUIREMENTS
 import pytest
 
 PACKAGE = Path(djet_ros.__file__).parent
@@ -19,8 +19,9 @@ MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
 ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
 # From the bottom up. Rooms in one tuple are beside one another and do not know each other.
-ORDER = (('__init__', 'errors', 'threads'), ('core',), ('config',), ('odometry',), ('recordings',),
-         ('posegraph',), ('replay',), ('live',), ('ros', 'dds'), ('lab',), ('cli',))
+ORDER = (('__init__', 'errors', 'libraries', 'threads'), ('core',), ('config',), ('odometry',),
+         ('recordings',), ('posegraph',), ('replay',), ('live',), ('ros', 'dds'), ('lab',),
+         ('cli',))
 FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 
 CORE_LIBRARIES = {'cv2', 'djet_ros', 'numpy', 'scipy'}
@@ -148,11 +149,27 @@ def test_what_comes_with_ros_is_imported_by_the_ros_face_only() -> None:
     assert users <= set(in_room('ros'))
 
 
+def name_of(requirement: str) -> str:
+    return re.split(r'[<>=!;\[ ]', requirement)[0]
+
+
 def test_every_library_is_a_declared_dependency() -> None:
-    declared = {re.split(r'[<>=!;\[ ]', line)[0] for line in requires('djet_ros') or []
+    declared = {name_of(line) for line in requires('djet_ros') or []
                 if not re.search(r'extra == .(test|lint)', line)}
     # Python 3.14 has zstd.
     known = sys.stdlib_module_names | {'compression', 'djet_ros'} | ROS_LIBRARIES
     undeclared = {(module, library) for module in TREES for library in libraries(module) - known
-                  if DISTRIBUTIONS.get(library, library) not in declared}
+                  if name_of(REQUIREMENTS.get(library, library)) not in declared}
     assert not undeclared
+
+
+def test_whoever_misses_a_library_is_told_what_setup_py_says() -> None:
+    declared = [line.replace('"', "'") for line in requires('djet_ros') or []]
+    for library, extra in EXTRAS.items():
+        assert any(name_of(line) == library and f"extra == '{extra}'" in line
+                   for line in declared), library
+    bounds = {name_of(line): set(re.findall(r'[<>=][^,; ]+', line.partition(';')[0]))
+              for line in declared if 'extra' not in line}
+    for requirement in REQUIREMENTS.values():
+        said = set(re.findall(r'[<>=][^,]+', requirement))
+        assert not said or said == bounds[name_of(requirement)]

@@ -544,6 +544,19 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
         'odometry.max_gap', 'estimator.window']) == [2.0, 5]
 
 
+def test_a_scale_at_run_time_needs_its_length_first(node, publisher):
+    node()
+    for given, taken in (({'odometry.scale': 'camera_height'}, False),
+                         ({'odometry.camera_height': 1.65}, True),
+                         ({'odometry.scale': 'camera_height'}, True),
+                         ({'odometry.camera_height': 0.0}, False)):
+        (done, reason), = publisher.ask('configure', node=NODE, values=given)
+        assert done is taken
+        assert ('odometry.camera_height is 0; give the metres' in reason) is not taken
+    assert publisher.ask('configured', node=NODE, names=[
+        'odometry.scale', 'odometry.camera_height']) == ['camera_height', 1.65]
+
+
 def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
     node()
     answers = publisher.ask('configure', node=NODE, values={'preset': 'paper'})
@@ -558,6 +571,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
 @pytest.mark.parametrize(('words', 'reason'), [
     (['-p', 'estimator.window:=4'], 'estimator.window is 4; it must be odd'),
     (['-p', 'odometry.scale:=ground_truth'], 'only a recording has'),
+    (['-p', 'odometry.scale:=camera_height'], 'give the metres from the ground to the camera'),
     (['-p', 'nonsense'], "Couldn't parse parameter override rule: '-p nonsense'"),
     (['--params-file', '/no/such.yaml'], "Couldn't parse params file: '--params-file /no/such"),
     (['--params-file', 'broken.yaml'], "Couldn't parse params file: '--params-file broken.yaml"),

@@ -468,6 +468,8 @@ def bad_config(tmp_path, bag):
     (bad_config, "did you mean 'estimator.window'"),
     (lambda t, b: [b, '--method', 'sift'], "'sift'"),
     (lambda t, b: [b, '--scale', 'speed'], 'speed'),
+    (lambda t, b: [b, '--scale', 'camera_height'], 'give the metres from the ground'),
+    (lambda t, b: [b, '--scale', 'constant'], 'scale_value is 0; give the metres of each'),
     (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
 ])
 def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
@@ -475,6 +477,82 @@ def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith('djet: error: ')
     assert message in done.stderr
+
+
+@pytest.mark.parametrize('verb', [('replay',), ('lab', 'evaluate'), ('lab', 'surfaces')])
+def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_of(
+        verb, folder, tmp_path):
+    file = tmp_path / 'bad.yaml'
+    file.write_text('')
+    for place, why in ((file / 'x.png', f'{file} exists and is no folder; choose another'),
+                       ('/proc/x/y.png', 'could not be made: ')):
+        said = djet(*verb, folder, '--output', place, expect=2).stderr
+        assert why in said
+        assert said.count('\n') == 1
+        assert 'readable' not in said
+    assert file.read_text() == ''
+
+
+def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_path):
+    file = tmp_path / 'car.yaml'
+    file.write_text('odometry: {scale: constant}\n')
+    djet('replay', bag, '--config', file, '--scale-value', '0.5', '--output', tmp_path / 'out')
+    assert summary(tmp_path / 'out')['scale_kind'] == 'metric'
+
+
+def seen(tmp_path, frames):
+    """Give a recording of images (H, W) with the true poses of the drive."""
+    poses = tmp_path / 'poses.txt'
+    with TumWriter(poses) as truth:
+        for i in range(len(frames)):
+            truth.write(SECOND + i * SECOND // 10, np.linalg.matrix_power(STEP, i))
+    messages = [(topic, message, stamp) for i, gray in enumerate(frames)
+                for stamp in [SECOND + i * SECOND // 10]
+                for topic, message in [(INFO_TOPIC, camera_info(K, SIZE, stamp)),
+                                       (IMAGE_TOPIC, image(gray, stamp_ns=stamp))]]
+    return record(tmp_path / 'bag', messages), poses
+
+
+def test_a_recording_in_which_nothing_can_be_tracked_is_no_silent_success(tmp_path):
+    source, poses = seen(tmp_path, [np.zeros(SIZE[::-1], np.uint8)] * FRAMES)
+    done = djet('replay', source, '--poses', poses, '--output', tmp_path / 'out')
+    assert (f'djet: warning: none of {FRAMES - 1} pairs could be tracked (TOO_FEW_MATCHES): the '
+            'images are dark') in done.stderr
+    assert 'positions' not in done.stdout
+    assert 'plot' not in done.stdout
+    told = summary(tmp_path / 'out')
+    assert (told['positions'], told['drift']) == (None, None)
+    assert told['failures'] == FRAMES - 1
+
+
+def test_a_camera_that_stands_has_words_of_its_own(tmp_path):
+    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
+    done = djet('replay', source, '--output', tmp_path / 'out')
+    assert (f'djet: warning: the camera stood or only turned in all {FRAMES - 1} pairs '
+            '(NO_PARALLAX)') in done.stderr
+
+
+def test_images_too_far_apart_for_a_pair_are_said(tmp_path, bag):
+    file = tmp_path / 'slow.yaml'
+    file.write_text('odometry: {max_gap: 0.05}\n')
+    done = djet('replay', bag, '--config', file, '--output', tmp_path / 'out')
+    assert f'none of {FRAMES} images has a pair' in done.stderr
+    assert 'raise odometry.max_gap' in done.stderr
+
+
+def test_a_camera_of_12_bits_is_said_and_its_range_mends_it(tmp_path):
+    cards = Cards()
+    frames = [cards.gray(np.linalg.matrix_power(STEP, i)).astype('<u2') * 4 for i in range(FRAMES)]
+    source = record(tmp_path / 'bag', [
+        (topic, message, SECOND + i * SECOND // 10) for i, values in enumerate(frames)
+        for topic, message in [
+            (INFO_TOPIC, camera_info(K, SIZE, SECOND + i * SECOND // 10)),
+            (IMAGE_TOPIC, image(values, 'mono16', SECOND + i * SECOND // 10))]])
+    done = djet('replay', source, '--output', tmp_path / 'dark')
+    assert 'djet: warning: few gray levels: ' in done.stderr
+    done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'told')
+    assert 'warning' not in done.stderr
+    assert summary(tmp_path / 'told')['status'][Status.OK.value] == FRAMES - 1
 
 
 def test_a_truncated_bag_leaves_what_was_before_the_cut(bag, tmp_path):

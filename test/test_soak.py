@@ -10,6 +10,9 @@ import subprocess
 import sys
 from typing import Any
 
+from covariances import check_messages
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Status
 from djet_ros.lab import soak as module
 from djet_ros.lab.soak import resident_mb, soak
@@ -45,6 +48,18 @@ def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path
     assert sum(figures['status'].values()) == FRAMES
     assert {Status.OK, Status.TOO_FEW_MATCHES} <= figures['status'].keys()
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.slow
+def test_no_covariance_of_a_soak_is_zero_infinite_or_absurd() -> None:
+    odometry = VisualOdometry(EstimatorConfig(max_features=module.FEATURES), OdometryConfig())
+    statuses = set()
+    # Beyond the first step back of the stamps.
+    for frame in module._drive(500):
+        result = odometry.process(frame)
+        statuses.add(result.status)
+        check_messages(result)
+    assert {Status.OK, Status.FIRST_FRAME, Status.TIME_JUMP, Status.TOO_FEW_MATCHES} <= statuses
 
 
 class Leaking(VisualOdometry):

@@ -78,7 +78,7 @@ def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
 
 
 def test_structure_takes_over_from_another_scale_on_the_way(cards):
-    drive = Drive(cards, scale='constant')
+    drive = Drive(cards, scale='constant', scale_value=1.0)
     drive.go(steps()[:2])
     for scale in ('structure', 'none', 'structure'):
         config = OdometryConfig(scale=scale)

@@ -250,7 +250,8 @@ def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
 # What a backend needs
 
 def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
-    one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant'})
+    one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant',
+                     'odometry.scale_value': 1.0})
     black = np.zeros_like(drive[0])
     images = [drive[0], drive[1], drive[1], drive[2], black, drive[3], black, black, drive[4],
               drive[5]]
@@ -378,6 +379,40 @@ def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp
     assert mended(one)[2] == {}
 
 
+@pytest.mark.parametrize('prepared', [False, True])
+def test_a_camera_of_12_bits_is_said_and_gives_the_same_once_its_range_is_known(drive, prepared):
+    def sent(one, first):
+        messages = [image(gray.astype('<u2') * 16, 'mono16', ns(0.1 * (first + i)))
+                    for i, gray in enumerate(drive)]
+        for message, after in zip(messages, [*messages[1:], None]):
+            if prepared and after is not None:
+                one.expect(after)
+            one.image(message)
+        return one.last.pose
+
+    one, eight, told = tracker(), tracker(), tracker(**{'odometry.gray_range': '0 4095'})
+    sent(one, 0)
+    text = mended(one)[2]['few gray levels']
+    assert re.match(r'\d+ images of 16 bits in a row became 1?\d gray levels with odometry'
+                    r'.gray_range 0 65535; their values lie between \d+ and \d+: set', text)
+    play(eight, drive)
+    assert np.array_equal(sent(told, 0), eight.last.pose)
+    assert mended(told)[2] == {}
+    # and while it runs
+    one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
+    sent(one, len(drive))
+    assert mended(one)[2] == {}
+
+
+def test_a_change_of_the_gray_range_holds_for_an_image_that_was_begun_before(drive):
+    message = image(drive[0].astype('<u2') * 16, 'mono16', 1)
+    one = tracker()
+    one.expect(message)
+    one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
+    one.image(message)
+    assert np.array_equal(one._frame.gray, drive[0])
+
+
 def test_one_image_that_comes_twice_is_nothing_to_mend(drive):
     one = tracker()
     for i, gray in enumerate(drive):
@@ -414,7 +449,7 @@ def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(dri
 
 
 def test_ground_that_is_never_seen_is_said_too(drive):
-    one = tracker(**{'odometry.scale': 'camera_height'})
+    one = tracker(**{'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0})
     play(one, [np.rot90(gray, 2) for gray in drive])
     assert 'no level ground' in mended(one)[2]['no metric length']
 

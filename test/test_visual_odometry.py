@@ -383,3 +383,12 @@ def test_the_configuration_names_the_scale():
     assert isinstance(scale_source(OdometryConfig(scale='speed')), SpeedScale)
     with pytest.raises(DjetError, match='no ground truth'):
         scale_source(OdometryConfig(scale='ground_truth'))
+
+
+@pytest.mark.parametrize(('scale', 'length', 'too_short'), [
+    ('constant', 'scale_value', 1e-7), ('camera_height', 'camera_height', 0.009)])
+def test_nobody_guesses_a_length_that_a_scale_needs(scale, length, too_short):
+    for given in ({}, {length: too_short}):
+        with pytest.raises(DjetError, match=rf"scale is '{scale}', and odometry.{length} is "
+                           rf'\S+; give the metres .*--{length.replace("_", "-")}'):
+            scale_source(OdometryConfig(scale=scale, **given))

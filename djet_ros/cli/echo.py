@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+import sys
 from threading import Event
+from time import monotonic
 from typing import Any
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
@@ -24,6 +27,11 @@ output is no terminal, as lines.
 _SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames received',
           'frames processed', 'frames dropped', 'frames rejected', 'frames lost on the way',
           'matches', 'inliers', 'median residual (px)')
+
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+
+# Seconds without a message after which it is said what is waited for.
+_PATIENCE_S = 2.0
 
 _UNITS = {'metric': 'm', 'relative': 'lengths of the first step'}
 
@@ -46,16 +54,23 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.names import Names
     names = Names(args.node, args.remap)
-    view = Monitor(names.full_node.strip('/'))
+    view, topic = Monitor(names.full_node.strip('/')), names.resolve('~/odometry')
+
+    def pose(message: Any) -> None:
+        view.odometry(message)
+        if not args.diagnostics:
+            _print_pose(message)
+
     with Graph() as graph:
-        graph.listen(names.resolve('~/odometry'), 'nav_msgs/msg/Odometry',
-                     view.odometry if args.diagnostics else _print_pose)
+        graph.listen(topic, _ODOMETRY, pose)
+        waiting = _Waiting(view, graph, topic)
         if args.diagnostics:
             graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
                          view.diagnostics)
-            _show(view, graph, stop)
+            _show(view, graph, stop, waiting)
         while not stop.is_set():
             graph.spin(0.1)
+            waiting.say()
     return 0
 
 
@@ -112,6 +127,27 @@ class Monitor:
         return f'{self.summary}; path: {self.length}; {shown}'
 
 
+class _Waiting:
+    """Says once, if nothing is heard for a while, over which topic nothing comes."""
+
+    def __init__(self, view: Monitor, graph: Any, topic: str) -> None:
+        self._view, self._graph, self._topic = view, graph, topic
+        self._end: float | None = monotonic() + _PATIENCE_S
+
+    def say(self) -> None:
+        if self._end is None or monotonic() < self._end:
+            return
+        self._end = None
+        if not self._view.poses and not self._view.values:
+            print(f'waiting for {self._topic}: {self._why()}', file=sys.stderr, flush=True)
+
+    def _why(self) -> str:
+        if offers := self._graph.offers(self._topic):
+            return f'{len(offers)} publish it, none sends'
+        near = get_close_matches(self._topic, self._graph.published(_ODOMETRY), n=1, cutoff=0.0)
+        return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
+
+
 def _print_pose(message: Any) -> None:
     """Stamp, position and orientation as in a TUM file."""
     stamp, pose = message.header.stamp, message.pose.pose
@@ -120,17 +156,19 @@ def _print_pose(message: Any) -> None:
           f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}', flush=True)
 
 
-def _show(view: Monitor, graph: Any, stop: Event) -> None:
+def _show(view: Monitor, graph: Any, stop: Event, waiting: _Waiting) -> None:
     """Keep a terminal up to date, or print a line for each diagnostics message."""
     console = Console()
     if console.is_terminal:
         with Live(view.table(), console=console, auto_refresh=False) as live:
             while not stop.is_set():
                 graph.spin(0.2)
+                waiting.say()
                 live.update(view.table(), refresh=True)
         return
     while not stop.is_set():
         graph.spin(0.2)
+        waiting.say()
         if view.news:
             view.news = False
             print(view.line(), flush=True)

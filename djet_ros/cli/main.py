@@ -11,6 +11,7 @@ from typing import NoReturn
 
 from djet_ros import __version__
 from djet_ros.errors import DjetError
+from djet_ros.libraries import how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 # Only the module of the command that is called gets imported: help is quick, and no command
@@ -40,13 +41,6 @@ LAB = {
     'surfaces': 'draw one match on its Hamming surface, round by round',
     'imu-offset': "find the offset of an IMU's clock, and how it is mounted, from a recording",
     'render': 'render a scene with exact ground truth as a KITTI sequence',
-}
-
-# Where a module and the distribution that brings it differ in name.
-DISTRIBUTIONS = {
-    'backports': 'backports.zstd',
-    'cv2': 'opencv-python-headless',
-    'yaml': 'PyYAML',
 }
 
 
@@ -131,7 +125,7 @@ def _how_to_install(error: ModuleNotFoundError) -> str:
     if module in ('', 'djet_ros'):
         raise error
     return (f"this command needs the Python module '{module}', which is not installed: "
-            f'pip install {DISTRIBUTIONS.get(module, module)}')
+            f'{how_to_get(module)}')
 
 
 def _fail(message: str) -> int:

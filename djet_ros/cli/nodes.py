@@ -9,6 +9,7 @@ import signal
 import sys
 from threading import Event
 
+from djet_ros.libraries import how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
@@ -27,16 +28,16 @@ def pose_graph_node() -> int:
     """Run the pose graph until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
     return _run('pose_graph_node', "Closes the loops of vo_node's odometry, as a ROS 2 node.",
                 without_ros="without ROS, 'djet slam' works on recorded bags",
-                extra=('gtsam', 'slam'))
+                library='gtsam')
 
 
 def _run(name: str, description: str, *, without_ros: str,
-         extra: tuple[str, str] | None = None) -> int:
+         library: str = '') -> int:
     """
     Run a node until SIGINT or SIGTERM; gives the exit code.
 
     2 means something that the user can mend, said in one line; without_ros: what can be had
-    where ROS is missing; extra: a library that it needs, and the extra that brings it.
+    where ROS is missing; library: one that it needs beside ROS.
     """
     one_blas_thread()
     sleep_while_waiting()
@@ -47,8 +48,8 @@ def _run(name: str, description: str, *, without_ros: str,
     if find_spec('rclpy') is None:
         return _fail(name, "rclpy is missing: install ROS 2 and 'source "
                            f"/opt/ros/jazzy/setup.bash'; {without_ros}")
-    if extra is not None and find_spec(extra[0]) is None:
-        return _fail(name, f"{extra[0]} is missing: pip install 'djet_ros[{extra[1]}]'")
+    if library and find_spec(library) is None:
+        return _fail(name, f'{library} is missing: {how_to_get(library)}')
 
     from djet_ros.errors import DjetError, one_line
     try:

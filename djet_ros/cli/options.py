@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.errors import DjetError
-from djet_ros.recordings.outputs import check_file, write_whole
+from djet_ros.recordings.outputs import check_file, make_folder, write_whole
 
 
 def add_output(parser: argparse.ArgumentParser, what: str, default: str | None = None,
@@ -35,7 +35,7 @@ def add_json_output(parser: argparse.ArgumentParser) -> None:
 def check_output(args: argparse.Namespace, *suffixes: str) -> None:
     """Raise DjetError where --output can't be the file that is wanted; make its folder."""
     check_file(args.output, args.overwrite, *suffixes)
-    args.output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(args.output.parent)
 
 
 def write_json(path: Path, figures: dict[str, Any], draw: Callable[[Path], None]) -> None:

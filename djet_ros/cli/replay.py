@@ -31,9 +31,9 @@ is told per 100 m, as the KITTI benchmark has it, where the way is that long.
 
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
           'odometry.camera_height', 'odometry.camera_pitch', 'odometry.scale_uncertainty',
-          'odometry.rectified', 'odometry.frame_convention', 'odometry.base_frame',
-          'odometry.imu', 'odometry.guess', 'odometry.guess_frame', 'odometry.mask',
-          'odometry.mask_file')
+          'odometry.rectified', 'odometry.gray_range', 'odometry.frame_convention',
+          'odometry.base_frame', 'odometry.imu', 'odometry.guess', 'odometry.guess_frame',
+          'odometry.mask', 'odometry.mask_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -36,15 +36,15 @@ class OdometryConfig:
         choices=('structure', 'none', 'constant', 'speed', 'camera_height', 'guess',
                  'ground_truth'))
     scale_value: float = parameter(
-        1.0, 'length of each translation in metres, for scale constant',
-        minimum=1e-6, maximum=1e6)
+        0.0, 'length of each translation in metres, which scale constant needs; 0 says none',
+        minimum=0.0, maximum=1e6)
     scale_uncertainty: float = parameter(
         0.05, 'standard deviation of a known length, as a share of it; for scale camera_height '
         'that of the height, and what the images leave uncertain comes on top',
         minimum=1e-6, maximum=10.0)
     camera_height: float = parameter(
-        1.0, 'metres from flat ground up to the camera, for scale camera_height',
-        minimum=0.01, maximum=1000.0)
+        0.0, 'metres from flat ground up to the camera, which scale camera_height needs; 0 says '
+        'none', minimum=0.0, maximum=1000.0)
     camera_pitch: float = parameter(
         0.0, 'degrees by which the camera looks down, to within 2, for scale camera_height; it '
         'must not roll', minimum=-30.0, maximum=80.0)
@@ -80,6 +80,10 @@ class OdometryConfig:
         'auto', 'whether images come rectified: true (camera is P), false (camera is K, D), auto '
         "(true where the image topic's last name has 'rect' in it, else false)",
         choices=('auto', 'true', 'false'))
+    gray_range: str = parameter(
+        '0 65535', "'low high': of images of 16 bits, the values that become black and white; all "
+        'others go in equal steps between them. A camera of 12 bits wants 0 4095. Images of 8 '
+        'bits stay as they are')
     frame_convention: str = parameter(
         'body', 'axes of all poses in messages: body (x forward, y left, z up, as REP 103 has it '
         'for what moves) or optical (z forward, x right, y down, as it has it for images)',
@@ -98,6 +102,7 @@ class OdometryConfig:
         """Refuse values outside their described range."""
         check(self)
         self.imu_quaternion()
+        self.gray_limits()
 
     def imu_quaternion(self) -> tuple[float, ...] | None:
         """Give the quaternion x y z w of imu_rotation, of length one; None where tf is asked."""
@@ -112,6 +117,15 @@ class OdometryConfig:
             raise ValueError(f"imu_rotation is '{self.imu_rotation:.80}'; give a quaternion "
                              "'x y z w' of length 1, or nothing")
         return tuple(value / length for value in values)
+
+    def gray_limits(self) -> tuple[int, int]:
+        """Give the two values of gray_range."""
+        words = self.gray_range.replace(',', ' ').split()
+        values = [int(word) for word in words if word.isdecimal() and len(word) < 6]
+        if len(values) != len(words) or len(values) != 2 or not values[0] < values[1] < 65536:
+            raise ValueError(f"gray_range is '{self.gray_range:.80}'; give 'low high', whole "
+                             'numbers from 0 to 65535 such as 0 4095')
+        return values[0], values[1]
 
 
 @dataclass(frozen=True)

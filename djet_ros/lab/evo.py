@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 import zipfile
 
 from djet_ros.errors import DjetError, one_line
+from djet_ros.libraries import how_to_get
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def find_tool(name: str) -> str:
     beside = Path(sys.executable).parent / name
     found = str(beside) if beside.exists() else shutil.which(name)
     if found is None:
-        raise DjetError(f"the command '{name}' is not installed: pip install 'djet_ros[peers]'")
+        raise DjetError(f"the command '{name}' is not installed: {how_to_get('evo')}")
     return found
 
 

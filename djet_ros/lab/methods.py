@@ -9,6 +9,7 @@ from typing import Any
 
 from djet_ros.core.estimator_config import EstimatorConfig, METHODS, preset, PRESETS
 from djet_ros.errors import DjetError
+from djet_ros.libraries import how_to_get
 
 # Methods of other libraries, and the module that each needs.
 PEERS = {'opencv_ransac': 'cv2', 'usac_magsac': 'cv2', 'poselib': 'poselib',
@@ -77,7 +78,7 @@ def check_methods(methods: Sequence[str]) -> None:
     for method in methods:
         if method in PEERS and find_spec(PEERS[method]) is None:
             raise DjetError(f"method '{method}' needs the module '{PEERS[method]}', which is not "
-                            "installed: pip install 'djet_ros[peers]'")
+                            f'installed: {how_to_get(PEERS[method])}')
 
 
 def check_names(what: str, given: Sequence[str], known: Iterable[str]) -> None:

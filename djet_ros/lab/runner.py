@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, parent_process, resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 import os
 import signal
 from threading import Thread
@@ -81,11 +82,40 @@ def _keep_finished(futures: dict[Future[list[R]], C], store: RecordStore[R]) -> 
 
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[Executor]:
-    """Give an executor of processes on this machine, by default one per core, one thread each."""
+    """
+    Give an executor of processes on this machine, by default one per core, one thread each.
+
+    Ctrl-C ends them, in the middle of their chunks.
+    """
     # Set before the workers import NumPy; equal thread counts also keep its sums equal.
     os.environ.update(dict.fromkeys(threads.VARIABLES, '1'))
-    with ProcessPoolExecutor(count, get_context('spawn'), _follow_parent) as executor:
-        yield executor
+    # Starting it lets SIGINT through, which is not to be while a worker starts.
+    resource_tracker.ensure_running()
+    others = set(active_children())
+    with ProcessPoolExecutor(count, _Workers(), _follow_parent) as executor:
+        try:
+            yield executor
+        except KeyboardInterrupt:
+            executor.shutdown(wait=False, cancel_futures=True)
+            for worker in set(active_children()) - others:
+                worker.terminate()
+            raise
+
+
+class _Worker(SpawnProcess):
+    """A process that leaves Ctrl-C to its parent, from its first instruction on."""
+
+    def start(self) -> None:
+        # It inherits what is blocked.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Workers(SpawnContext):
+    Process = _Worker
 
 
 @contextmanager
@@ -107,8 +137,7 @@ def dask_workers(address: str) -> Iterator[Executor]:
 
 
 def _follow_parent() -> None:
-    """Leave Ctrl-C to the parent, and end with it even where it was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End with the parent, even where it was killed."""
     Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -22,6 +22,14 @@ import numpy as np
 _POLYNOMIAL = (4, 5, 8, 12, 14)
 _MODELS = {'plumb_bob': _POLYNOMIAL, 'rational_polynomial': _POLYNOMIAL, 'equidistant': (4,)}
 
+# Focal lengths, and how far off the middle the optical axis may lie, in sides of an image: wide of
+# every lens, and near enough that nothing computed with them overflows.
+_SHORTEST, _LONGEST, _FARTHEST = 1e-2, 1e3, 10.0
+
+# Share of the undistorted image that must be seen in the image that comes, and the points on
+# either of its sides by which that is told.
+_LEAST_SEEN, _GRID = 0.1, 16
+
 
 class Camera:
     """
@@ -54,11 +62,13 @@ class Camera:
             # Drivers without a calibration leave zeros; some rectifiers fill in P alone, or K.
             K = projection if projection.any() else K
         _check_camera(K)
+        check_lens(K, _whole_size(info))
         if rectified or not D.any():
             return cls(_of_image(K, info), np.empty(0), size)
         pinhole = K
         if projection.any() and not _turned(info):
             _check_camera(projection)
+            check_lens(projection, _whole_size(info))
             pinhole = projection
         return cls(_of_image(K, info), D, size, info.distortion_model or 'plumb_bob',
                    _of_image(pinhole, info))
@@ -69,6 +79,8 @@ class Camera:
         if self.size is not None and self.size != (width, height):
             raise BadMessage('size_mismatch', f'image is {width}x{height} pixels, CameraInfo '
                              f'(with its binning and ROI) is for {self.size[0]}x{self.size[1]}')
+        if self.size is None:
+            check_lens(self.raw_K, (width, height))
         if self._distortion is None:
             return gray
         if self._maps is None or self._maps[0].shape[:2] != gray.shape:
@@ -105,10 +117,25 @@ class Camera:
 
     def _undistortion(self, width: int, height: int) -> tuple[Any, Any]:
         model, D = self._distortion or ('', np.empty(0))
+        self._check_distortion(width, height)
         module = cv2.fisheye if model == 'equidistant' else cv2
         first, second = module.initUndistortRectifyMap(
             self.raw_K, D, np.eye(3), self.K, (width, height), cv2.CV_16SC2)
         return first, second
+
+    def _check_distortion(self, width: int, height: int) -> None:
+        """Refuse a distortion by which hardly anything of the image would be seen."""
+        x, y = np.meshgrid(*((np.arange(_GRID) + 0.5) * side / _GRID for side in (width, height)))
+        rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+        # What is too far off for a number is not seen.
+        with np.errstate(all='ignore'):
+            seen, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
+        inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
+        if inside.mean() < _LEAST_SEEN:
+            coefficients = ' '.join(f'{value:g}' for value in self.distortion[1])
+            raise BadMessage('bad_calibration', (
+                f'the distortion {coefficients} ({self.distortion[0]}) leaves {inside.mean():.0%} '
+                f'of an image of {width}x{height} pixels to be seen; calibrate the camera anew'))
 
 
 def means_rectified(rectified: str, image_topic: str) -> bool:
@@ -160,6 +187,29 @@ def _check_camera(K: Array) -> None:
                          f'{K[0, 0]:g} and {K[1, 1]:g}, last row {K[2].tolist()}')
 
 
+def check_lens(K: Array, size: tuple[int, int]) -> None:
+    """
+    Refuse a camera matrix (3, 3) that no lens before an image of (width, height) pixels has.
+
+    A size of zeros is open, and refuses nothing. Raises BadMessage.
+    """
+    side = max(size)
+    if not side:
+        return
+    focal, off = np.diag(K)[:2], K[:2, 2] - np.array(size) / 2
+    if not ((_SHORTEST * side <= focal) & (focal <= _LONGEST * side)).all():
+        raise BadMessage('bad_calibration', (
+            f'focal lengths of {focal[0]:g} and {focal[1]:g} pixels are those of no lens before '
+            f'an image of {size[0]}x{size[1]}; calibrate the camera anew'))
+    if not (np.abs(off) <= _FARTHEST * side).all():
+        raise BadMessage('bad_calibration', (
+            f'the principal point {K[0, 2]:g}, {K[1, 2]:g} is far off an image of '
+            f'{size[0]}x{size[1]} pixels; calibrate the camera anew'))
+    if abs(K[0, 1]) > focal[0] or K[1, 0]:
+        raise BadMessage('bad_calibration', (
+            f'the skew {K[0, 1]:g}, {K[1, 0]:g} is that of no sensor; calibrate the camera anew'))
+
+
 def _distortion(model: str, D: Array) -> tuple[str, Array]:
     counts: Sequence[int] = _MODELS.get(model, ())
     if len(D) not in counts:
@@ -171,6 +221,13 @@ def _distortion(model: str, D: Array) -> tuple[str, Array]:
 def _binning(info: Any) -> tuple[int, int]:
     """Zero means one, as the message has it."""
     return max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+
+
+def _whole_size(info: Any) -> tuple[int, int]:
+    """Size of the full resolution, which the matrices are of; zeros where it is open."""
+    roi = info.roi
+    return (max(int(info.width), int(roi.x_offset) + int(roi.width)),
+            max(int(info.height), int(roi.y_offset) + int(roi.height)))
 
 
 def _image_size(info: Any) -> tuple[int, int] | None:

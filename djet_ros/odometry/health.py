@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Status, TRACKED
+from djet_ros.odometry.images import Coarse
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_and_rest
 from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult
@@ -43,7 +44,8 @@ class Health:
         self._config = config
         self._speed_topics = speed_topics
         self._fates: deque[str] = deque(maxlen=_WINDOW)
-        self._equal = self._unknown_lengths = 0
+        self._equal = self._unknown_lengths = self._coarse_images = 0
+        self._coarse: Coarse | None = None
         self._last: OdometryResult | None = None
         self._stamp_ns = 0
 
@@ -55,6 +57,11 @@ class Health:
         """Take images that were dropped for a reason."""
         self._fates.extend([reason] * min(number, _WINDOW))
         self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
+
+    def gray(self, coarse: Coarse | None) -> None:
+        """Take how few gray levels an image of 16 bits became, or that it is none of them."""
+        self._coarse = coarse
+        self._coarse_images = 0 if coarse is None else self._coarse_images + 1
 
     def processed(self, result: OdometryResult) -> None:
         """Take the result of an image."""
@@ -69,8 +76,9 @@ class Health:
     def complaints(self, scale: ScaleSource, mounted: bool) -> list[Complaint]:
         """Say what there is to mend now; mounted: whether base_frame is known, if asked for."""
         return [one for one in (
-            self._stamps(), self._frame(), None if mounted else self._mounting(),
-            self._length(scale), self._load(), self._way(), self._order()) if one is not None]
+            self._stamps(), self.few_levels(), self._frame(),
+            None if mounted else self._mounting(), self._length(scale), self._load(),
+            self._way(), self._order()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
         if self._equal < _IN_A_ROW or self._last is None:
@@ -79,6 +87,16 @@ class Health:
         return Complaint('stamps stand still', 'ERROR', (
             f'{self._equal} images in a row have the stamp {seconds}.{rest:09d} and are dropped; '
             'the camera driver has to stamp each image with the time of its exposure'))
+
+    def few_levels(self) -> Complaint | None:
+        """Say that images of 16 bits become next to nothing."""
+        if self._coarse_images < _IN_A_ROW or self._coarse is None:
+            return None
+        levels, low, high = self._coarse
+        return Complaint('few gray levels', 'WARN', (
+            f'{self._coarse_images} images of 16 bits in a row became {levels} gray levels with '
+            f'odometry.gray_range {self._config.gray_range}; their values lie between {low} and '
+            f'{high}: set odometry.gray_range to what the camera can give'))
 
     def _frame(self) -> Complaint | None:
         if self._last is None:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.errors import DjetError
@@ -19,6 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
+
+# The values of images of 16 bits, of which all become gray unless somebody says less.
+WHOLE_RANGE = (0, 65535)
+
+# Gray levels below which an image of 16 bits shows little of what it has, and the share of the
+# pixels that makes a level one: broken pixels have any value.
+_FEW_LEVELS, _LEAST_SHARE = 32, 1e-4
 
 # Features need a neighbourhood; OpenCV fails on slivers.
 _SMALLEST_SIDE = 16
@@ -92,17 +100,66 @@ _ENCODINGS = {
 ENCODINGS = tuple(_ENCODINGS)
 
 
-def gray_image(message: Any) -> Gray:
+def gray_image(message: Any, limits: tuple[int, int] = WHOLE_RANGE) -> Gray:
     """
     Gray image (H, W) uint8 of an Image or a CompressedImage.
 
-    Of 16 bits the upper 8 are taken. The result may share memory with the message. Raises
+    limits: which values of 16 bits become 0 and 255, in equal steps between them; of the whole
+    range the upper 8 bits are taken. The result may share memory with the message. Raises
     BadMessage.
     """
-    return _raw(message) if hasattr(message, 'encoding') else _compressed(message)
+    if not hasattr(message, 'encoding'):
+        return narrowed(_compressed(message), limits)
+    pixels, values = _raw(message)
+    # Most cameras send no padding: then a gray image is the message's own memory.
+    return np.ascontiguousarray(pixels.to_gray(narrowed(values, limits)))
 
 
-def _raw(message: Any) -> Gray:
+def narrowed(values: NDArray[Any], limits: tuple[int, int] = WHOLE_RANGE) -> NDArray[np.uint8]:
+    """Make numbers of 16 bits gray levels by limits; those of 8 bits stay as they are."""
+    return values if values.dtype == np.uint8 else _levels_of_values(limits).take(values)
+
+
+@lru_cache
+def _levels_of_values(limits: tuple[int, int]) -> NDArray[np.uint8]:
+    """Gray level (65536,) of each value."""
+    low, high = limits
+    return np.clip((np.arange(65536) - low) * 256 // (high - low + 1), 0, 255).astype(np.uint8)
+
+
+class Coarse(NamedTuple):
+    """What became of 16 bits where it is little: gray levels, and between which values it was."""
+
+    levels: int
+    low: int
+    high: int
+
+
+def coarse(message: Any, gray: Gray) -> Coarse | None:
+    """
+    Say how few gray levels an image of 16 bits became; None where they are enough, or 8 bits came.
+
+    gray: what ``gray_image`` made of the message. Outside the two values is a thousandth each.
+    """
+    if not _is_wide(message):
+        return None
+    levels = int((np.bincount(gray.ravel()) > _LEAST_SHARE * gray.size).sum())
+    if levels >= _FEW_LEVELS:
+        return None
+    values = _raw(message)[1] if hasattr(message, 'encoding') else _compressed(message)
+    low, high = np.quantile(values, (0.001, 0.999), method='nearest')
+    return Coarse(levels, int(low), int(high))
+
+
+def _is_wide(message: Any) -> bool:
+    if hasattr(message, 'encoding'):
+        return _ENCODINGS[message.encoding].wide
+    # Of formats that are decoded PNG alone has 16 bits, and says so after its size.
+    return bytes(message.data[:8]) == PNG_START and bytes(message.data[24:25]) == bytes([16])
+
+
+def _raw(message: Any) -> tuple[_Pixels, NDArray[Any]]:
+    """Give the meaning of an encoding, and numbers (H, W, size) of 8 or 16 bits."""
     pixels = _ENCODINGS.get(message.encoding)
     if pixels is None:
         raise BadMessage('unknown_encoding', f"image encoding '{message.encoding:.40}' is not "
@@ -118,33 +175,32 @@ def _raw(message: Any) -> Gray:
     if len(data) < height * step:
         raise BadMessage('short_data', f'image data has {len(data)} bytes, {height} rows of '
                          f'{step} have {height * step}')
-    rows = data[:height * step].reshape(height, step)[:, :row]
+    values: NDArray[Any] = data[:height * step].reshape(height, step)[:, :row]
     if pixels.wide:
-        # The upper byte of each number.
-        rows = rows[:, 0 if message.is_bigendian else 1::2]
-    # Most cameras send no padding: then a gray image is the message's own memory.
-    return np.ascontiguousarray(pixels.to_gray(rows.reshape(height, width, pixels.size)))
+        values = values.view('>u2' if message.is_bigendian else '<u2')
+    return pixels, values.reshape(height, width, pixels.size)
 
 
-def _compressed(message: Any) -> Gray:
+def _compressed(message: Any) -> NDArray[Any]:
     if 'compressedDepth' in message.format:
         raise BadMessage('unknown_encoding', f"image format '{message.format:.40}' holds depths, "
                          'not brightness')
     return decoded(_bytes(message.data))
 
 
-def decoded(data: NDArray[np.uint8]) -> Gray:
-    """Gray image (H, W) uint8 of the bytes (N,) of a PNG or JPEG file. Raises BadMessage."""
+def decoded(data: NDArray[np.uint8]) -> NDArray[Any]:
+    """Gray image (H, W), uint8 or uint16, of the bytes (N,) of a PNG or JPEG file; BadMessage."""
     width, height = _declared_size(data.tobytes())
     _check_size(width, height)
     try:
         # A camera's geometry must not be turned by what the file says of its orientation.
-        gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+                            | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         gray = None
     if gray is None or gray.shape != (height, width):
         raise BadMessage('undecodable', f'compressed image of {len(data)} bytes is damaged')
-    return np.asarray(gray, dtype=np.uint8)
+    return np.asarray(gray)
 
 
 def _bytes(data: Any) -> NDArray[np.uint8]:

@@ -106,11 +106,6 @@ class Gyro:
         """Take the rotation (3, 3) of the IMU's axes to those of the camera."""
         self.to_camera = to_camera
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Give the stamp of the newest sample, by the clock of the images."""
-        return self._rates.stamps[-1] - self.offset_ns if self._rates else None
-
     def add(self, stamp_ns: int, rate: Array) -> None:
         """Take a rate (3,) in rad/s; what is of no use is counted in ``refused``."""
         if not (np.abs(rate) < _FASTEST).all():

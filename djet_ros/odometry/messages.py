@@ -178,18 +178,20 @@ class MessageFactory:
             linear_acceleration=self._vector(acceleration),
             linear_acceleration_covariance=np.zeros(9))
 
-    def picture(self, stamp: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
-        """Make the Image of an array (H, W), mono8, or (H, W, 3), bgr8."""
+    def picture(self, stamp: int, frame_id: str, pixels: NDArray[Any]) -> Any:
+        """Make the Image of an array (H, W), mono8 or mono16, or (H, W, 3), bgr8."""
         image_type = self._type('sensor_msgs/msg/Image')
         height, width = pixels.shape[:2]
-        data: Any = np.ascontiguousarray(pixels).ravel()
+        gray = 'mono8' if pixels.dtype == np.uint8 else 'mono16'
+        little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
+        data: Any = little.view(np.uint8).ravel()
         if hasattr(image_type, 'get_fields_and_field_types'):
             # rclpy would check an array byte by byte, but takes this one as it is.
             data = array('B', data.tobytes())
         return image_type(
             header=self.header(stamp, frame_id), height=height, width=width,
-            encoding='mono8' if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
-            step=pixels.size // height, data=data)
+            encoding=gray if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
+            step=len(data) // height, data=data)
 
     def cloud(self, stamp: int, frame_id: str, places: Array) -> Any:
         """Make the PointCloud2 of places (M, 3), float32 x, y and z."""

@@ -45,6 +45,10 @@ _AT_FIRST = np.array([1e3, np.radians(2.0), np.radians(2.0)])
 # Pitch and roll with which a vehicle bounces, from pair to pair.
 _BOUNCE = np.radians(0.2)
 
+# Lengths that a scale can't do without: their parameter, the smallest in metres, their meaning.
+_WANTED = {'constant': ('scale_value', 1e-6, 'the metres of each translation'),
+           'camera_height': ('camera_height', 0.01, 'the metres from the ground to the camera')}
+
 # Normalised squared error (1 or 2 expected) beyond which something is not what it was taken for.
 _SURPRISE = 20.0
 
@@ -378,8 +382,9 @@ def scale_source(config: OdometryConfig,
     Make the source that the configuration asks for.
 
     ground_truth: stamps (N,) and positions (N, 3), needed for scale 'ground_truth'; without them
-    DjetError.
+    DjetError, as where ``check_scale`` raises it.
     """
+    check_scale(config)
     kind, parameters = _made_of(config)
     if kind is not GroundTruthScale:
         return kind(*parameters)
@@ -387,6 +392,17 @@ def scale_source(config: OdometryConfig,
         raise DjetError("odometry.scale is 'ground_truth', and there is no ground truth; "
                         'give poses, or choose structure, constant or speed')
     return kind(*ground_truth, *parameters)
+
+
+def check_scale(config: OdometryConfig) -> None:
+    """Raise DjetError where a scale wants a length that nobody gave."""
+    if config.scale not in _WANTED:
+        return
+    name, least, meaning = _WANTED[config.scale]
+    if (metres := getattr(config, name)) < least:
+        raise DjetError(f"odometry.scale is '{config.scale}', and odometry.{name} is {metres:g}; "
+                        f'give {meaning} (odometry.{name}, --{name.replace("_", "-")}), '
+                        f'at least {least:g}')
 
 
 def _made_of(config: OdometryConfig) -> tuple[Callable[..., ScaleSource], tuple[float, ...]]:

@@ -22,7 +22,7 @@ from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import Complaint, has_frame, Health, why_restarted
-from djet_ros.odometry.images import BadMessage, Gray, gray_image
+from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
@@ -44,11 +44,16 @@ class Outgoing(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """An undistorted image, the shape of the one that came, and its view where nothing hides."""
+    """
+    An undistorted image, the shape of the one that came, and its view where nothing hides.
+
+    coarse: what is left of an image of 16 bits, where that is little.
+    """
 
     gray: Gray
     shape: tuple[int, ...]
     view: View | None
+    coarse: Coarse | None
 
 
 class _Expected(NamedTuple):
@@ -57,6 +62,7 @@ class _Expected(NamedTuple):
     message: Any
     camera: Camera
     estimator: TwoViewEstimator
+    limits: tuple[int, int]
     seen: Callable[[], _Seen]
 
 
@@ -186,21 +192,26 @@ class Tracker:
         if self._camera is None or self._paused or any(
                 one.message is message for one in self._expected):
             return
-        camera, estimator = self._camera, self._odometry.estimator
+        camera, estimator, limits = self._camera, self._odometry.estimator, self._limits
         # What is left out of an image may not be known yet.
         whole = not (self._hides or self.config.odometry.mask)
-        self._expected.append(_Expected(message, camera, estimator, started_beside(
-            lambda: _seen(message, camera, estimator if whole else None))))
+        self._expected.append(_Expected(message, camera, estimator, limits, started_beside(
+            lambda: _seen(message, camera, limits, estimator if whole else None))))
+
+    @property
+    def _limits(self) -> tuple[int, int]:
+        return self.config.odometry.gray_limits()
 
     def _see(self, message: Any, camera: Camera) -> _Seen:
         """See an image, by what was begun of it unless that was by another camera."""
         for one in self._expected:
             if one.message is message:
                 self._expected.remove(one)
-                if one.camera is camera and one.estimator is self._odometry.estimator:
+                if one.camera is camera and one.estimator is self._odometry.estimator \
+                        and one.limits == self._limits:
                     return one.seen()
                 break
-        return _seen(message, camera, None)
+        return _seen(message, camera, self._limits, None)
 
     def image(self, message: Any) -> list[Outgoing]:
         """Take an Image or a CompressedImage, and give what comes of it."""
@@ -222,6 +233,7 @@ class Tracker:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
+        self._health.gray(seen.coarse)
         return self._process(Frame(seen.gray, self._camera.K, stamp, message.header.frame_id,
                                    left_out), seen.view if left_out is None else None)
 
@@ -326,6 +338,12 @@ class Tracker:
         """Say what there is to mend beside the state: what is seen, and what helps."""
         return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside,
                 *self.face_complaints]
+
+    @property
+    def complaints_of_content(self) -> list[Complaint]:
+        """Say what there is to mend of what messages hold, whoever sends or records them."""
+        found = (self._health.few_levels(), *self.complaints_beside)
+        return [one for one in found if one is not None]
 
     @property
     def complaints_beside(self) -> list[Complaint]:
@@ -483,9 +501,10 @@ class Tracker:
         return [self.diagnostics(stamp)]
 
 
-def _seen(message: Any, camera: Camera, estimator: TwoViewEstimator | None) -> _Seen:
+def _seen(message: Any, camera: Camera, limits: tuple[int, int],
+          estimator: TwoViewEstimator | None) -> _Seen:
     """See an image by a camera, and prepare its view where there is an estimator for it."""
-    raw = gray_image(message)
+    raw = gray_image(message, limits)
     gray = camera.undistort(raw)
     view = None if estimator is None else estimator.view(gray, camera.K)
-    return _Seen(gray, raw.shape, view)
+    return _Seen(gray, raw.shape, view, coarse(message, raw))

@@ -120,7 +120,7 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
     def frame_at(stamp: int) -> Frame:
         for camera, message in images:
             if stamp_ns(message.header) == stamp:
-                raw = gray_image(message)
+                raw = gray_image(message, config.odometry.gray_limits())
                 return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
                              masks.of(stamp, raw.shape, camera))
         raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '

@@ -246,7 +246,7 @@ class LiveSlam:
         if message is None or self._camera is None:
             return None
         try:
-            raw = gray_image(message)
+            raw = gray_image(message, self.config.odometry.gray_limits())
             return Frame(self._camera.undistort(raw), self._camera.K, stamp,
                          message.header.frame_id, self._masks.of(stamp, raw.shape, self._camera))
         except BadMessage as problem:

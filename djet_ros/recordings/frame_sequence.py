@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import struct
+from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera
-from djet_ros.odometry.images import BadMessage, decoded, jpeg_size
+from djet_ros.odometry.camera import Camera, check_lens
+from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, narrowed
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
 from djet_ros.recordings.imu import ImuTrack
 import numpy as np
@@ -46,19 +47,23 @@ class FrameSequence:
         self.poses = poses
         self.imu = imu
         self._images = images
+        try:
+            check_lens(K, images.size)
+        except BadMessage as error:
+            raise DjetError(f'{name}: {error}') from None
         self._camera = Camera(K, self.distortion, images.size, model)
 
     def __len__(self) -> int:
         """Count the frames."""
         return len(self.stamps_ns)
 
-    def raw(self, index: int) -> NDArray[np.uint8]:
-        """Gray pixels (H, W) of a frame as its file has them."""
-        return self._images.gray(index)
+    def raw(self, index: int) -> NDArray[Any]:
+        """Gray pixels (H, W) of a frame as its file has them, uint8 or uint16."""
+        return self._images.pixels(index)
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """Gray pixels (H, W) of a frame without its distortion."""
-        return self._camera.undistort(self.raw(index))
+        return self._camera.undistort(self._images.gray(index))
 
 
 def from_first(poses: Array) -> Array | None:
@@ -92,7 +97,11 @@ class ImageFiles:
                                 f'{self.size[0]}x{self.size[1]}; one size is needed')
 
     def gray(self, index: int) -> NDArray[np.uint8]:
-        """Image (H, W) uint8 of a file; colours become gray."""
+        """Image (H, W) uint8 of a file; of 16 bits the upper 8."""
+        return narrowed(self.pixels(index))
+
+    def pixels(self, index: int) -> NDArray[Any]:
+        """Image (H, W), uint8 or uint16, of a file; colours become gray."""
         path = self.paths[index]
         try:
             image = decoded(np.frombuffer(path.read_bytes(), np.uint8))

@@ -33,22 +33,21 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
 
     ours: names of the files and folders that a run writes; marks: files by which a folder that is
     not empty is known to be an earlier run's (without any, others' files may lie beside ours).
-    Raises DjetError where the folder is somebody else's, or ours and not to be overwritten;
-    OSError where it can't be made.
+    Raises DjetError where the folder is somebody else's, or ours and not to be overwritten, or
+    can't be made; OSError where what is there can't be removed.
     """
     for path in check_room(folder, ours, overwrite, marks):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink()
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
 
 
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,
                marks: Collection[str] = ()) -> list[Path]:
     """Raise DjetError as ``make_room`` does; give what it would remove, and touch nothing."""
-    if folder.exists() and not folder.is_dir():
-        raise DjetError(f'{folder} exists and is no folder; choose another --output')
+    _check_bars(folder)
     if marks and folder.is_dir() and any(folder.iterdir()) \
             and not all((folder / mark).is_file() for mark in marks):
         raise DjetError(f'{folder} is not empty and holds no earlier results; choose another '
@@ -58,6 +57,22 @@ def check_room(folder: Path, ours: Collection[str], overwrite: bool,
         raise DjetError(f'{folder} holds earlier results; choose another --output, or replace '
                         'them with --overwrite')
     return present
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those that it stands in; DjetError where it can't be, and what bars it."""
+    _check_bars(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DjetError(f'{folder} could not be made: {error.strerror or error}; choose another '
+                        '--output') from error
+
+
+def _check_bars(folder: Path) -> None:
+    for place in (*reversed(folder.parents), folder):
+        if place.exists() and not place.is_dir():
+            raise DjetError(f'{place} exists and is no folder; choose another --output')
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -84,7 +99,7 @@ def appearing(out: Path, overwrite: bool, is_ours: Callable[[Path], bool], what:
     _check_unused(out, overwrite)
     if out.exists() and not (out.is_dir() and is_ours(out)):
         raise DjetError(f'{out} exists and is no {what}; it is not overwritten')
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
     with TemporaryDirectory(prefix=f'.{out.name}.', dir=out.parent) as beside:
         # What lies in the folder may be named after it, so it has the final name already.
         folder = Path(beside) / out.name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -43,7 +43,7 @@ class Outcome(NamedTuple):
     """
     The summary as it was written, and in one line what the user must know of, if anything.
 
-    advice: lines on what came beside the images and was of no use.
+    advice: lines on what was of no use, of the images and of what came beside them.
     """
 
     summary: dict[str, Any]
@@ -142,8 +142,8 @@ class Replay:
             self._folder.finish(summary)
         self._evaluate(summary)
         self._folder.finish(summary)
-        return Outcome(summary, problem or None, tuple(
-            f'{one.name}: {one.text}' for one in self._tracker.complaints_beside))
+        return Outcome(summary, problem or None, (*self._log.advice(), *(
+            f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> int:
         """Hand one message on; give how many images were worked on."""
@@ -274,7 +274,7 @@ class Replay:
             summary['drift'] = log.drift(truth)
             summary['positions'] = log.positions(truth)
             self._folder.add_errors(pairs, errors)
-        if len(log.steps) > 1:
+        if any(step.tracked for step in log.steps):
             self._plot(truth)
 
     def _plot(self, truth: Array) -> None:
@@ -299,6 +299,14 @@ class Replay:
         plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], positions, title, unit)
 
 
+# What may be wrong where no pair at all has been tracked, by what was said of most of them.
+_NOTHING_MATCHED = (
+    'the images are dark, empty or blurred, or show another place each time; look at exposure '
+    '(of 16 bits, at odometry.gray_range), and at the time between them')
+_NOTHING_FITS = (
+    'no one motion explains the matches; check that the calibration is that of the images '
+    '(--info-topic, odometry.rectified), and what moves in them (odometry.mask_file)')
+
 # So few places can be moved onto any others.
 _LEAST_PLACES = 4
 
@@ -318,6 +326,23 @@ class _Log:
     def pairs(self) -> list[Step]:
         return [step for step in self.steps if step.previous_stamp_ns is not None]
 
+    def advice(self) -> list[str]:
+        """Say what a run that ended well keeps quiet: nothing was tracked, or nothing moved."""
+        pairs = self.pairs()
+        statuses = Counter(step.status for step in pairs)
+        if not pairs:
+            return [] if len(self.steps) < 2 else [
+                f'none of {len(self.steps)} images has a pair: they are too far apart; raise '
+                'odometry.max_gap beyond the seconds between them']
+        if statuses[Status.NO_PARALLAX] == len(pairs):
+            return [f'the camera stood or only turned in all {len(pairs)} pairs (NO_PARALLAX): '
+                    'there are rotations, and no way']
+        if any(step.tracked for step in pairs):
+            return []
+        most = statuses.most_common(1)[0][0]
+        why = _NOTHING_MATCHED if most is Status.TOO_FEW_MATCHES else _NOTHING_FITS
+        return [f'none of {len(pairs)} pairs could be tracked ({most.value}): {why}']
+
     def drift(self, truth: Array) -> dict[str, float | None] | None:
         """
         Drift over the frames whose true pose (N, 4, 4) is known; None where the way is too short.
@@ -330,7 +355,7 @@ class _Log:
         if self.scale is Scale.RELATIVE:
             poses[:, :3, 3] *= one_factor(poses[:, :3, 3], truth[known][:, :3, 3])
         found = drift(truth[known], poses)
-        if found is None:
+        if found is None or not any(step.tracked for step in self.steps):
             return None
         if self.scale is Scale.UNKNOWN:
             return {**asdict(found), 'translation_percent': None}
@@ -342,9 +367,11 @@ class _Log:
 
         That is how large it is at the end over what it is at the start, None where it is not told.
         Errors are taken after the path was moved onto the true one (N, 4, 4), its scale free too
-        unless it is in metres; None where lengths mean nothing.
+        unless it is in metres; None where lengths mean nothing, and where nothing was tracked.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
+        if not any(step.tracked for step in self.steps):
+            return None
         if self.scale is Scale.UNKNOWN or known.sum() < _LEAST_PLACES:
             return None
         way = truth[known, :3, 3]

@@ -65,7 +65,8 @@ class ResultsFolder(Closing):
             (path / 'config.yaml').write_text(dump_yaml(config))
             self._table = LineFile(path / 'frames.csv')
         except OSError as error:
-            raise _blame(path, error) from error
+            raise DjetError(f'{path} could not be begun: {error.strerror or error}; make room, or '
+                            'choose another --output') from error
         self.finish({'complete': False, 'error': 'the run did not come to its end'})
         self._rows = csv.writer(self._table, lineterminator='\n')
         self._row(COLUMNS)

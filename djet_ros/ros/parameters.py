@@ -14,6 +14,7 @@ from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own, why_unused
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import FIXED, live_choices, ODOMETRY, SHARED, with_live_values
+from djet_ros.odometry.scale import check_scale
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -137,7 +138,8 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
 
 
 def _possible(config: Config) -> Config:
-    """Refuse what can't be had in this ROS."""
+    """Refuse what can't be had in this ROS, and a scale that lacks its length."""
+    check_scale(config.odometry)
     asked = ('ros.publish_tf is true' if config.ros.publish_tf else
              'odometry.guess_frame is set' if config.odometry.guess_frame else '')
     if asked and find_spec('tf2_msgs') is None:

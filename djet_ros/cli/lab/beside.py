@@ -25,7 +25,7 @@ from djet_ros.lab.beside import (
     TRIALS,
 )
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.outputs import make_folder, write_whole
 import numpy as np
 from rich.table import Table
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     check_workers(args)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; at least three are needed')
-    args.output.mkdir(parents=True, exist_ok=True)
+    make_folder(args.output)
     moments = _moments(args, [TrialChunk(name, seed, args.frames)
                               for name in trials for seed in args.seeds])
     rows = trial_rows(moments)

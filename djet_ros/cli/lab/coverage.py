@@ -42,7 +42,7 @@ from djet_ros.lab.runner import chunks_of, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import RecordStore
-from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.outputs import make_folder, write_whole
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         raise DjetError(f'--frames is {args.frames}; at least two are needed')
     if not scenes and not args.sources:
         raise DjetError('there is nothing to measure; name a SOURCE or --scenes')
-    args.output.mkdir(parents=True, exist_ok=True)
+    make_folder(args.output)
     with local_workers(args.workers) as executor:
         rendered = _rendered(executor, args.output / 'scenes',
                              [(name, seed) for name in scenes for seed in args.seeds], args.frames)

@@ -15,7 +15,7 @@ from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
 from djet_ros.lab.lengths import go, STRETCHES, Way, WayChunk
-from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.outputs import make_folder, write_whole
 import numpy as np
 
 DESCRIPTION = """\
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.hidden < 0:
         raise DjetError(f'--hidden is {args.hidden}; it must not be negative')
     size = (620, 188) if args.half else None
-    args.output.mkdir(parents=True, exist_ok=True)
+    make_folder(args.output)
     ways = _ways(args, [WayChunk('road', seed, size, args.frames, args.hidden)
                         for seed in args.seeds])
     _show(ways)

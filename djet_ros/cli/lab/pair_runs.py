@@ -21,6 +21,7 @@ from djet_ros.lab.runner import C, chunks_of, dask_workers, local_workers, run
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
 from djet_ros.lab.store import R, RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
+from djet_ros.recordings.outputs import make_folder
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -73,7 +74,7 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()
     try:
         datasets = open_datasets(args.sources, selection, workspace)
-        args.output.mkdir(parents=True, exist_ok=True)
+        make_folder(args.output)
         settings = {'sequences': [dataset.settings() for dataset in datasets],
                     'methods': [method.settings() for method in competing]}
         with RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store:

@@ -1,0 +1,33 @@
+"""What each covariance in a message must be, whatever the images were."""
+
+from __future__ import annotations
+
+from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.types import TRACKED
+from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.visual_odometry import OdometryResult
+import numpy as np
+from ros_messages import message_type
+
+# Beyond what is said of a motion that nobody knows.
+ABSURD = 1e12
+
+
+def check_messages(result: OdometryResult) -> None:
+    """Check all covariances of what is published of a frame: no zero, nothing infinite."""
+    make = Messages(message_type, OdometryConfig())
+    odometry = make.odometry(result)
+    told = {'pose': odometry.pose, 'twist': odometry.twist}
+    if result.status in TRACKED:
+        told['relative pose'] = make.relative_pose_cov(result).pose
+    for name, one in told.items():
+        covariance = np.reshape(one.covariance, (6, 6))
+        where = f'{name} of a frame that is {result.status.value}'
+        assert np.isfinite(covariance).all(), where
+        assert (np.diag(covariance) > 0).all(), where
+        assert (np.diag(covariance) < ABSURD).all(), where
+        # As correlations, so that radians do not drown in metres.
+        deviations = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(deviations, deviations)
+        assert np.allclose(correlation, correlation.T, rtol=0, atol=1e-9), where
+        assert np.linalg.eigvalsh(correlation)[0] > -1e-9, where
