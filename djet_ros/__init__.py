@@ -1,3 +1,3 @@
 """D-JET: visual odometry by differential pose optimisation in descriptor space."""
 
-__version__ = '0.2.0'
+__version__ = '0.3.0'
