@@ -8,7 +8,7 @@ SEQUENCE ?=
 FRAMES ?= 21
 REAL_FRAMES ?=
 ONLY ?=
-TABLES ?= dds soak outvoted links loops 'live loops' 'camera height'
+TABLES ?= dds soak outvoted links loops 'live loops' 'camera height' coverage
 SEEDS ?= 0,1,2,3,4
 # in the order of their names: files of few tests, some of them long, would come last
 PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
@@ -49,8 +49,8 @@ results: $(VENV)/.installed-test,peers
 		$(if $(REAL_FRAMES),--real-frames $(REAL_FRAMES)) $(if $(ONLY),--only '$(ONLY)')
 	$(VENV)/bin/python doc/pages.py
 
-# tables beside those: TABLES of node, dds, soak, outvoted, links, loops, 'live loops' and
-# 'camera height'
+# tables beside those: TABLES of node, dds, soak, outvoted, links, loops, 'live loops',
+# 'camera height' and coverage
 recorded: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/record.py $(TABLES)
 	$(VENV)/bin/python doc/pages.py

@@ -213,11 +213,10 @@ def missing(results: dict[str, Any], args: argparse.Namespace
         used = min(frames, args.real_frames or frames)
         jobs.append(Job(title(folder), (), folder, args.real_frames, used))
     work: dict[str, Callable[[], dict[str, Any]]] = {
-        job.name: partial(measured, job) for job in sorted(jobs, key=lambda job: -job.cost)}
+        f'drive {title(folder)}': partial(drive, folder) for folder in kitti(args.data)
+        if length(folder) > DRIVE}
     work['ablation'] = partial(ablation, args.seeds[:ABLATED_SEEDS])
-    for folder in kitti(args.data):
-        if length(folder) > DRIVE:
-            work[f'drive {title(folder)}'] = partial(drive, folder)
+    work |= {job.name: partial(measured, job) for job in sorted(jobs, key=lambda job: -job.cost)}
     for name, action in work.items():
         if name not in results['parts'] and (not args.only or name in args.only):
             yield name, action

@@ -371,7 +371,8 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'speed': speed,
     **{name: recorded(name) for name in (
-        'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height')},
+        'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height',
+        'coverage')},
 }
 
 

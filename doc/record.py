@@ -6,7 +6,7 @@ plays a recording, one is the node, and this one listens; it needs djet_ros[dds,
 be any command, such as one that brings its own ROS along. A table that can't be measured is said
 in a line and left as it was; the exit status is 1 then.
 
-    python doc/record.py links outvoted soak 'camera height' loops dds 'live loops'
+    python doc/record.py links outvoted soak 'camera height' loops dds 'live loops' coverage
     python doc/record.py node --node '. install/setup.sh; ros2 run djet_ros vo_node --ros-args'
 """
 
@@ -78,6 +78,8 @@ IMAGE = '/camera/image_rect'
 HEIGHT = 1.65
 LINKS = (1, 2, 3)
 WRONG, PLACES = (360.0, 2000.0), 8
+# Frames of each scene and seed whose poses are held against their covariances.
+COVERED = 12
 # The path of the node is full before the first of them.
 MARKS = (6_000, 10_000)
 
@@ -326,6 +328,36 @@ def row_of(name: str, found: Array) -> list[str]:
 
 
 # Processes on a graph
+
+
+def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Tell how many poses lie within their own ellipsoids."""
+    djet('lab', 'coverage', '--scenes', 'all', '--seeds', '0-9', '--frames', COVERED, '--output',
+         place / 'rendered')
+    rows = covered(place / 'rendered')
+    for real in args.data.glob('tartanair/sequences/*'):
+        djet('lab', 'coverage', real, '--output', place / real.name)
+        rows += covered(place / real.name, f'TartanAir {real.name}')
+    return {'how': f'`djet lab coverage --scenes all --seeds 0-9 --frames {COVERED}`, and on real '
+                   'frames; each pair by itself / in a row, from the motion before.',
+            'header': ['', 'poses', 'wrong and sure', 'given up (right)',
+                       'NEES over its expectation, median', 'inside 95 %', 'beyond 99.9 %'],
+            'rows': rows}
+
+
+def covered(folder: Path, name: str = '') -> list[list[str]]:
+    """Rows of a run of coverage, both of a scene's in one; without those that tell no pose."""
+    found = json.loads((folder / 'coverage.json').read_text())
+    at = [found['levels'].index(level) for level in (0.95, 0.999)]
+    by_scene: dict[str, list[list[str]]] = {}
+    for row in found['rows']:
+        if np.isfinite(row['median'] or np.nan):
+            within, beyond = row['inside'][at[0]][0], 1 - row['inside'][at[1]][0]
+            by_scene.setdefault(name or row['scene'], []).append([
+                str(row['told']), str(row['wrong_and_sure']),
+                f"{row['given_up']} ({row['needlessly']})", f"{row['median']:.2f}",
+                f'{within:.1%}', f'{beyond:.1%}'])
+    return [[scene, *map(' / '.join, zip(*rows))] for scene, rows in by_scene.items()]
 
 
 def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -585,7 +617,7 @@ def playing(source: Path, *words: Any) -> Iterator[None]:
 
 MEASURED: dict[str, Callable[[Path, argparse.Namespace], dict[str, Any]]] = {
     'node': node, 'dds': dds, 'soak': soak, 'outvoted': outvoted, 'links': links, 'loops': loops,
-    'live loops': live_loops, 'camera height': camera_height}
+    'live loops': live_loops, 'camera height': camera_height, 'coverage': coverage}
 
 
 if __name__ == '__main__':
