@@ -9,8 +9,8 @@ from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 import os
 import signal
-from threading import Thread
-from typing import Protocol, TypeVar
+from threading import current_thread, main_thread, Thread
+from typing import Any, Protocol, TypeVar
 
 from djet_ros import threads
 from djet_ros.errors import DjetError
@@ -67,8 +67,6 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
         raise DjetError('a worker died (killed, or out of memory); run the same command again: '
                         f'{store.path} keeps what was done') from error
     finally:
-        for future in futures:
-            future.cancel()
         _keep_finished(futures, store)
     return in_order(store, (chunk.name for chunk in chunks))
 
@@ -85,21 +83,48 @@ def local_workers(count: int | None = None) -> Iterator[Executor]:
     """
     Give an executor of processes on this machine, by default one per core, one thread each.
 
-    Ctrl-C ends them, in the middle of their chunks.
+    Ctrl-C ends them, in the middle of their chunks; after another error no new chunk begins.
     """
     # Set before the workers import NumPy; equal thread counts also keep its sums equal.
     os.environ.update(dict.fromkeys(threads.VARIABLES, '1'))
     # Starting it lets SIGINT through, which is not to be while a worker starts.
     resource_tracker.ensure_running()
     others = set(active_children())
-    with ProcessPoolExecutor(count, _Workers(), _follow_parent) as executor:
+    with _Pool(count, _Workers(), _follow_parent) as executor:
         try:
             yield executor
         except KeyboardInterrupt:
-            executor.shutdown(wait=False, cancel_futures=True)
+            # Before its futures are cancelled: it cannot tell a cancelled one that workers died.
             for worker in set(active_children()) - others:
                 worker.terminate()
             raise
+        finally:
+            executor.shutdown(cancel_futures=True)
+
+
+class _Pool(ProcessPoolExecutor):
+    """Processes of which none is left half started by Ctrl-C."""
+
+    def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
+        with _interrupt_after():
+            return super().submit(*args, **kwargs)
+
+
+@contextmanager
+def _interrupt_after() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of this block."""
+    if current_thread() is not main_thread():
+        # Python interrupts no other.
+        yield
+        return
+    seen: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: seen.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if seen:
+        raise KeyboardInterrupt
 
 
 class _Worker(SpawnProcess):
