@@ -127,7 +127,7 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
         for n, known in enumerate(pairs[:-2]):
             scale.of_step((n * 10**8, (n + 1) * 10**8), views[n + 1], known)
         scale.bridge((7 * 10**8, 8 * 10**8), views[8], pair)
-        found.append(scale.of_step((8 * 10**8, 9 * 10**8), views[9], pairs[-1]).value)
+        found.append(scale.of_step((8 * 10**8, 9 * 10**8), views[9], pairs[-1])[1].value)
     assert found[0] == pytest.approx(1, abs=0.04)
     assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # torn: the last speed goes on
 
@@ -142,6 +142,32 @@ def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
     after = lengths(drive.go([pose(x=0.16, z=0.12)] * 3))
     assert before[0] == pytest.approx(1)
     assert after == pytest.approx(1, rel=0.05)
+
+
+@pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
+def test_a_way_too_slow_for_parallax_from_frame_to_frame_adds_up(cards, way):
+    drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
+    start = drive.go(steps(WAYS[:4]))[-1].pose
+    results = drive.go(slow)
+    assert all(result.status is Status.NO_PARALLAX for result in results)
+    gone = (np.linalg.inv(start) @ results[-1].pose)[:3, 3] * WAYS[0]
+    assert np.linalg.norm(gone - [30 * way, 0, 0]) < 0.1 * 30 * way
+    sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1]) * WAYS[0]
+    assert np.linalg.norm(gone - [30 * way, 0, 0]) < 4 * sigma
+
+
+@pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
+def test_a_way_too_slow_for_parallax_adds_up_before_there_are_landmarks(cards, way):
+    speed = SpeedScale()
+    for i in range(80):
+        speed.add_speed(i * 10**8, way * 10)
+    results = Drive(cards, speed, scale='speed').go([
+        pose(x=way, yaw=0.0005 * (-1)**i) for i in range(40)])
+    assert sum(result.status is Status.OK for result in results) < 3
+    gone = results[-1].pose[:3, 3]
+    assert np.linalg.norm(gone - [40 * way, 0, 0]) < 0.1 * 40 * way
+    sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1])
+    assert np.linalg.norm(gone - [40 * way, 0, 0]) < 4 * sigma
 
 
 def test_a_bad_frame_does_not_change_the_scale(cards):

@@ -8,6 +8,7 @@ from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.messages import twist
 from djet_ros.odometry.scale import (
     ConstantScale,
@@ -174,14 +175,45 @@ def test_the_same_image_twice_is_a_standstill_for_every_method(cards, method):
 
 
 def test_pure_rotation_turns_the_pose_and_does_not_move_it(cards):
-    turn = pose(yaw=0.02)
-    results = drive(odometry(), cards, [np.eye(4), turn, turn])
-    for result in results[1:]:
+    results = drive(odometry(), cards, [np.eye(4), *[pose(yaw=0.02)] * 8])
+    for i, result in enumerate(results[1:], 1):
         assert result.status is Status.NO_PARALLAX
         assert not result.stationary
-        assert np.degrees(rotation_angle(result.motion[:3, :3], turn[:3, :3])) < 0.1
+        turned = pose(yaw=0.02 * i)
+        assert np.degrees(rotation_angle(result.pose[:3, :3], turned[:3, :3])) < 0.1
         assert not result.motion[:3, 3].any()
         assert result.motion_covariance[0, 0] == pytest.approx(1e6)
+
+
+def test_the_reference_stays_in_sight_while_nothing_tells_the_way(cards):
+    results = drive(odometry(), cards, [np.eye(4), *[pose(yaw=0.018)] * 8])
+    # 4.7 pixels a step, of which a view 320 wide bears 16
+    stamps = [result.stamp_ns for result in results]
+    references = [stamps.index(result.previous_stamp_ns) for result in results[1:]]
+    assert references == [0, 0, 0, 0, 4, 4, 4, 4]
+
+
+def test_a_motion_that_was_crept_into_came_about_since_it_was_none(cards):
+    creeping = [pose(x=0.002)] * 20
+    results = drive(odometry(ConstantScale(1.0)), cards, [*[np.eye(4)] * 10, *creeping])
+    resting = results[9].stamp_ns
+    assert all(result.stationary for result in results[1:12])
+    told = next(result for result in results[1:] if not result.stationary)
+    # a tenth of what counts as standing is crept within a frame
+    assert told.since_ns in (resting, resting + 10**8)
+    assert told.previous_stamp_ns == 0
+
+
+def test_a_slow_pan_is_not_taken_for_the_bias_of_a_gyro(cards):
+    gyro, rate = Gyro(GyroNoise(2e-4, 2e-5)), 0.008
+    gyro.mount(np.eye(3))
+    rng = np.random.default_rng(3)
+    for i in range(-5, 50 * 20):
+        gyro.add(i * 5_000_000, rng.normal([0, rate, 0], 2e-4 * np.sqrt(200)))
+    # a fifth of a pixel from frame to frame
+    drive(VisualOdometry(ESTIMATOR, gyro=gyro), cards, [pose(yaw=0.1 * rate)] * 40)
+    assert np.sqrt(gyro.bias_covariance[1, 1]) < 0.1 * rate
+    assert abs(gyro.bias[1]) < 0.1 * rate
 
 
 def test_a_step_back_in_time_begins_everything_anew(cards):

@@ -120,13 +120,15 @@ class Addition:
     What a window says of its newest frame: its motion from the one before, and how long it is.
 
     R (3, 3), t (3,) with its length in the unit of the track: x_new = R x_before + t; sigma:
-    standard deviation of the length, as if the frames before stood where the window has them.
+    standard deviation of the length, as if the frames before stood where the window has them, and
+    covariance (6, 6) of all of it, over R -> exp([w]_x) R and t + dt.
     """
 
     R: Array
     t: Array
     length: float
     sigma: float
+    covariance: Array
 
 
 class Window:
@@ -478,8 +480,12 @@ class Window:
         block = H[-6:, -6:]
         covariance = np.linalg.inv(block + np.diag(1e-12 * np.diag(block)))
         variance = float(unit(t) @ covariance[3:, 3:] @ unit(t))
+        # A frame's step turns its translation too.
+        J = np.eye(6)
+        J[3:, :3] = -skew(t)
         # Where rounding leaves less than nothing, nobody knows.
-        return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf)
+        return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
+                        J @ covariance @ J.T)
 
     def _take_along(self, frame: int) -> None:
         """Take what the landmarks of a frame tell into the prior, before it goes."""

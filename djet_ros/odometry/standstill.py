@@ -14,6 +14,9 @@ _CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
 # Times the displacement of what stands still up to which something hardly moves.
 _HARDLY = 3
 
+# chosen: share of the displacement up to which a camera stands, from which on it creeps.
+_CREEPS = 0.1
+
 # chosen: so many features that stood before tell that they still do; false matches of a thousand
 # features end within a third of a pixel of where they began less than once in a hundred pairs.
 _WITNESSES = 10
@@ -55,6 +58,16 @@ class Standstill:
         features = _named(relative.x)
         still = _displacements(relative.x, relative.y) < most
         self._world = np.union1d(np.setdiff1d(self._world, features), features[still])
+
+    def crept(self, relative: RelativePose, most: float) -> bool:
+        """
+        Tell whether a camera that stands by ``told`` is not quite where the reference view was.
+
+        Then it creeps, and one day will have moved. What others do is told by the most, too.
+        """
+        y = _refined(relative)
+        still = _displacements(relative.x, y) < most
+        return _drift(relative.x[still], y[still]) > _CREEPS * most
 
     def told(self, relative: RelativePose, most: float, at_rest: bool) -> bool:
         """
@@ -109,9 +122,29 @@ def _nothing_moved(relative: RelativePose, most: float) -> bool:
     # Two equal images are DEGENERATE to most estimators, for want of any residual.
     if relative.status not in (*TRACKED, Status.DEGENERATE):
         return False
+    return float(np.median(_displacements(relative.x, _refined(relative)))) < most
+
+
+def _refined(relative: RelativePose) -> Array:
+    """Matched pixels (N, 2), as exact as they are known for all."""
     refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
-    y = relative.y_opt if refined else relative.y
-    return float(np.median(_displacements(relative.x, y))) < most
+    return relative.y_opt if refined else relative.y
+
+
+def _drift(x: Array, y: Array) -> float:
+    """
+    Tell how far pixels moved together from x to y (N, 2), as a root mean square without noise.
+
+    Together: by an affine map, whose six parameters take their share of the noise.
+    """
+    if len(x) <= 6:
+        return 0.0
+    around = x - x.mean(0)
+    design = np.column_stack([around / max(np.abs(around).max(), 1.0), np.ones(len(x))])
+    fit = design @ np.linalg.lstsq(design, y - x, rcond=None)[0]
+    # Two residuals of each, less the parameters.
+    noise = float(((y - x - fit)**2).sum()) / (2 * len(x) - 6)
+    return float(np.sqrt(max(float((fit**2).sum()) - 6 * noise, 0.0) / len(x)))
 
 
 def _still_and_hardly(relative: RelativePose, most: float

@@ -82,6 +82,11 @@ class OneScale:
         """Whether the newest frame of the track is a keyframe; None where none are chosen."""
         return self._window.is_keyframe if self._carried else None
 
+    @property
+    def is_new(self) -> bool:
+        """Whether there are no landmarks yet, or none are kept."""
+        return not self._carried or self._window.is_new
+
     def begin(self, view: View) -> None:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
         if not self._carried:
@@ -90,27 +95,36 @@ class OneScale:
         if self._speed is not None:
             self._variance += _TORN**2
 
-    def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Length:
-        """Length of a step whose motion was estimated, from the newest frame of the track on."""
+    def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose
+                ) -> tuple[RelativePose, Length]:
+        """
+        Give a step whose motion was estimated, from the newest frame of the track on, its length.
+
+        Gives the motion too: that of the pair, but where it has too little parallax to tell of a
+        translation, what landmarks tell that were seen from further away.
+        """
         measured = self._source.between(*span_ns)
         if not self._carried:
-            return measured
+            return relative, measured
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
         addition = self._added(current, relative, guess)
         if addition is None:
-            return measured if measured.known else unknown(guess * float(np.exp(self._log)))
+            return relative, (
+                measured if measured.known else unknown(guess * float(np.exp(self._log))))
+        if not relative.t.any():
+            relative = _as_landmarks_tell(relative, addition, guess)
         own = self._wandered(addition, relative, seconds)
         if measured.known and self._source.exact:
             self._set(measured, addition.length)
-            return replace(measured, common=self._common())
+            return relative, replace(measured, common=self._common())
         if measured.known and measured.value > _STANDING:
             self._observe(measured, addition.length, own)
         value = addition.length * float(np.exp(self._log))
         # The factor of a relative scale is that of the whole track, and no error of a step.
         common = np.hypot(np.sqrt(self._variance), self._share) if self._metric else 0.0
-        return Length(value, value * float(np.hypot(own, common)), True, self._metric,
-                      measured.known, self._common())
+        return relative, Length(value, value * float(np.hypot(own, common)), True, self._metric,
+                                measured.known, self._common())
 
     def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> None:
         """
@@ -216,3 +230,17 @@ class OneScale:
         if measured.value > _STANDING:
             self._log, self._variance = float(np.log(measured.value / length)), 0.0
             self._metric, self._kept[0] = True, 0.0
+
+
+def _as_landmarks_tell(relative: RelativePose, addition: Addition, usual: float) -> RelativePose:
+    """
+    Give a pair without parallax the motion of the window, where that is surer than none.
+
+    usual: length of a step, which is how unsure no translation would be.
+    """
+    if np.linalg.eigvalsh(addition.covariance[3:, 3:])[-1] > usual**2:
+        return relative
+    to_unit = np.diag(np.repeat([1.0, 1 / addition.length], 3))
+    to_unit[3:, 3:] -= np.outer(addition.t, addition.t) / addition.length**3
+    return replace(relative, R=addition.R, t=addition.t / addition.length,
+                   covariance_6=to_unit @ addition.covariance @ to_unit)

@@ -35,6 +35,13 @@ import numpy as np
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4
 
+# chosen: share of the image's larger side by which the median match may have moved from a reference
+# without parallax that stays; what was seen is still in sight then.
+_IN_SIGHT = 0.05
+
+# Nanoseconds; chosen: what creeps for longer before it is seen to move counts as having stood.
+_CREEPING_NS = 2_000_000_000
+
 # Nanoseconds; chosen: a lorry that drives past at a walk has left the image by then, and for so
 # long a camera that begins to move can do without its gyro feeling it.
 _NOT_FELT_NS = 3_000_000_000
@@ -56,8 +63,8 @@ class OdometryResult:
     stationary: whether the camera stood still.
 
     since_ns: stamp of the newest frame that was where the reference frame is, which is later
-    where the camera stood still: the motion came about after it; since_covariance: (6, 6) how
-    sure it is that this frame was there.
+    where the camera stood still and did not creep: the motion came about after it;
+    since_covariance: (6, 6) how sure it is that this frame was there.
 
     keyframe: whether the frame is a keyframe of the window that carries the scale; None where
     there is no window, or the motion to the frame is not known.
@@ -100,7 +107,9 @@ class VisualOdometry:
       bad pairs in a row each newest frame becomes the reference, until one pair is good again.
       The motion in between is missing then, and the pose's covariance says so. A pair that two
       motions explain does not keep it, for its images are good;
-    * while the camera stands still it stays, so that noise does not add up;
+    * while the camera stands still it stays, so that noise does not add up; where nothing tells
+      the way yet, as neither the pair has parallax nor landmarks are there, it stays as long as
+      most of it is in sight, so that a slow way adds up to one that can be told;
     * a gap of more than max_gap, another image size or another camera begin a new reference at
       the last pose; a step back in time restarts everything.
     """
@@ -184,21 +193,32 @@ class VisualOdometry:
             return self._lose(frame, view, relative, self._one_scale.of_rest(span))
 
         # Its length in the one scale of the track, by what frames share or by what measures it.
-        length = self._one_scale.of_step(span, view, relative)
+        waits = self._waits(relative)
+        told, length = ((relative, self._one_scale.of_rest(span)) if waits
+                        else self._one_scale.of_step(span, view, relative))
 
         # Integrate the motion and its uncertainty; this frame is the next reference.
-        motion = camera_motion(relative, length.value)
+        motion = camera_motion(told, length.value)
         path = self._path.moved_by_pair(
-            self._pose, motion, motion_covariance(relative, length.own), length.common)
+            self._pose, motion, motion_covariance(told, length.own), length.common)
+        keyframe = self._one_scale.keyframe
         result = self._result(frame, relative.status, relative, length, motion,
-                              motion_covariance(relative, length), path,
-                              keyframe=self._one_scale.keyframe)
-        self._pose, self._path = result.pose, path
-        self._refer_to(frame, view)
+                              motion_covariance(told, length), path,
+                              keyframe=None if keyframe is None else keyframe and not waits)
+        if not waits:
+            self._pose, self._path = result.pose, path
+            self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
         return result
+
+    def _waits(self, relative: RelativePose) -> bool:
+        """Tell whether the reference stays until a pair with it tells the way."""
+        if relative.status is not Status.NO_PARALLAX or not self._one_scale.is_new:
+            return False
+        moved = np.linalg.norm(relative.y - relative.x, axis=1)
+        return bool(np.median(moved) < _IN_SIGHT * max(self._view.gray.shape))
 
     def _by_depths(self, relative: RelativePose) -> RelativePose:
         """Let depths that other frames have told decide between a motion and its rivals."""
@@ -235,13 +255,19 @@ class VisualOdometry:
         self._gyro.judge(agreed)
         # What bridges bad pairs may be the motion of what made them bad.
         if agreed and not self._bad_pairs:
-            self._gyro.learn(self._since_ns, frame.stamp_ns, relative.R,
-                             relative.covariance_6[:3, :3])
+            self._learn(self._gyro, frame, relative.R, relative.covariance_6[:3, :3])
         if turn is None:
             return relative
         # What turned otherwise was not the camera, but something that fills the image.
         return fused(relative, turn) if agreed else replace(
             relative, status=Status.DEGENERATE, t=np.zeros(3))
+
+    def _learn(self, gyro: Gyro, frame: Frame, R: Array, covariance: Array) -> None:
+        """Learn the bias from how a frame has turned, since another of the same reference."""
+        stamp_ns, before, unsure = self._turned
+        turn = R @ before.T
+        gyro.learn(stamp_ns, frame.stamp_ns, turn, covariance + turn @ unsure @ turn.T)
+        self._turned = frame.stamp_ns, R, covariance
 
     def _doubted_at_rest(self, frame: Frame, relative: RelativePose) -> RelativePose:
         """
@@ -253,13 +279,17 @@ class VisualOdometry:
         if (relative.status is Status.OK and self._gyro is not None
                 and frame.stamp_ns - self._known_ns < _NOT_FELT_NS
                 and self._standstill.may_stand(relative, self._config.standstill)
-                and self._gyro.at_rest(self._since_ns, frame.stamp_ns)):
+                and self._at_rest(frame)):
             return replace(relative, status=Status.AMBIGUOUS)
         return relative
 
     def _stands_still(self, frame: Frame, relative: RelativePose) -> bool:
-        at_rest = self._gyro is not None and self._gyro.at_rest(self._since_ns, frame.stamp_ns)
-        return self._standstill.told(relative, self._config.standstill, at_rest)
+        return self._standstill.told(relative, self._config.standstill, self._at_rest(frame))
+
+    def _at_rest(self, frame: Frame) -> bool:
+        """Whether a gyro felt nothing since it was last known what the camera does."""
+        return self._gyro is not None and self._gyro.at_rest(
+            max(self._since_ns, self._known_ns), frame.stamp_ns)
 
     def _start(self, frame: Frame, view: View, status: Status,
                backwards: bool) -> OdometryResult:
@@ -287,7 +317,7 @@ class VisualOdometry:
         if self._gyro is not None and self._gyro.fits and (turn := self._turn(frame)) is not None:
             motion[:3, :3] = turn.R.T
             # An error of the bias is the same all along: n steps err n times as much as one.
-            before = (self._since_ns - self._known_ns) / (frame.stamp_ns - self._since_ns)
+            before = max(self._since_ns - self._known_ns, 0) / (frame.stamp_ns - self._since_ns)
             covariance[3:, 3:] = (1 + 2 * before) * turn.R.T @ turn.covariance @ turn.R
         return motion, covariance
 
@@ -301,10 +331,13 @@ class VisualOdometry:
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
                               self._path.moved(self._pose, np.eye(4), covariance),
                               stationary=True, keyframe=keyframe)
-        if self._gyro is not None:
-            self._gyro.learn(self._since_ns, frame.stamp_ns, np.eye(3),
-                             np.eye(3) * _STILL_TO_WITHIN**2)
-        self._since_ns, self._since_covariance = frame.stamp_ns, result.motion_covariance
+        # What it has crept by now is part of the motion that will be told one day.
+        crept = self._standstill.crept(relative, self._config.standstill)
+        if self._gyro is not None and not crept:
+            self._learn(self._gyro, frame, np.eye(3), np.eye(3) * _STILL_TO_WITHIN**2)
+            self._turned = _not_turned(frame)
+        if not crept or frame.stamp_ns - self._since_ns > _CREEPING_NS:
+            self._since_ns, self._since_covariance = frame.stamp_ns, result.motion_covariance
         self._known_ns = frame.stamp_ns
         self._forget()
         return result
@@ -332,6 +365,7 @@ class VisualOdometry:
         self._reference, self._view = frame, view
         self._since_ns = frame.stamp_ns
         self._since_covariance = np.zeros((6, 6))
+        self._turned = _not_turned(frame)
         self._standstill.refer()
         self._forget()
 
@@ -349,6 +383,11 @@ class VisualOdometry:
             self._pose @ motion, covariance, path.pose, length.value, length.known, stationary,
             self._since_ns, self._since_covariance, length.metric, length.measured, length.common,
             keyframe)
+
+
+def _not_turned(frame: Frame) -> tuple[int, Array, Array]:
+    """Stamp, rotation (3, 3) from the reference and its covariance (3, 3) of one like it."""
+    return frame.stamp_ns, np.eye(3), np.zeros((3, 3))
 
 
 def camera_motion(relative: RelativePose, length: float = 1.0) -> Array:
