@@ -126,7 +126,7 @@ def _nothing_moved(relative: RelativePose, most: float) -> bool:
 
 
 def _refined(relative: RelativePose) -> Array:
-    """Matched pixels (N, 2), as exact as they are known for all."""
+    """Give matched pixels (N, 2), as exact as they are known for all."""
     refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
     return relative.y_opt if refined else relative.y
 

@@ -35,8 +35,8 @@ import numpy as np
 # Radians by which a camera that stands still turns from frame to frame.
 _STILL_TO_WITHIN = 2e-4
 
-# chosen: share of the image's larger side by which the median match may have moved from a reference
-# without parallax that stays; what was seen is still in sight then.
+# chosen: share of the image's larger side by which the median match may have moved from a
+# reference that waits for parallax; nearly all that it saw is in sight then.
 _IN_SIGHT = 0.05
 
 # Nanoseconds; chosen: what creeps for longer before it is seen to move counts as having stood.
@@ -121,6 +121,7 @@ class VisualOdometry:
         odometry = odometry or OdometryConfig()
         self._one_scale = OneScale()
         self._last: Frame | None = None
+        self._turned: tuple[int, Array, Array] = 0, np.eye(3), np.zeros((3, 3))
         self.configure(estimator or EstimatorConfig(), odometry, scale or scale_source(odometry))
         self.listen_to(gyro, guess)
         self.reset()
