@@ -9,7 +9,7 @@ from djet_ros.config.sections import Config, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import live_choices, with_live_values
+from djet_ros.live.parameters import FIXED, live_choices, with_live_values
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -224,6 +224,14 @@ def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
     # every other choice is as good live as offline
     assert all(live_choices(item) == item.description.choices
                for item in flat(Config()).values() if item.name != 'odometry.scale')
+
+
+def test_what_poses_are_called_and_along_which_axes_they_are_is_fixed_for_a_nodes_life():
+    of_poses = {name for name in flat(Config()) if name.startswith('odometry.')
+                and name.endswith(('_frame', '_convention'))} - {'odometry.guess_frame'}
+    assert len(of_poses) == 4
+    assert of_poses < set(FIXED)
+    assert set(FIXED) < flat(Config()).keys()
 
 
 @pytest.mark.parametrize(('name', 'node', 'meant'), [

@@ -162,7 +162,7 @@ def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: No
 
 def test_with_a_base_frame_the_map_is_of_the_vehicle_by_the_mounting_on_tf(
         listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> None:
-    pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     drive(listener, camera, nodes, **{'odometry.base_frame': 'base_link'})
     # What the camera that looks to the left has on its right is ahead of the vehicle.
     check_the_map(listener, to_the_right=[1, 0, 0])

@@ -191,7 +191,7 @@ def test_a_file_of_parameters_that_is_not_there_ends_the_launch(
 @pytest.mark.ros
 def test_two_cameras_have_their_own_nodes_and_topics(
         environment: dict[str, str], tmp_path: Path) -> None:
-    pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     said = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
                     'base_frame:=base_link',
                     until='queue policy', times=2)

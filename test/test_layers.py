@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import requires
 from pathlib import Path
 import re
+import subprocess
 import sys
 from xml.etree import ElementTree
 
@@ -147,6 +148,26 @@ def test_what_comes_with_ros_is_imported_by_the_ros_face_only() -> None:
     users = {module for module in TREES if libraries(module) & ROS_LIBRARIES}
     assert users
     assert users <= set(in_room('ros'))
+
+
+def test_who_misses_a_module_of_ros_is_told_the_package_that_package_xml_asks_for() -> None:
+    asked = {node.args[1].value for node in ast.walk(TREES['djet_ros.ros.parameters'])
+             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+             and node.func.id == '_require' and isinstance(node.args[1], ast.Constant)}
+    assert asked == {'tf2-msgs', 'tf2-ros-py'}
+    assert {str(package).replace('-', '_') for package in asked} <= ROS_LIBRARIES
+
+
+def test_a_live_node_loads_nothing_that_reads_recordings_draws_or_fills_terminals() -> None:
+    # Ubuntu has no rosbags: a robot is to do without.
+    done = subprocess.run(
+        [sys.executable, '-c', 'import sys, djet_ros.live.graph_face, djet_ros.live.odometry_face;'
+         'print(*{name.partition(".")[0] for name in sys.modules})'],
+        capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert {'cv2', 'numpy', 'scipy', 'yaml'} <= loaded
+    assert not loaded & {'apsw', 'backports', 'compression', 'lz4', 'matplotlib', 'rich',
+                         'rosbags', 'sqlite3', 'zstandard'}
 
 
 def name_of(requirement: str) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.lab.scenes.imu import feel, Mems
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.decoding import MAKE
@@ -167,7 +167,7 @@ class Drive:
 def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
         node, publisher, subscriber, drive, tmp_path, base_frame, imu):
     if base_frame or imu:
-        pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+        pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     mounting = MAKE.frame(0, 'base_link', 'camera', AHEAD)
     write_kitti_bag(Drive(drive), tmp_path / 'plain')
     with Bag(tmp_path / 'plain') as plain, ResultBag(tmp_path / 'bag') as whole:
@@ -529,19 +529,51 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
         'estimator.max_features': 10**6, 'estimator.loss': 'hubber', 'ros.queue_size': 3,
         'odometry.scale': 'ground_truth', 'odometry.max_lost': 'many', 'ros.publish_tf': True,
         'ros.publish_path': True})
-    assert [good for good, _ in answers] == [True, True] + [False] * 6 + [True, True]
+    assert [good for good, _ in answers] == [False, True] + [False] * 6 + [True, True]
     reasons = [reason for _, reason in answers]
+    assert 'read-only' in reasons[0]
     assert 'Max: 20000' in reasons[3]
     assert reasons[4].startswith("estimator.loss is 'hubber'; choose from none, huber, cauchy")
     assert 'read-only' in reasons[5]
     assert 'which only a recording has; choose from structure, none, constant' in reasons[6]
     assert reasons[6].count('ground_truth') == 1
+    assert publisher.ask('configure', node=NODE, values={'odometry.scale': 'none'})[0][0]
     play(publisher, drive[3:5], first=3)
     subscriber.wait('all odometry', lambda heard: len(heard[f'{NODE}/odometry']) == 5)
-    frames = [m.header.frame_id for m in subscriber.heard[f'{NODE}/odometry']]
-    assert frames == ['odom'] * 3 + ['world'] * 2
+    # without a scale each translation has length one
+    lengths = [np.linalg.norm(pose_of(m)[1][:3, 3])
+               for m in subscriber.heard[f'{NODE}/relative_pose']]
+    assert [length == pytest.approx(1, abs=1e-9) for length in lengths[-3:]] == [False, True, True]
     assert publisher.ask('configured', node=NODE, names=[
         'odometry.max_gap', 'estimator.window']) == [2.0, 5]
+
+
+@pytest.mark.parametrize(('values', 'asks'), [
+    ({'odometry.imu': True}, 'odometry.imu is true without an odometry.imu_rotation'),
+    ({'odometry.guess': True}, 'odometry.guess is true'),
+    ({'odometry.scale': 'guess'}, 'odometry.scale is guess')])
+def test_what_needs_a_module_that_is_not_there_is_refused_and_the_node_works_on(
+        node, publisher, subscriber, drive, values, asks):
+    one = node(before='import sys; sys.modules["tf2_ros"] = None; ', **EVERY)
+    camera(publisher)
+    (done, reason), = publisher.ask('configure', node=NODE, values=values)
+    assert not done
+    assert reason.startswith(f'{asks}, which needs the Python module tf2_ros: '
+                             'apt install ros-$ROS_DISTRO-tf2-ros-py (')
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+    assert one.process.poll() is None
+
+
+def test_the_start_is_refused_in_one_line_where_a_module_is_not_there(tmp_path):
+    done = subprocess.run(
+        [*command('vo_node', 'import sys; sys.modules["tf2_ros"] = None; '), '--ros-args',
+         '-p', 'odometry.base_frame:=base_link'], env=ENVIRONMENT, capture_output=True,
+        text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    line, = done.stderr.splitlines()
+    assert line.startswith('vo_node: error: odometry.base_frame is base_link, which needs the '
+                           'Python module tf2_ros: ')
 
 
 def test_a_scale_at_run_time_needs_its_length_first(node, publisher):
@@ -627,7 +659,7 @@ def test_path_transform_and_debug_image_come_on_demand(
 
 def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_parent(
         node, publisher, subscriber, drive):
-    pytest.importorskip('tf2_ros', reason='tf2_ros is not installed')
+    pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     one = node(**EVERY, **{'odometry.base_frame': 'base_link', 'ros.publish_tf': True})
     camera(publisher)
     listener = Peer('listener')

@@ -19,7 +19,7 @@ from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
-from djet_ros.posegraph.keyframe_images import frame_finder
+from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag, BagMessage

@@ -11,6 +11,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.live import session as sessions
+from djet_ros.live.rate_limit import RateLimit
 from djet_ros.live.session import ROOM, Session
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
@@ -157,6 +158,32 @@ def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live,
     # The newest is never the one that is dropped.
     assert one.tracker.last.stamp_ns == (len(drive) - 1) * PERIOD
     assert 'images dropped: they come faster than they are worked on' in one.graph.lines[0]
+
+
+def test_a_camera_that_is_too_fast_on_purpose_is_slowed_down_and_nobody_complains(live, drive):
+    limit, slow, fast = RateLimit(4.0), live(), live(**{'ros.max_rate': 4.0})
+    for i, gray in enumerate(drive):
+        if limit.takes(i * PERIOD):
+            slow.send([gray], first=i)
+    # after a reset the same images are taken
+    fast.send(drive[:8])
+    fast.session.reset()
+    fast.graph.batches.clear()
+    fast.send(drive)
+    for one in (slow, fast):
+        one.wait_for_images(5)
+    assert [serialised(message) for message in fast.graph.heard(*POSES)] == [
+        serialised(message) for message in slow.graph.heard(*POSES)]
+    fast.session.pause()
+    said = fast.graph.said()
+    assert said['frames beyond ros.max_rate'] == '7'
+    assert said['frames received'] == said['frames processed'] == '5'
+    assert not any(key.startswith('to mend') for key in said)
+    assert not any('come faster' in line for line in fast.graph.lines)
+    fast.session.configure(with_values(fast.tracker.config, {'ros.max_rate': 0.0}))
+    fast.session.resume()
+    fast.send(drive[:3], first=12)
+    fast.wait_for_images(8)
 
 
 @pytest.mark.parametrize('policy', ['latest', 'every'])

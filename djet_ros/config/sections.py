@@ -199,6 +199,10 @@ class NodeConfig:
     queue_size: int = parameter(
         2, 'frames that may wait with queue_policy latest; beyond it the oldest is dropped',
         minimum=1, maximum=1000)
+    max_rate: float = parameter(
+        0.0, 'images a second, by their stamps, that are worked on at most; of a faster camera '
+        'the others are left out before they wait, and counted; 0 leaves out none',
+        minimum=0.0, maximum=1000.0)
     publish_tf: bool = parameter(
         False, 'whether the integrated pose is also published as odom_frame -> camera frame on tf')
     publish_path: bool = parameter(

@@ -119,7 +119,7 @@ class Middleware(Protocol):
         """Give the topics over which somebody sends messages of a ROS type."""
 
     def follow_frames(self) -> None:
-        """Hear what tf says from now on; DjetError where that can't be had."""
+        """Hear what tf says from now on."""
 
     def transform(self, parent: str, child: str) -> Array | None:
         """Give a frame in another (4, 4), or None where tf does not know it."""

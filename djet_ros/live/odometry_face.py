@@ -7,6 +7,7 @@ from dataclasses import replace
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware, Profile
+from djet_ros.live.parameters import wants_topic_of_guess, why_frames
 from djet_ros.live.session import Session
 from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
@@ -57,12 +58,9 @@ class OdometryFace(Face):
         """Make the publishers and the subscriptions that a configuration asks for."""
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
-        guess = odometry.guess or odometry.scale == 'guess'
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,
-                  'guess': guess and not odometry.guess_frame}
-        frames = bool(odometry.base_frame) or wanted['guess'] or (
-            odometry.imu and odometry.imu_quaternion() is None)
-        if frames and not self._follows_frames:
+                  'guess': wants_topic_of_guess(odometry)}
+        if why_frames(odometry) and not self._follows_frames:
             self._follows_frames = True
             self._middleware.follow_frames()
         for what in [what for what in wanted if wanted[what] and what not in self._hears_beside]:
@@ -71,6 +69,7 @@ class OdometryFace(Face):
                         getattr(self.session, what),
                         replace(input_profile(config.ros),
                                 depth=_MASKS_DEPTH if what == 'mask' else _DEPTH))
+        guess = odometry.guess or odometry.scale == 'guess'
         if guess and odometry.guess_frame and not self._hears_tf:
             self._hears_tf = True
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from djet_ros.config.flat import FlatParameter, section, with_values
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.errors import DjetError
 
 # What a subscription or the queue was made with holds for its life; and nobody who knows the odom
-# frame could follow it to other axes. A mask is read once.
+# frame could follow it to other names or axes. A mask is read once.
 FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
-         'ros.queue_size', 'odometry.frame_convention', 'odometry.base_frame',
-         'odometry.mask_file')
+         'ros.queue_size', 'odometry.frame_convention', 'odometry.camera_frame',
+         'odometry.odom_frame', 'odometry.base_frame', 'odometry.mask_file')
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
 SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
@@ -24,6 +24,22 @@ SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
 # What the odometry goes by; what belongs to another node is no unknown name.
 ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')
                      for item in section(Config(), part))
+
+
+def wants_topic_of_guess(config: OdometryConfig) -> bool:
+    """Tell whether another odometry is to be heard, and not to be made of tf."""
+    return (config.guess or config.scale == 'guess') and not config.guess_frame
+
+
+def why_frames(config: OdometryConfig) -> str:
+    """Say what asks tf how something is mounted; nothing where nothing does."""
+    if config.base_frame:
+        return f'odometry.base_frame is {config.base_frame}'
+    if config.imu and config.imu_quaternion() is None:
+        return 'odometry.imu is true without an odometry.imu_rotation'
+    if wants_topic_of_guess(config):
+        return 'odometry.guess is true' if config.guess else 'odometry.scale is guess'
+    return ''
 
 
 # Values that only a recording has, by parameter.

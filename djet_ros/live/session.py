@@ -17,8 +17,10 @@ from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
+from djet_ros.live.rate_limit import RateLimit
 from djet_ros.odometry.diagnostics import LEVELS, State
 from djet_ros.odometry.health import Complaint
+from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -149,6 +151,7 @@ class Session:
         self._wiring = wiring
         self._topics = topics
         self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size, ROOM)
+        self._limit = RateLimit(node.max_rate)
         # Held while an image is worked on and published, and by what happens in between.
         self._lock = Lock()
         self._turnstile = Lock()
@@ -157,7 +160,7 @@ class Session:
         self._beside: FrameQueue[_Beside] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
         self._came = Event()
         self._came_at = -np.inf
-        self._counted_drops = self._lost = self._counted_lost = 0
+        self._counted_drops = self._lost = self._counted_lost = self._left_out = 0
         self._said_drops = False
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
@@ -197,8 +200,11 @@ class Session:
         return self._queue.has_room
 
     def image(self, message: Any) -> None:
-        """Take an Image or a CompressedImage."""
+        """Take an Image or a CompressedImage, unless they come faster than is asked for."""
         self._last_image = monotonic()
+        if not self._limit.takes(stamp_ns(message.header)):
+            self._left_out += 1
+            return
         self._queue.put(_Received(message, self._newest_info, self._last_image), _bytes(message))
 
     def camera_info(self, message: Any) -> None:
@@ -250,7 +256,9 @@ class Session:
             self._beside.clear()
             self._latencies.clear()
             self._log.clear()
-            self._counted_drops, self._lost, self._counted_lost = self._queue.dropped, 0, 0
+            self._counted_drops = self._queue.dropped
+            self._lost = self._counted_lost = self._left_out = 0
+            self._limit = RateLimit(self._tracker.config.ros.max_rate)
             self._said_drops = False
             self._tracker.reset()
             self._say()
@@ -278,6 +286,8 @@ class Session:
         """Take other parameters from the next image on; the queue stays as it was made."""
         with self._between_images():
             before = flat(self._tracker.config)
+            if config.ros.max_rate != self._tracker.config.ros.max_rate:
+                self._limit = RateLimit(config.ros.max_rate)
             self._tracker.configure(config)
         changed = [f'{item.name} = {item.value}' for item in flat(config).values()
                    if item.value != before[item.name].value]
@@ -440,6 +450,7 @@ class Session:
 
     def _face_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
+                'frames beyond ros.max_rate': str(self._left_out),
                 'queue policy': self._tracker.config.ros.queue_policy,
                 **self._latencies.values()}
 

@@ -1,29 +1,18 @@
-"""The images of keyframes: out of a recording, and where they are kept."""
+"""The images of keyframes, and where they are kept."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from djet_ros.config.sections import Config
 from djet_ros.core.types import Features
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.images import gray_image
-from djet_ros.odometry.masks import Masks
-from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.mask_files import still_mask
-from djet_ros.recordings.recording import Recording
 import numpy as np
-
-# Recorded nanoseconds for which an image waits for its mask, as in a replay.
-_PATIENCE_NS = 10**9
 
 # What is kept of them.
 _FEATURES = 'points', 'octaves', 'angles', 'responses', 'descriptors'
@@ -106,44 +95,3 @@ class _Kept(NamedTuple):
 
     offset: int
     frame: Frame
-
-
-def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]:
-    """
-    Give the function from stamps, in the order of recording, to frames as the odometry had them.
-
-    It raises DjetError for a stamp of which the recording has no image, or not in this order.
-    """
-    masks = Masks(still_mask(config.odometry.mask_file))
-    images = _images(recording, config, masks)
-
-    def frame_at(stamp: int) -> Frame:
-        for camera, message in images:
-            if stamp_ns(message.header) == stamp:
-                raw = gray_image(message, config.odometry.gray_limits())
-                return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
-                             masks.of(stamp, raw.shape, camera))
-        raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
-                        'give the recording that was replayed')
-    return frame_at
-
-
-def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tuple[Camera, Any]]:
-    """Images of a recording, each with its camera, once their masks are among those given."""
-    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
-    camera: Camera | None = None
-    mask_topic = recording.beside.get('mask', '') if config.odometry.mask else ''
-    waiting: deque[tuple[int, Camera, Any]] = deque()
-    for topic, recorded, message in recording.messages(
-            {recording.image_topic, recording.info_topic, mask_topic}):
-        if topic == recording.info_topic:
-            camera = Camera.from_info(message, rectified)
-        elif topic == recording.image_topic and camera is not None:
-            waiting.append((recorded, camera, message))
-        elif topic == mask_topic:
-            masks.add(message)
-        while waiting and (not mask_topic or recorded - waiting[0][0] >= _PATIENCE_NS
-                           or masks.has(stamp_ns(waiting[0][2].header))):
-            yield waiting.popleft()[1:]
-    for _, of_image, message in waiting:
-        yield of_image, message

@@ -10,7 +10,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.odometry.scale import Scale
 from djet_ros.posegraph.backend import OptimisedGraph
-from djet_ros.posegraph.keyframe_images import frame_finder, KeyframeFile
+from djet_ros.posegraph.keyframe_images import KeyframeFile
 from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
 from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.steps import graph_of, scale_of, Step

@@ -186,12 +186,8 @@ class RosMiddleware:
                 if kind in kinds and self._node.count_publishers(name)]
 
     def follow_frames(self) -> None:
-        """Hear what tf says from now on; DjetError where tf2_ros is not installed."""
-        try:
-            tf2 = import_module('tf2_ros')
-        except ImportError as error:
-            raise DjetError('odometry.base_frame needs tf2_ros: apt install '
-                            f'ros-$ROS_DISTRO-tf2-ros-py ({one_line(error)})') from error
+        """Hear what tf says from now on; that tf2_ros is there, the parameters have seen to."""
+        tf2 = import_module('tf2_ros')
         self._frames = tf2.Buffer()
         self._listener = tf2.TransformListener(self._frames, self._node)
 

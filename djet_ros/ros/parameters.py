@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from importlib.util import find_spec
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 import sys
@@ -12,8 +12,15 @@ from typing import Any
 from djet_ros.config.flat import flat, FlatParameter, from_flat, why_unknown
 from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own, why_unused
-from djet_ros.errors import DjetError
-from djet_ros.live.parameters import FIXED, live_choices, ODOMETRY, SHARED, with_live_values
+from djet_ros.errors import DjetError, one_line
+from djet_ros.live.parameters import (
+    FIXED,
+    live_choices,
+    ODOMETRY,
+    SHARED,
+    why_frames,
+    with_live_values,
+)
 from djet_ros.odometry.scale import check_scale
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -83,6 +90,10 @@ def graph_parameters(node: Node) -> Config:
     """
     given = _given(node)
     config = from_flat(given)
+    if config.slam.publish_tf:
+        _require('tf2_msgs', 'tf2-msgs', 'slam.publish_tf is true')
+    if config.odometry.base_frame:
+        _require_frames(config)
     _declare(node, (item for item in flat(config).values() if item.name in SHARED
                     or item.name.startswith(('estimator.', 'slam.'))), given, read_only=True)
     return config
@@ -140,12 +151,27 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
 def _possible(config: Config) -> Config:
     """Refuse what can't be had in this ROS, and a scale that lacks its length."""
     check_scale(config.odometry)
-    asked = ('ros.publish_tf is true' if config.ros.publish_tf else
-             'odometry.guess_frame is set' if config.odometry.guess_frame else '')
-    if asked and find_spec('tf2_msgs') is None:
-        raise DjetError(f'{asked}, and the package tf2_msgs is not installed: '
-                        'apt install ros-$ROS_DISTRO-tf2-msgs')
+    if config.ros.publish_tf:
+        _require('tf2_msgs', 'tf2-msgs', 'ros.publish_tf is true')
+    if config.odometry.guess_frame:
+        _require('tf2_msgs', 'tf2-msgs', 'odometry.guess_frame is set')
+    _require_frames(config)
     return config
+
+
+def _require_frames(config: Config) -> None:
+    if asked := why_frames(config.odometry):
+        # Jazzy's package tf2_ros is C++ alone.
+        _require('tf2_ros', 'tf2-ros-py', asked)
+
+
+def _require(module: str, package: str, asked: str) -> None:
+    """Refuse what is asked for where a Python module of ROS is missing or does not work."""
+    try:
+        import_module(module)
+    except ImportError as error:
+        raise DjetError(f'{asked}, which needs the Python module {module}: apt install '
+                        f'ros-$ROS_DISTRO-{package} ({one_line(error)})') from error
 
 
 def _values(parameters: list[Parameter]) -> dict[str, Any]:

@@ -1,0 +1,61 @@
+"""ros.max_rate: which images are taken, by their stamps alone."""
+
+from djet_ros.live.rate_limit import RateLimit
+import numpy as np
+import pytest
+
+SECOND = 10**9
+
+
+def taken(limit, stamps):
+    """Give the stamps of the images that are taken."""
+    return [stamp for stamp in stamps if limit.takes(stamp)]
+
+
+def camera(hertz, seconds=20, jitter=0.0, start=0):
+    """Give stamps (ns) of a camera, each off by up to a share of the period."""
+    count = int(hertz * seconds)
+    off = np.random.default_rng(0).uniform(-jitter, jitter, count)
+    return [start + round((i + off[i] + 1) * SECOND / hertz) for i in range(count)]
+
+
+@pytest.mark.parametrize(('comes', 'most'), [(60, 20), (60, 25), (60, 59), (90, 10), (33, 2)])
+@pytest.mark.parametrize('jitter', [0.0, 0.3])
+def test_a_fast_camera_gives_as_many_images_as_are_asked_for(comes, most, jitter):
+    stamps = taken(RateLimit(most), camera(comes, jitter=jitter))
+    # a little less where an uneven camera is hardly faster
+    least = 0.9 if jitter else 0.98
+    assert least * 20 * most - 2 <= len(stamps) <= 20 * most + 1
+    # never two where there should be one
+    assert all(after - before > 0.4 * SECOND / most for before, after in zip(stamps, stamps[1:]))
+
+
+@pytest.mark.parametrize('comes', [5, 29.9, 30])
+def test_a_camera_that_is_no_faster_loses_nothing_though_its_stamps_are_not_even(comes):
+    stamps = camera(comes, jitter=0.2)
+    assert taken(RateLimit(30), stamps) == stamps
+
+
+def test_as_it_stands_every_image_is_taken():
+    stamps = [0, 1, 2, 2, 1, 0, 10**18]
+    assert taken(RateLimit(0.0), stamps) == stamps
+
+
+def test_stamps_that_go_back_start_anew():
+    limit = RateLimit(10)
+    late, early = camera(60, 2, start=100 * SECOND), camera(60, 2)
+    assert taken(RateLimit(10), early) == taken(limit, early)
+    taken(limit, late)
+    assert taken(limit, early) == taken(RateLimit(10), early)
+
+
+def test_after_a_pause_of_hours_no_more_come_than_before():
+    limit = RateLimit(10)
+    first = len(taken(limit, camera(60, 5)))
+    assert len(taken(limit, camera(60, 5, start=3600 * SECOND))) <= first + 1
+
+
+def test_images_of_one_stamp_share_its_fate():
+    limit = RateLimit(10)
+    assert [limit.takes(stamp) for stamp in (0, 0, 0, SECOND // 100, SECOND // 100)] == [
+        True, True, True, False, False]
