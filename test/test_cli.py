@@ -112,6 +112,21 @@ def test_what_the_user_can_mend_gives_one_line_and_exit_code_2(
     assert probe.returncode == code
 
 
+@pytest.mark.parametrize(('words', 'nodes'), [
+    (('replay', 'bag', '--output', 'out', '--config'), '/vo_node'),
+    (('lens', 'bag', '--config'), '/vo_node'),
+    (('slam', 'bag', '--output', 'out', '--config'), '/vo_node and /pose_graph_node'),
+    (('live', '-r', '__ns:=/rear', '--params'), '/rear/vo_node')])
+def test_a_file_of_parameters_for_others_alone_is_refused_by_every_command_that_takes_one(
+        tmp_path: Path, words: tuple[str, ...], nodes: str) -> None:
+    path = tmp_path / 'theirs.yaml'
+    path.write_text('/left/eye: {ros__parameters: {preset: fast}}')
+    done = djet(*words, str(path))
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr == (f'djet: error: {path}: it is for /left/eye, and nothing is taken from '
+                           f"it: this is {nodes}; '/**' is for all\n")
+
+
 @pytest.mark.parametrize('body', ["raise ValueError('a bug')", 'import djet_ros.no_such_module'])
 def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
     probe = start_probe(body)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
-from djet_ros.config.sections import Config, SECTIONS
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
@@ -245,7 +245,7 @@ def test_a_file_for_other_nodes_alone_is_said_as_ros_understands_names(
     path = written(tmp_path, f"'{name}': {{ros__parameters: {{preset: paper}}}}")
     said = why_unused(path, node)
     assert said == '' if meant else said == (
-        f"{path} is for /{name.strip('/')}, and nothing is taken from it: this node is {node}; "
+        f"{path}: it is for /{name.strip('/')}, and nothing is taken from it: this is {node}; "
         "'/**' is for all")
 
 
@@ -257,3 +257,61 @@ def test_a_file_for_several_nodes_is_for_each_of_them(tmp_path):
     assert why_unused(path, '/left/vo_node') == why_unused(path, '/other') == ''
     assert 'is for /left/vo_node, /other, and' in why_unused(path, '/vo_node')
     assert 'is for no node, and' in why_unused(written(tmp_path, '{}'), '/vo_node')
+
+
+def gap(path, *nodes):
+    """Give the max_gap that a file has, offline or for nodes."""
+    return load_yaml(path, **({'nodes': nodes} if nodes else {})).odometry.max_gap
+
+
+@pytest.mark.parametrize('text', [
+    '/left/vo_node: {ros__parameters: {odometry.max_gap: 3}}',
+    'left: {vo_node: {ros__parameters: {odometry: {max_gap: 3}}}}',
+    '/left: {vo_node: {ros__parameters: {odometry: {max_gap: 3}}}}'])
+def test_a_file_for_the_odometry_in_a_namespace_serves_offline_and_there_and_nowhere_else(
+        tmp_path, text):
+    path = written(tmp_path, text)
+    assert gap(path) == gap(path, '/left/vo_node') == 3
+    for other in ('/right/vo_node', '/vo_node', '/left/eye'):
+        with pytest.raises(DjetError) as error:
+            gap(path, other)
+        assert str(error.value) == (f'{path}: it is for /left/vo_node, and nothing is taken from '
+                                    f"it: this is {other}; '/**' is for all")
+
+
+def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_meant(tmp_path):
+    path = written(tmp_path, """
+        /**: {ros__parameters: {odometry: {max_gap: 1.5, max_lost: 9}}}
+        /left/vo_node: {ros__parameters: {odometry: {max_gap: 3}}}
+        right: {vo_node: {ros__parameters: {odometry: {max_gap: 7}}}}
+    """)
+    assert (gap(path, '/left/vo_node'), gap(path, '/right/vo_node')) == (3, 7)
+    assert gap(path, '/rear/vo_node') == 1.5
+    assert load_yaml(path, nodes=['/left/vo_node']).odometry.max_lost == 9
+    with pytest.raises(DjetError, match='it is for /left/vo_node and /right/vo_node, and one of '
+                                        'them is meant; give a file for that one'):
+        load_yaml(path)
+    path.write_text(path.read_text().rstrip() + "\n        vo_node: {ros__parameters: {preset: fast}}")
+    assert gap(path) == 1.5
+    assert load_yaml(path).preset == 'fast'
+
+
+def test_a_file_for_other_nodes_alone_is_refused_and_not_taken_for_the_defaults(tmp_path):
+    for name in ('left_vo', 'pose_graph_node', '/*/eye'):
+        path = written(tmp_path, f"'{name}': {{ros__parameters: {{slam.loop_votes: 7}}}}")
+        with pytest.raises(DjetError, match='nothing is taken from it: this is /vo_node; ') as one:
+            load_yaml(path)
+        assert str(one.value).startswith(f'{path}: it is for /{name.strip("/")}, ')
+
+
+def test_loops_go_by_the_pose_graphs_own_parameters_and_by_the_odometrys(tmp_path):
+    path = written(tmp_path, """
+        pose_graph_node: {ros__parameters: {slam: {loop_votes: 7}, estimator: {window: 5}}}
+    """)
+    both = (NODE_NAME, GRAPH_NAME)
+    assert load_yaml(path, nodes=both) == from_flat({'slam.loop_votes': 7})
+    path.write_text(path.read_text() + """
+        vo_node: {ros__parameters: {odometry: {max_gap: 3}}}
+    """)
+    assert load_yaml(path, nodes=both) == from_flat({'slam.loop_votes': 7, 'odometry.max_gap': 3})
+    assert load_yaml(path) == from_flat({'odometry.max_gap': 3})

@@ -514,7 +514,7 @@ def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
     path.write_text('vo_node: {ros__parameters: {odometry: {max_gap: 3}}}')
     with nodes(tmp_path, IMAGE) as start:
         one = start('-r', '__ns:=/left', '--params-file', str(path))
-        wait_for_log(one, f'{path} is for /vo_node, and nothing is taken from it: this node is '
+        wait_for_log(one, f'{path}: it is for /vo_node, and nothing is taken from it: this is '
                           "/left/vo_node; '/**' is for all")
 
 

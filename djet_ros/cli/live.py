@@ -10,6 +10,7 @@ from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_sign
 from djet_ros.config.flat import flat, parse_value
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
+from djet_ros.dds.names import Names
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import with_live_values
 
@@ -33,20 +34,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Work until SIGINT or SIGTERM."""
     stop = stop_by_signal()
-    config, use_sim_time = _configuration(args)
+    names = Names(NODE_NAME, args.remap)
+    config, use_sim_time = _configuration(args, names.full_node)
 
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.middleware import DdsMiddleware
-    from djet_ros.dds.names import Names
     from djet_ros.live.odometry_face import OdometryFace
-    names = Names(NODE_NAME, args.remap)
     with Graph() as graph:
         return OdometryFace(DdsMiddleware(graph, names, use_sim_time), config).run(stop)
 
 
-def _configuration(args: argparse.Namespace) -> tuple[Config, bool]:
-    """Read file and command line; the boolean is use_sim_time."""
-    config = load_yaml(args.params, take=with_live_values) if args.params else Config()
+def _configuration(args: argparse.Namespace, node: str) -> tuple[Config, bool]:
+    """Read file and command line for a node by its full name; the boolean is use_sim_time."""
+    config = Config() if args.params is None else load_yaml(
+        args.params, take=with_live_values, nodes=[node])
     known = flat(config)
     values: dict[str, Any] = {}
     use_sim_time = False

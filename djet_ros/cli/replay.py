@@ -13,7 +13,7 @@ from djet_ros.cli.options import add_output, add_topics
 from djet_ros.cli.terminal import console, new_table, progress_bar, spread
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
-from djet_ros.config.sections import Config, OdometryConfig
+from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import BESIDE, open_recording
@@ -72,9 +72,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def configured(args: argparse.Namespace) -> Config:
-    """Give the parameters of --config with those of the flags on top."""
-    return with_values(load_yaml(args.config) if args.config else Config(), flag_values(args))
+def configured(args: argparse.Namespace, *nodes: str) -> Config:
+    """Give the parameters of --config for some nodes with those of the flags on top."""
+    config = load_yaml(args.config, nodes=nodes or (NODE_NAME,)) if args.config else Config()
+    return with_values(config, flag_values(args))
 
 
 def replayed(args: argparse.Namespace, config: Config, recording: Path, folder: Path) -> Outcome:

@@ -12,7 +12,7 @@ from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Run, with progress on stderr, and show what came of it."""
     given = flag_values(args)
     of_slam = {name: given.pop(name) for name in PARAMETERS if name in given}
-    config = configured(args)
+    config = configured(args, NODE_NAME, GRAPH_NAME)
     make_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():

@@ -8,7 +8,7 @@ import math
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
 from djet_ros.core.parameter import check, parameter
 
-NODE_NAME = 'vo_node'
+NODE_NAME, GRAPH_NAME = 'vo_node', 'pose_graph_node'
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 from djet_ros.config.flat import explain, flat, section, shown, Value, with_values
 from djet_ros.config.safe_files import read_yaml
-from djet_ros.config.sections import Config, NODE_NAME, SECTIONS
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
 
@@ -32,39 +32,54 @@ _PRESET_NOTE = """\
 
 
 def load_yaml(path: Path, base: Config | None = None,
-              take: Callable[[Config, Mapping[str, Any]], Config] = with_values) -> Config:
+              take: Callable[[Config, Mapping[str, Any]], Config] = with_values,
+              nodes: Sequence[str] = (NODE_NAME,)) -> Config:
     """
     Read a YAML file over the base configuration (by default all defaults).
 
-    take: how the configuration takes the values.
+    take: how the configuration takes the values; nodes: for whom it is read, by full names such as
+    '/left/vo_node', or without a slash in whichever namespace the file has it. Of the pose graph's
+    own parameters slam.* alone are taken.
 
-    Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with the
-    node names ``/**`` and ``vo_node``. Raises DjetError, beginning with the path, on anything
-    that is not such a file.
+    Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with
+    namespaces and wildcards. Raises DjetError, beginning with the path, on anything that is not
+    such a file, and where nothing of it is for these nodes.
     """
     content = read_yaml(path)
     try:
-        return take(base or Config(), dict(_flatten(_ours(content))))
+        return take(base or Config(), dict(_flatten(_ours(content, nodes))))
     except DjetError as error:
         raise DjetError(f'{path}: {error}') from None
 
 
-def _ours(content: Any) -> Any:
-    """Take this node's parameters out of ROS's layout; a plain layout stays as it is."""
+def _ours(content: Any, nodes: Sequence[str]) -> Any:
+    """Take the parameters of some nodes out of ROS's layout; a plain layout stays as it is."""
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise DjetError('the file must hold sections with parameters')
-    nodes = {name: value['ros__parameters'] for name, value in content.items()
-             if isinstance(value, dict) and 'ros__parameters' in value}
-    if not nodes:
+    parts = list(_addressed(content))
+    if not parts:
         return content
-    merged: dict[str, Any] = {}
-    for name, parameters in nodes.items():
-        if str(name).rpartition('/')[2] in ('**', '*', NODE_NAME):
-            merged.update((key, value) for key, value in _flatten(parameters)
-                          if not is_ros_own(key))
-    return merged
+    full = [_full_name(node, [name for name, _ in parts]) for node in nodes]
+    found = [(node, parameters) for node in full for name, parameters in parts
+             if _is_for(name, node)]
+    if not found:
+        raise DjetError(_for_others((name for name, _ in parts), full))
+    return {key: value for node, parameters in found for key, value in _flatten(parameters)
+            if not is_ros_own(key)
+            and (_last(node) != GRAPH_NAME or key.startswith('slam.'))}
+
+
+def _full_name(node: str, names: Sequence[str]) -> str:
+    """Give the full name that a file, by the names in it, has for a node; DjetError if several."""
+    if node.startswith('/') or f'/{node}' in names:
+        return f'/{node.strip("/")}'
+    found = {name for name in names if _last(name) == node and '*' not in name}
+    if len(found) > 1:
+        raise DjetError(f'it is for {" and ".join(sorted(found))}, and one of them is meant; '
+                        'give a file for that one')
+    return found.pop() if found else f'/{node}'
 
 
 def why_unused(path: Path, node: str) -> str:
@@ -73,32 +88,40 @@ def why_unused(path: Path, node: str) -> str:
 
     node: its full name, such as '/left/vo_node'. DjetError where the file can't be read.
     """
-    names = list(_addressees(read_yaml(path)))
-    if any(re.fullmatch(_pattern(name), node) for name in names):
-        return ''
-    return (f"{path} is for {', '.join(names) or 'no node'}, and nothing is taken from it: this "
-            f"node is {node}; '/**' is for all")
+    names = [name for name, _ in _addressed(read_yaml(path))]
+    return '' if any(_is_for(name, node) for name in names) else (
+        f'{path}: {_for_others(names, [node])}')
+
+
+def _for_others(names: Iterable[str], nodes: Sequence[str]) -> str:
+    return (f'it is for {", ".join(names) or "no node"}, and nothing is taken from it: this is '
+            f"{' and '.join(nodes)}; '/**' is for all")
 
 
 # Namespaces in one another, deeper than anybody's.
 _DEPTH = 20
 
 
-def _addressees(content: Any, above: str = '', depth: int = 0) -> Iterator[str]:
-    """Give the names, perhaps with wildcards, of the nodes that ROS takes a file to be for."""
+def _addressed(content: Any, above: str = '', depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Give names of nodes, perhaps with wildcards, and the parameters that a file has for them."""
     if not isinstance(content, dict) or depth > _DEPTH:
         return
     for key, value in content.items():
         if key == 'ros__parameters':
-            yield above
+            yield above, value
         else:
-            yield from _addressees(value, f'{above}/{str(key).strip("/")}', depth + 1)
+            yield from _addressed(value, f'{above}/{str(key).strip("/")}', depth + 1)
 
 
-def _pattern(name: str) -> str:
-    """Give the regular expression for what ROS means by the name of a node with wildcards."""
+def _is_for(name: str, node: str) -> bool:
+    """Tell whether ROS takes a name, perhaps with wildcards, for that of a node."""
     wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
-    return ''.join(wildcards.get(part, f'/{re.escape(part)}') for part in name.split('/')[1:])
+    pattern = ''.join(wildcards.get(part, f'/{re.escape(part)}') for part in name.split('/')[1:])
+    return re.fullmatch(pattern, node) is not None
+
+
+def _last(name: str) -> str:
+    return name.rpartition('/')[2]
 
 
 def is_ros_own(name: str) -> bool:
