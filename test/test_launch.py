@@ -12,6 +12,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 from time import monotonic, sleep
 from typing import Any
 
@@ -30,7 +31,7 @@ ARGUMENTS = {
     'vo.launch.py': {'image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
                      'log_level', 'respawn', 'use_sim_time', 'rviz'},
     'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'base_frame',
-                       'namespace', 'log_level', 'respawn', 'use_sim_time'},
+                       'namespace', 'log_level', 'respawn', 'publish_tf', 'use_sim_time'},
     'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'base_frame', 'rviz'},
 }
 
@@ -156,6 +157,27 @@ def launched(environment: dict[str, str], log: Path, *words: str, until: str,
     return log.read_text()
 
 
+def parameters_of_launched(environment: dict[str, str], folder: Path, *words: str
+                           ) -> tuple[bool, bool]:
+    """Give use_sim_time and ros.publish_tf of the odometry that a launch file starts."""
+    node = folder / 'lib' / 'djet_ros' / 'vo_node'
+    node.write_text(f'#!/bin/sh\nexec {shlex.join([sys.executable, "-c", TELL])} "$@"\n')
+    said = launched(environment, folder / 'out', *words, until='TOLD')
+    clock, tf = re.findall(r'TOLD (\w+) (\w+)', said)[0]
+    return clock == 'True', tf == 'True'
+
+
+# What a node gets, by rclpy alone: the launch is under test.
+TELL = """
+import rclpy
+rclpy.init()
+node = rclpy.create_node('vo_node', automatically_declare_parameters_from_overrides=True)
+tf = node.has_parameter('ros.publish_tf') and node.get_parameter('ros.publish_tf').value
+print('TOLD', node.get_parameter('use_sim_time').value, tf, flush=True)
+rclpy.spin(node)
+"""
+
+
 @pytest.mark.ros
 def test_vo_launch_starts_the_node_on_the_topics_given(
         environment: dict[str, str], tmp_path: Path) -> None:
@@ -185,6 +207,59 @@ def test_a_file_of_parameters_that_is_not_there_ends_the_launch(
     said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
                     until='params_file')
     assert 'params_file:=/no/such.yaml is no file' in said
+    assert 'process started' not in said
+
+
+OUTER = """\
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_ros.actions import SetParameter
+def generate_launch_description():
+    return LaunchDescription([SetParameter('use_sim_time', True), IncludeLaunchDescription(
+        PythonLaunchDescriptionSource({!r}))])
+"""
+
+OWN = '/**: {ros__parameters: {use_sim_time: true, ros: {publish_tf: true}}}'
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('file', 'given', 'clock', 'tf'), [
+    ('vo.launch.py', (), True, True),
+    ('vo.launch.py', ('use_sim_time:=false',), False, True),
+    ('slam.launch.py', (), True, True),
+    ('slam.launch.py', ('publish_tf:=false',), True, False)])
+def test_what_a_file_of_parameters_says_holds_unless_the_launch_is_told_otherwise(
+        environment: dict[str, str], tmp_path: Path, file: str, given: tuple[str, ...],
+        clock: bool, tf: bool) -> None:
+    own = tmp_path / 'own.yaml'
+    own.write_text(OWN)
+    assert parameters_of_launched(environment, tmp_path, file, f'params_file:={own}', *given) == (
+        clock, tf)
+
+
+@pytest.mark.ros
+def test_a_slam_has_the_odometry_on_tf_as_it_stands(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    assert parameters_of_launched(environment, tmp_path, 'slam.launch.py') == (False, True)
+
+
+@pytest.mark.ros
+def test_an_outer_launch_file_can_set_the_clock_of_all(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    inner = tmp_path / 'share' / 'djet_ros' / 'launch' / 'vo.launch.py'
+    inner.with_name('outer.launch.py').write_text(OUTER.format(str(inner)))
+    assert parameters_of_launched(environment, tmp_path, 'outer.launch.py') == (True, False)
+
+
+@pytest.mark.ros
+def test_an_rviz_that_is_not_there_is_said_in_a_line_and_nothing_is_started(
+        environment: dict[str, str], tmp_path: Path) -> None:
+    from ament_index_python.packages import get_packages_with_prefixes
+    if 'rviz2' in get_packages_with_prefixes():
+        pytest.skip('rviz2 is installed')
+    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'rviz:=true', until='rviz2')
+    assert 'rviz:=true needs rviz2, which is not installed: apt install ros-$ROS_DISTRO-rv' in said
     assert 'process started' not in said
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from djet_ros.errors import DjetError
 from launch import LaunchContext
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
 from launch.substitution import Substitution
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -37,8 +39,10 @@ _ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     'log_level': ('from which level on the nodes log', {
         'default_value': 'info', 'choices': ['debug', 'info', 'warn', 'error', 'fatal']}),
     'respawn': ('start a node again that has ended by an error', _TRUTH),
-    'use_sim_time': ('take the time from /clock', _TRUTH),
-    'rviz': ('show it in RViz, for the names as they stand', _TRUTH),
+    'publish_tf': ("whether the odometry's pose goes to tf, whatever params_file says", _TRUTH),
+    'use_sim_time': ('take the time from /clock; empty: as the parameters or an outer launch file '
+                     'say', {'choices': ['true', 'false', ''], 'default_value': ''}),
+    'rviz': ('show it in RViz (package rviz2), for the names as they stand', _TRUTH),
 }
 
 
@@ -49,9 +53,30 @@ def arguments(*names: str, **defaults: str | Substitution) -> list[DeclareLaunch
             for name in names for text, more in [_ARGUMENTS[name]]]
 
 
-def sim_time() -> dict[str, ParameterValue]:
-    """Give the parameter use_sim_time as it was asked for."""
-    return {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+def truth(argument: str) -> ParameterValue:
+    """Give the value of an argument that is true or false as a parameter."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=bool)
+
+
+def _sim_time(context: LaunchContext) -> dict[str, ParameterValue]:
+    """Give the parameter use_sim_time where it was asked for, as files may say it too."""
+    given = LaunchConfiguration('use_sim_time').perform(context)
+    return {'use_sim_time': truth('use_sim_time')} if given else {}
+
+
+def rviz() -> OpaqueFunction:
+    """Describe RViz, which the odometry itself does not need."""
+    def describe(context: LaunchContext) -> list[Node]:
+        try:
+            get_package_prefix('rviz2')
+        except PackageNotFoundError:
+            raise DjetError('rviz:=true needs rviz2, which is not installed: '
+                            'apt install ros-$ROS_DISTRO-rviz2') from None
+        return [Node(package='rviz2', executable='rviz2', name='rviz_of_vo',
+                     parameters=[_sim_time(context)],
+                     arguments=['-d', PathJoinSubstitution([CONFIG, 'vo.rviz'])])]
+
+    return OpaqueFunction(function=describe, condition=IfCondition(LaunchConfiguration('rviz')))
 
 
 def node(executable: str, name: str | Substitution, *files: str, **parameters: Any
@@ -67,6 +92,7 @@ def node(executable: str, name: str | Substitution, *files: str, **parameters: A
             if not (path := Path(LaunchConfiguration(file).perform(context))).is_file():
                 raise DjetError(f'{file}:={path} is no file')
         values = {key.replace('__', '.'): value for key, value in parameters.items()}
+        values.update(_sim_time(context))
         # An empty one would take away what a file says.
         if base_frame := LaunchConfiguration('base_frame').perform(context):
             values['odometry.base_frame'] = base_frame
@@ -75,8 +101,7 @@ def node(executable: str, name: str | Substitution, *files: str, **parameters: A
             namespace=LaunchConfiguration('namespace'), respawn=LaunchConfiguration('respawn'),
             respawn_delay=2.0,
             remappings=[(topic, LaunchConfiguration(topic)) for topic in ('image', 'camera_info')],
-            parameters=[*(ParameterFile(LaunchConfiguration(file)) for file in files), values,
-                        sim_time()],
+            parameters=[*(ParameterFile(LaunchConfiguration(file)) for file in files), values],
             ros_arguments=['--log-level', LaunchConfiguration('log_level')])]
 
     return OpaqueFunction(function=describe)
