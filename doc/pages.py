@@ -16,6 +16,8 @@ import textwrap
 from typing import Any
 
 from djet_ros.lab.methods import TITLES
+from djet_ros.live.parameters import FIXED, SHARED
+from djet_ros.odometry.images import ENCODINGS
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -120,6 +122,27 @@ def short_dependencies(_: Any) -> str:
     return table(('package', 'what for'), (
         (f'`{one["name"]}`' + (f' (`{one["extra"]}`)' if 'extra' in one else ''),
          one.get('short', one['reason'])) for one in data('dependencies')))
+
+
+def complaints(_: Any) -> str:
+    return table(('summary has', 'level', 'seen'), (
+        (f'`{one["name"]}`', one['level'], one['seen']) for one in data('complaints')))
+
+
+def fixed(_: Any) -> str:
+    return named(FIXED)
+
+
+def shared(_: Any) -> str:
+    return named(['estimator.*', *SHARED])
+
+
+def encodings(_: Any) -> str:
+    return named(ENCODINGS)
+
+
+def named(names: Iterable[str]) -> str:
+    return paragraph(', '.join(f'`{name}`' for name in names) + '.')
 
 
 def rooms(_: Any) -> str:
@@ -364,7 +387,8 @@ def number(value: float | None, digits: int = 3) -> str:
 
 BLOCKS: dict[str, Callable[[Any], str]] = {
     'summary': summary, 'short dependencies': short_dependencies, 'dependencies': dependencies,
-    'rooms': rooms, 'reports': reports, 'promises': promises, 'hard images': hard_images,
+    'rooms': rooms, 'complaints': complaints, 'fixed parameters': fixed,
+    'shared parameters': shared, 'encodings': encodings, 'reports': reports, 'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
     'measured with': measured_with, 'compared': compared,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),

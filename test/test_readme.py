@@ -64,6 +64,28 @@ def test_a_figure_that_was_typed_would_be_seen_and_mended(tmp_path):
     assert readme.read_text() == whole
 
 
+def complaints_of_the_code() -> set[tuple[str, str]]:
+    """Give what the diagnostics complain of, each with its level, a word standing for a blank."""
+    found = set()
+    for path in (ROOT / 'djet_ros').rglob('*.py'):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'Complaint':
+                name, level = call.args[:2]
+                parts = name.values if isinstance(name, ast.JoinedStr) else [name]
+                found.add((''.join(re.escape(one.value) if isinstance(one, ast.Constant)
+                                   else r'\w+' for one in parts), level.value))
+    return found
+
+
+def test_the_table_of_complaints_has_those_of_the_code_and_no_others():
+    listed = {(one['name'], one['level']) for one in data('complaints')}
+    code = complaints_of_the_code()
+    fits = {(name, level): [one for one in code if one[1] == level and re.fullmatch(one[0], name)]
+            for name, level in listed}
+    assert all(len(found) == 1 for found in fits.values())
+    assert {one for found in fits.values() for one in found} == code
+
+
 def test_every_promise_and_every_answer_names_tests_that_exist():
     promises = data('promises')
     assert promises and all(one['tests'] for one in promises)

@@ -38,8 +38,8 @@ class LiveSlam:
     """
     Closes loops while the odometry goes on.
 
-    config: slam, and what it shares with the odometry (estimator, odometry.frame_convention,
-    odometry.camera_frame, odometry.base_frame, odometry.rectified, odometry.scale_uncertainty);
+    config: slam, estimator, and what else it shares with the odometry (listed as SHARED in
+    live/parameters.py);
     still_mask is what odometry.mask_file leaves out of all images, (H, W) bool;
     message_type gives the class for a type name; image_topic is the resolved name of the images'
     topic, by which odometry.rectified 'auto' goes; node is the name by which the diagnostics are
