@@ -388,7 +388,8 @@ def number(value: float | None, digits: int = 3) -> str:
 BLOCKS: dict[str, Callable[[Any], str]] = {
     'summary': summary, 'short dependencies': short_dependencies, 'dependencies': dependencies,
     'rooms': rooms, 'complaints': complaints, 'fixed parameters': fixed,
-    'shared parameters': shared, 'encodings': encodings, 'reports': reports, 'promises': promises, 'hard images': hard_images,
+    'shared parameters': shared, 'encodings': encodings, 'reports': reports,
+    'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
     'measured with': measured_with, 'compared': compared,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),

@@ -8,7 +8,8 @@ def generate_launch_description():
     """Describe both nodes; together they publish map -> odom -> camera or base_frame."""
     return LaunchDescription([
         *arguments('image', 'camera_info', 'params_file', 'slam_params_file', 'base_frame',
-                   'namespace', 'log_level', 'respawn', 'publish_tf', 'use_sim_time', publish_tf='true'),
+                   'namespace', 'log_level', 'respawn', 'publish_tf', 'use_sim_time',
+                   publish_tf='true'),
         node('vo_node', 'vo_node', 'params_file', ros__publish_tf=truth('publish_tf')),
         node('pose_graph_node', 'pose_graph_node', 'params_file', 'slam_params_file'),
     ])

@@ -291,7 +291,8 @@ def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_m
     with pytest.raises(DjetError, match='it is for /left/vo_node and /right/vo_node, and one of '
                                         'them is meant; give a file for that one'):
         load_yaml(path)
-    path.write_text(path.read_text().rstrip() + "\n        vo_node: {ros__parameters: {preset: fast}}")
+    path.write_text(f'{path.read_text().rstrip()}\n'
+                    '        vo_node: {ros__parameters: {preset: fast}}')
     assert gap(path) == 1.5
     assert load_yaml(path).preset == 'fast'
 

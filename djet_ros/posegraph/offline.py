@@ -13,6 +13,7 @@ from djet_ros.posegraph.backend import OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeFile
 from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
 from djet_ros.posegraph.pose_graph import PoseGraph
+from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import graph_of, scale_of, Step
 from djet_ros.posegraph.units import in_unit
 from djet_ros.recordings.recording import Recording
