@@ -9,7 +9,6 @@ from djet_ros.core.geometry import (
     fit_rotation,
     fundamental,
     growth,
-    homogeneous,
     in_front,
     inverses,
     line_distances,
@@ -195,7 +194,3 @@ def test_angles_between_poses_are_exact_even_where_an_arc_cosine_is_blind(angle)
 
 def test_opposite_directions_are_half_a_turn_apart():
     assert direction_angle(np.array([0, 0, 1.0]), np.array([0, 0, -2.0])) == pytest.approx(np.pi)
-
-
-def test_homogeneous_points_end_in_one():
-    assert np.array_equal(homogeneous(np.array([[2.0, 3.0]])), [[2, 3, 1]])

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-from djet_ros.core.basins import Ahead, TUNING as BASIN_TUNING
+from djet_ros.core.basins import Ahead, BASIN_TUNING
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb

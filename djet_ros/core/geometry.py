@@ -71,11 +71,6 @@ def sphere_tangents(t: Array) -> Array:
                      [-sign * x, -y]]).transpose(*range(2, t.ndim + 1), 0, 1)
 
 
-def homogeneous(points: Array) -> Array:
-    """Append a one: (N, 2) -> (N, 3)."""
-    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
-
-
 def inverse_of(K: Array) -> Array:
     """Inverse (3, 3) of a camera matrix (3, 3): each is asked for some fifty times a frame."""
     return _inverse(np.asarray(K, float).tobytes())
