@@ -16,6 +16,7 @@ from covariances import check_messages
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
+from djet_ros.core.features import detect_orb
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.lab.scenes.catalogue import make_scene
@@ -30,6 +31,7 @@ Gray = NDArray[np.uint8]
 BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 SIZE = (620, 188)
+SMALL = (64, 48)
 FRAMES = 7
 PERIOD_NS = 10**8
 
@@ -145,7 +147,8 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     'no feature (one gray)': lambda: same(flat(128)),
     'one feature': lambda: same(one_feature()),
     'noise, another one in each frame': lambda: told(map(noise, range(5))),
-    '64×48 pixels': lambda: same(noise(1, (64, 48))),
+    '64×48 pixels, standing still': lambda: (
+        outcome for seed in range(5) for outcome in same(noise(seed, SMALL))),
     '4096×3072 pixels, standing still': large,
     'standstill': partial(drive, 'standstill'),
     'pure rotation': partial(drive, 'rotation'),
@@ -177,6 +180,15 @@ def test_hard_images_have_the_stated_outcome(kind):
         assert np.median(errors[:, 0]) < expected.rotation
     if expected.direction is not None:
         assert np.median(errors[:, 1]) < expected.direction
+
+
+def test_few_corners_fit_into_a_small_image_and_less_of_it_is_rim_than_orb_leaves_out():
+    estimator = TwoViewEstimator()
+    for seed in range(5):
+        found = estimator.features(noise(seed, SMALL)).points
+        assert 0 < len(found) < 3 * estimator.config.min_matches
+        assert not len(detect_orb(noise(seed, SMALL), 1000))
+        assert min(found.min(), (np.subtract(SMALL, 1) - found).min()) < 16
 
 
 @pytest.mark.parametrize('size', [(1, 1), (17, 900), (26, 26)])

@@ -425,6 +425,17 @@ def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
     assert 0.8 * took < sum(stages.values()) < took
 
 
+def test_the_time_of_a_second_attempt_is_added_to_that_of_the_first(pair):
+    previous, current, _ = pair
+    matches = TwoViewEstimator().match(previous, current)
+    first = {'matching': 1.0, 'starts': 5.0, 'jet': 7.0, 'result': 2.0}
+    stages = TwoViewEstimator().estimate_pair(
+        Pair(previous, current, matches.x, matches.y, timings=first.copy())).timings
+    assert stages['matching'] == first['matching']
+    for stage in ('starts', 'jet', 'result'):
+        assert first[stage] < stages[stage] < first[stage] + 1.0
+
+
 def test_the_result_tells_the_hamming_distances_at_the_final_places(pair):
     previous, current, _ = pair
     result = TwoViewEstimator().estimate(previous, current)

@@ -9,8 +9,8 @@ from djet_ros.core.geometry import (
     fit_rotation,
     fundamental,
     growth,
-    homogeneous,
     in_front,
+    inverse_depths,
     inverses,
     line_distances,
     patch_warp,
@@ -197,5 +197,23 @@ def test_opposite_directions_are_half_a_turn_apart():
     assert direction_angle(np.array([0, 0, 1.0]), np.array([0, 0, -2.0])) == pytest.approx(np.pi)
 
 
-def test_homogeneous_points_end_in_one():
-    assert np.array_equal(homogeneous(np.array([[2.0, 3.0]])), [[2, 3, 1]])
+@pytest.mark.parametrize('t', [[0, 0, -1.0], [0, 0, 1.0], [1.0, 0, 0], [0.3, -0.2, -0.9]],
+                         ids=['forwards', 'backwards', 'sideways', 'aslant'])
+@pytest.mark.parametrize('turn', [[0.0, 0, 0], [0.05, -0.1, 0.08]], ids=['straight', 'turning'])
+@pytest.mark.parametrize('rho', [0.1, 0.3, 0.5, 0.8])
+def test_inverse_depths_scatter_as_they_say_however_near_they_come(t, turn, rho):
+    rng, noise, count = np.random.default_rng(11), 1e-5, 20_000
+    R, t = rotation_exp(np.array(turn)), unit(np.array(t))
+    for x in ([0.4, 0.2, 1], [-0.1, 0.5, 1], [0.8, -0.6, 1]):
+        there = R @ x + rho * t
+        y = np.repeat([there / there[2]], count, axis=0)
+        y[:, :2] += noise * rng.normal(size=(count, 2))
+        found, sigma = inverse_depths(R, t, np.repeat([x], count, axis=0), y)
+        assert found.mean() == pytest.approx(rho, abs=0.05 * found.std())
+        assert sigma * noise == pytest.approx(found.std(), rel=0.03)
+
+
+def test_of_points_on_the_epipole_nobody_knows_the_depth():
+    x = np.array([[0.0, 0, 1]])
+    _, sigma = inverse_depths(np.eye(3), np.array([0.0, 0, -1]), x, x)
+    assert sigma[0] > 1e5

@@ -173,7 +173,6 @@ def test_what_is_masked_is_no_ground_and_the_rest_tells(floor):
                                for gray, one in zip((before, after), masked)), motion)
         if all(masked):
             assert abs(seen.value[0] - 0.8 / HEIGHT) < 3 * np.sqrt(seen.covariance[0, 0])
-            assert seen.correlation > 0.8
     assert ground.motion(view(before), view(after), motion) is None
 
 

@@ -211,10 +211,9 @@ def test_minimising_never_ends_above_the_cost_of_the_start(name, kind):
         start = epipolar_residuals(problem, R, t)
         cost = (start.sign * loss(start.r**2)[0]).sum()
         found = minimise(problem, R, t, loss)
-        assert found.cost <= cost
-        # and the solution says the truth about itself
         there = epipolar_residuals(problem, found.R, found.t)
-        assert found.cost == pytest.approx((there.sign * loss(there.r**2)[0]).sum())
+        assert (there.sign * loss(there.r**2)[0]).sum() <= cost
+        # and the solution says the truth about itself
         assert np.allclose(found.residuals.r, there.r)
 
 
@@ -310,7 +309,7 @@ def ellipses(rng, places, sigma):
 
 def at(problem, R, t):
     """Take a pose as the solution of a problem."""
-    return Solution(R, t, 0.0, epipolar_residuals(problem, R, t))
+    return Solution(R, t, epipolar_residuals(problem, R, t))
 
 
 def test_two_measurements_of_a_place_are_joined_as_gaussians_are():

@@ -11,8 +11,15 @@ from djet_ros.cli.main import main
 from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.core.covariance import LARGE_CELLS, SHIFT
 from djet_ros.core.geometry import rotation_exp, unit
-from djet_ros.core.lens import by_radius, fit_lens, LensFit, linearise, MatchedPair
-from djet_ros.core.types import Array, Pose
+from djet_ros.core.lens import (
+    by_radius,
+    fit_lens,
+    LensFit,
+    linearise,
+    MatchedPair,
+    MOST_MATCHES,
+)
+from djet_ros.core.types import Array, Pose, RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab import lens
 from djet_ros.lab.scenes.sequence import render_sequence
@@ -68,6 +75,14 @@ def fitted(pairs: Sequence[MatchedPair]) -> LensFit:
 
 
 TURNS = np.linspace(0.02, 0.06, 20)
+
+
+@pytest.mark.parametrize(('matches', 'kept'), [(0, 0), (7, 7), (300, 300), (301, 151)])
+def test_of_a_pair_so_many_matches_are_kept_at_most(matches: int, kept: int) -> None:
+    places = np.random.default_rng(1).uniform((0, 0), SIZE, (matches, 2))
+    seen = RelativePose(Status.OK, x=places, placed=places, voting=np.ones(matches, bool))
+    pair = MatchedPair.of(seen, K)
+    assert len(pair.x) == len(pair.y) == kept <= MOST_MATCHES
 
 
 @pytest.mark.parametrize('k1', [0.0, 0.015, -0.02, 0.05])

@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 from djet_ros.cli.main import main
+from djet_ros.core.matching import RIGID
 import pytest
 from test_layers import ORDER
 import yaml
@@ -160,6 +161,11 @@ def test_the_rooms_that_the_design_page_lists_are_the_folders_in_their_order():
     folders = {path.parent.name for path in ROOT.glob('djet_ros/*/__init__.py')}
     assert set().union(*listed) == folders
     assert listed == [set(rooms) & folders for rooms in reversed(ORDER) if set(rooms) & folders]
+
+
+def test_the_design_page_says_how_many_matches_have_to_agree_where_they_were_foreseen():
+    assert f'no more than {RIGID * 100:.0f} % of its matches agree' in (
+        DOC / 'design.md').read_text()
 
 
 def test_no_host_of_a_package_registry_is_named():

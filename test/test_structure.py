@@ -8,7 +8,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose, Status, TRACKED
-from djet_ros.core.window import _around_patches, _PATCH, TUNING, Window
+from djet_ros.core.window import _around_patches, _PATCH, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Scale, scale_source, SpeedScale, Unmeasured
@@ -70,7 +70,8 @@ def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
     # Half of the landmarks are out of sight, for long enough that a window of keyframes would have
     # gone by, were each frame one.
     still = drive.go([pose(yaw=turn) for turn in (
-        *[0.06] * 6, *[0.015 * (-1)**i for i in range(2 * TUNING.keyframes)], *[-0.06] * 5)])
+        *[0.06] * 6, *[0.015 * (-1)**i for i in range(2 * WINDOW_TUNING.keyframes)],
+        *[-0.06] * 5)])
     assert all(result.status is Status.NO_PARALLAX for result in still)
     assert not any(result.stationary or result.keyframe for result in still)
     after = drive.go(steps(WAYS[4:8]))
@@ -312,7 +313,7 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     pair = estimator.estimate(*views)
     factors = np.exp(rng.normal(0, 0.5, len(pair.x)))
     wrong = replace(pair, y_opt=pair.x + factors[:, None] * (pair.y_opt - pair.x))
-    window = Window(ESTIMATOR, replace(TUNING, landmarks=40))
+    window = Window(ESTIMATOR, replace(WINDOW_TUNING, landmarks=40))
     window.start(views[0])
     window._append(views[1], wrong, 1.0)
     window._found(wrong, 1.0)

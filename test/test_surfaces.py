@@ -132,6 +132,19 @@ def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(
             assert np.allclose(getattr(asked, name), getattr(fresh, name), 1e-9), name
 
 
+@pytest.mark.parametrize('warp', [np.diag([1.1, 0.95, 0])[:, :2], np.eye(3, 2)],
+                         ids=['stretched', 'as it is'])
+@pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
+def test_a_surface_forgets_how_it_was_seen_before_where_nobody_knows_how_it_is_seen(
+        pair, kind, warp):
+    x = np.random.default_rng(37).uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
+    asked, new = (kind(*pair, x, EstimatorConfig()) for _ in range(2))
+    asked.around(x, np.repeat(warp[None], len(x), axis=0))
+    again, first = asked.around(x), new.around(x)
+    for name in ('centres', 'A', 'b', 'c', 'usable'):
+        assert np.array_equal(getattr(again, name), getattr(first, name)), name
+
+
 WARPS = {'smaller': 0.85 * np.eye(2), 'larger': 1.2 * np.eye(2),
          'turned': Rotation.from_euler('z', 8, degrees=True).as_matrix()[:2, :2],
          'seen aslant': np.array([[1.15, 0.05], [0.0, 0.95]])}

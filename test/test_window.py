@@ -8,7 +8,7 @@ from typing import Any
 from djet_ros.core.bundle import in_frame, projected
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.core.window import TUNING, Window
+from djet_ros.core.window import Window, WINDOW_TUNING
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -115,7 +115,7 @@ def test_the_window_tells_the_noise_of_its_observations_and_keeps_the_right_ones
     # Beyond 4 standard deviations in two numbers lie 3 of 10 000, and some leave with the sign of
     # their depth.
     assert window.thrown < 0.015 * window.taken
-    assert window.taken > 30 * TUNING.landmarks
+    assert window.taken > 30 * WINDOW_TUNING.landmarks
 
 
 def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
@@ -123,7 +123,7 @@ def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
     for _ in range(30):
         window.go()
         chosen.append(window.is_keyframe)
-        held = min(sum(chosen[:-1]), TUNING.keyframes) + 1
+        held = min(sum(chosen[:-1]), WINDOW_TUNING.keyframes) + 1
         assert len(window._views) == held
     assert 5 < sum(chosen) < 25
 

@@ -72,7 +72,7 @@ class BasinTuning:
     clear: float = 5.0
 
 
-TUNING = BasinTuning()
+BASIN_TUNING = BasinTuning()
 
 
 @dataclass(frozen=True)
@@ -112,28 +112,30 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     do not; turn: a rotation that was measured, which all of them have to have; sought: whether
     basins were looked for in all directions already, and are among the starts.
     """
-    some = problem.subset(thinned(len(problem.blur), TUNING.matches_to_sketch))
+    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_to_sketch))
     scale = max(refine_all(some, starts, Loss(), 0).scales().min(), LEAST_SCALE)
-    tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+    tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
     if turn is not None:
         # Whatever moves as most matches do tells their noise, and what fits the turn fits it well.
-        scale = max(refine_all(some, starts, tight, TUNING.steps_to_sketch).scales().min(),
+        scale = max(refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch).scales().min(),
                     LEAST_SCALE)
-        tight = replace(tight, scale=min(config.loss_scale, TUNING.tight) * scale)
-        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_compare,
-                                             _held(turn, scale)), tight, TUNING.turned_starts)
-    elif len(problem.blur) > TUNING.few_matches:
-        starts = [*starts, *all_round(starts[0].R, 0 if sought else TUNING.directions_of_many)]
-        starts = _promising(some, refine_all(some, starts, tight, TUNING.steps_to_sketch), tight,
-                            TUNING.refined_starts)
+        tight = replace(tight, scale=min(config.loss_scale, BASIN_TUNING.tight) * scale)
+        starts = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare,
+                                             _held(turn, scale)), tight,
+                            BASIN_TUNING.turned_starts)
+    elif len(problem.blur) > BASIN_TUNING.few_matches:
+        more = 0 if sought else BASIN_TUNING.directions_of_many
+        starts = [*starts, *all_round(starts[0].R, more)]
+        starts = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch),
+                            tight, BASIN_TUNING.refined_starts)
     else:
-        starts = [*starts, *all_round(starts[0].R, TUNING.directions)]
-    refined = refine_all(problem, starts, tight, TUNING.steps_to_compare)
+        starts = [*starts, *all_round(starts[0].R, BASIN_TUNING.directions)]
+    refined = refine_all(problem, starts, tight, BASIN_TUNING.steps_to_compare)
     possible, others_move = np.ones(len(refined), bool), False
     if turn is not None and (turned_so := _turned_so(turn, refined)).any():
         others_move = not turned_so[costs_in_front(problem, refined, tight).argmin()]
         possible = turned_so
-    basins = _promising(problem, refined, tight, TUNING.refined_starts, possible)
+    basins = _promising(problem, refined, tight, BASIN_TUNING.refined_starts, possible)
     best = basins.pop(_likeliest(losses_at(problem, basins, tight), places, basins, prior))
     # All matches are placed equally well, whatever they move with.
     residuals = epipolar_residuals(problem, best.R, best.t)
@@ -150,20 +152,20 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     are led on, for some may have been on the way to one and the same; where that does not help,
     they are held against others. Where a turn alone explains the matches, none of that matters.
     """
-    some = problem.subset(thinned(len(problem.blur), TUNING.matches_ahead))
+    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_ahead))
     tight = Loss()
-    basins = around(ahead.pose, TUNING.directions)
-    for steps in (0, *TUNING.steps_ahead):
+    basins = around(ahead.pose, BASIN_TUNING.directions)
+    for steps in (0, *BASIN_TUNING.steps_ahead):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), LEAST_SCALE)
-        tight = Loss(config.loss, min(config.loss_scale, TUNING.tight) * scale)
+        tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
         if steps:
-            basins = _promising(some, found, tight, TUNING.refined_starts)
+            basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
     if (_is_clear(problem, places, basins, tight)
             or _mere_turn(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
-    basins = _promising(some, refine_all(some, basins, tight, TUNING.steps_to_compare), tight,
-                        TUNING.refined_starts)
+    basins = _promising(some, refine_all(some, basins, tight, BASIN_TUNING.steps_to_compare),
+                        tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
     before = ahead.pose if ahead.pose.t.any() else None
@@ -174,7 +176,7 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
 def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:
     """Tell whether matches clearly prefer the first of some basins to the others."""
     preferred = preferences(losses_at(problem, basins, loss), places, 0)
-    return bool((preferred[1:] >= TUNING.clear).all())
+    return bool((preferred[1:] >= BASIN_TUNING.clear).all())
 
 
 def _mere_turn(problem: JetProblem, parallax: float) -> bool:
@@ -206,7 +208,7 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
     preferred = preferences(losses, places, best)
     return solution, tuple(
         Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
-        if apart(poses[best], pose) > TUNING.same_basin)
+        if apart(poses[best], pose) > BASIN_TUNING.same_basin)
 
 
 def _likeliest(losses: Array, places: Array, poses: list[Pose], prior: Pose | None) -> int:
@@ -230,8 +232,8 @@ def _turned_so(turn: Turn, sketch: Sketch) -> NDArray[np.bool_]:
     direction that makes up for the difference; left to itself it turns away.
     """
     off = turn.off(sketch.R)
-    allowed = turn.covariance + TUNING.turn_fits**2 * np.eye(3)
-    return np.asarray((off * np.linalg.solve(allowed, off.T).T).sum(1) < TUNING.agreeing**2)
+    allowed = turn.covariance + BASIN_TUNING.turn_fits**2 * np.eye(3)
+    return np.asarray((off * np.linalg.solve(allowed, off.T).T).sum(1) < BASIN_TUNING.agreeing**2)
 
 
 def _held(turn: Turn | None, scale: float) -> Held | None:
@@ -243,8 +245,8 @@ def _held(turn: Turn | None, scale: float) -> Held | None:
     """
     if turn is None:
         return None
-    variance = turn.covariance + TUNING.turn_slack**2 * np.eye(3)
-    return Held(turn.R, np.asarray(TUNING.turn_weight * scale**2 * np.linalg.inv(variance)))
+    variance = turn.covariance + BASIN_TUNING.turn_slack**2 * np.eye(3)
+    return Held(turn.R, np.asarray(BASIN_TUNING.turn_weight * scale**2 * np.linalg.inv(variance)))
 
 
 def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
@@ -256,7 +258,7 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
     off = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T)
     for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
         if (possible is None or possible[number]) and (
-                off[number, chosen] > TUNING.same_basin**2).all():
+                off[number, chosen] > BASIN_TUNING.same_basin**2).all():
             chosen.append(number)
             if len(chosen) == most:
                 break

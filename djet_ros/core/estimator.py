@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-from djet_ros.core.basins import Ahead, TUNING as BASIN_TUNING
+from djet_ros.core.basins import Ahead, BASIN_TUNING
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
@@ -163,7 +163,8 @@ class TwoViewEstimator:
         began, jet = perf_counter(), timings.get('jet', 0.0)
         starts, surface = both(lambda: self._starts(pair), lambda: self._sampled(pair))
         # What was done beside the surfaces took no time: stages add up to all of it.
-        timings['starts'] = perf_counter() - began - (timings['jet'] - jet)
+        alone = perf_counter() - began - (timings['jet'] - jet)
+        timings['starts'] = timings.get('starts', 0.0) + alone
         return pair, starts, surface
 
     def _starts(self, pair: Pair) -> list[Pose]:

@@ -15,7 +15,8 @@ import math
 
 import cv2
 from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
-from djet_ros.core.geometry import homogeneous, rotation_exp, sphere_tangents
+from djet_ros.core.geometry import rays, rotation_exp, sphere_tangents
+from djet_ros.core.jet import robust_scale
 from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,7 @@ class GroundTuning:
     rests: float = 1e-3
 
 
-TUNING = GroundTuning()
+_TUNING = GroundTuning()
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,11 @@ class GroundMotion:
     What a pair of views says of the ground.
 
     value: (3,) length of the translation in heights of the camera, pitch of the camera (down is
-    positive) and roll against the ground in rad; covariance: (3, 3); correlation of the ground in
-    both views.
+    positive) and roll against the ground in rad; covariance: (3, 3).
     """
 
     value: Array
     covariance: Array
-    correlation: float
 
 
 class Ground:
@@ -107,43 +106,44 @@ class Ground:
         """Choose the pixels that see ground."""
         self._normal = np.array([0.0, np.cos(pitch), np.sin(pitch)])
         self._forward = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
-        self._reach = TUNING.far
+        self._reach = _TUNING.far
         # Of large images every second row and column, and so on, are more than enough.
-        every = max(math.isqrt(shape[0] * shape[1] // TUNING.candidates), 1)
-        columns, rows = np.meshgrid(np.arange(TUNING.rim, shape[1] - TUNING.rim, every),
-                                    np.arange(TUNING.rim, shape[0] - TUNING.rim, every))
+        every = max(math.isqrt(shape[0] * shape[1] // _TUNING.candidates), 1)
+        columns, rows = np.meshgrid(np.arange(_TUNING.rim, shape[1] - _TUNING.rim, every),
+                                    np.arange(_TUNING.rim, shape[0] - _TUNING.rim, every))
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-        rays = homogeneous(pixels) @ np.linalg.inv(K).T
-        seen = self._sees(rays)
+        towards = rays(K, pixels)
+        seen = self._sees(towards)
         if seen.any():
-            self._reach = max(TUNING.flat, TUNING.times * float(self._ahead(rays[seen]).min()))
-        chosen = np.flatnonzero(self._sees(rays))
-        self.is_in_view = len(chosen) >= TUNING.least_pixels
+            nearest = float(self._ahead(towards[seen]).min())
+            self._reach = max(_TUNING.flat, _TUNING.times * nearest)
+        chosen = np.flatnonzero(self._sees(towards))
+        self.is_in_view = len(chosen) >= _TUNING.least_pixels
         if not self.is_in_view:
             return
-        some = np.linspace(0, len(chosen) - 1, min(len(chosen), TUNING.pixels)).astype(np.int64)
-        self._pixels, self._rays = pixels[chosen[some]], rays[chosen[some]]
+        some = np.linspace(0, len(chosen) - 1, min(len(chosen), _TUNING.pixels)).astype(np.int64)
+        self._pixels, self._rays = pixels[chosen[some]], towards[chosen[some]]
         # Above the ground nothing is looked at, but for what the filters reach.
-        self._top = max(int(self._pixels[:, 1].min()) - TUNING.side, 0)
+        self._top = max(int(self._pixels[:, 1].min()) - _TUNING.side, 0)
         self._K = K - [[0, 0, 0], [0, 0, self._top], [0, 0, 0]]
         self._pixels[:, 1] -= self._top
         _, self._cells = np.unique((self._pixels // CELL) @ [1, 1 << 16], return_inverse=True)
 
-    def _ahead(self, rays: Array) -> Array:
+    def _ahead(self, towards: Array) -> Array:
         """Give how far ahead, in heights, rays (N, 3) meet level ground; infinite above it."""
-        inverse = rays @ self._normal
-        ahead = np.where(inverse > 1e-9, rays @ self._forward, np.inf)
+        inverse = towards @ self._normal
+        ahead = np.where(inverse > 1e-9, towards @ self._forward, np.inf)
         return np.asarray(ahead / np.maximum(inverse, 1e-9))
 
-    def _sees(self, rays: Array) -> NDArray[np.bool_]:
+    def _sees(self, towards: Array) -> NDArray[np.bool_]:
         """(N,) bool mask of the rays (N, 3) that meet level ground that is looked at."""
-        ahead = self._ahead(rays)
-        aside = np.abs(rays[:, 0]) / np.maximum(rays @ self._normal, 1e-9)
-        return np.asarray((ahead > TUNING.near) & (ahead < min(self._reach, TUNING.far))
-                          & (aside < TUNING.aside))
+        ahead = self._ahead(towards)
+        aside = np.abs(towards[:, 0]) / np.maximum(towards @ self._normal, 1e-9)
+        return np.asarray((ahead > _TUNING.near) & (ahead < min(self._reach, _TUNING.far))
+                          & (aside < _TUNING.aside))
 
     def motion(self, previous: View, current: View, relative: RelativePose,
-               lengths: tuple[float, float] = TUNING.lengths) -> GroundMotion | None:
+               lengths: tuple[float, float] = _TUNING.lengths) -> GroundMotion | None:
         """
         Find how the ground moves between two views, from the motion between them.
 
@@ -158,17 +158,17 @@ class Ground:
             return self._standing(wanted, there, relative)
         start = self._search(wanted, there, relative, lengths)
         if start is None:
-            start = self._search(wanted, there, relative, TUNING.lengths)
+            start = self._search(wanted, there, relative, _TUNING.lengths)
         return None if start is None else self._fit(wanted, there, relative, start)
 
     def _texture(self, view: View) -> Image:
         """Image whose contrast is alike everywhere, from the highest row looked at."""
         gray = cv2.GaussianBlur(view.gray[self._top:], (0, 0), 1.0).astype(np.float32)
-        detail = gray - cv2.blur(gray, (TUNING.side, TUNING.side))
+        detail = gray - cv2.blur(gray, (_TUNING.side, _TUNING.side))
         # The running sums of a filter may end a little below zero.
-        power = np.maximum(cv2.blur(detail**2, (TUNING.side, TUNING.side)), 0.0)
-        inner, rim = np.full(gray.shape, np.nan, np.float32), TUNING.side // 2
-        inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + TUNING.noise))[rim:-rim, rim:-rim]
+        power = np.maximum(cv2.blur(detail**2, (_TUNING.side, _TUNING.side)), 0.0)
+        inner, rim = np.full(gray.shape, np.nan, np.float32), _TUNING.side // 2
+        inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + _TUNING.noise))[rim:-rim, rim:-rim]
         if view.mask is not None:
             inner[view.mask[self._top:]] = np.nan
         return inner
@@ -185,25 +185,25 @@ class Ground:
         R = relative.R if turned else np.eye(3)
         correlation = _correlation(
             wanted, _sampled(there, self._seen_again(R, np.zeros(3), self._normal)))
-        if correlation < (TUNING.seen if turned else TUNING.same):
+        if correlation < (_TUNING.seen if turned else _TUNING.same):
             return None
-        least = TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
-        return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]), correlation)
+        least = _TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
+        return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]))
 
     def _search(self, wanted: Array, there: Image, relative: RelativePose,
                 lengths: tuple[float, float]) -> Array | None:
         """Plane (3,) of the length at which level ground correlates best, if one stands out."""
-        step, (least, most) = TUNING.step, TUNING.lengths
+        step, (least, most) = _TUNING.step, _TUNING.lengths
         low, high = max(lengths[0], least), min(lengths[1], most)
         tried = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
         found = np.array([_correlation(wanted, _sampled(there, self._seen_again(
             relative.R, relative.t, length * self._normal))) for length in tried])
         best = int(found.argmax())
-        if found[best] < TUNING.seen or best in (0, len(found) - 1):
+        if found[best] < _TUNING.seen or best in (0, len(found) - 1):
             return None
         # Textures that repeat have several peaks; slow ground has one, but a broad one.
-        peaks = found == maximum_filter1d(found, 2 * TUNING.neighbours + 1, mode='nearest')
-        if (peaks & (found > found[best] - TUNING.clearly)).sum() > 1:
+        peaks = found == maximum_filter1d(found, 2 * _TUNING.neighbours + 1, mode='nearest')
+        if (peaks & (found > found[best] - _TUNING.clearly)).sum() > 1:
             return None
         return np.asarray(tried[best] * self._normal)
 
@@ -220,7 +220,7 @@ class Ground:
         tangents, theta = sphere_tangents(relative.t), np.zeros(5)
         gradients = [np.asarray(cv2.Scharr(there, -1, *axis, scale=1 / 32), np.float32)
                      for axis in ((1, 0), (0, 1))]
-        for _ in range(TUNING.rounds):
+        for _ in range(_TUNING.rounds):
             R = rotation_exp(theta[:3]) @ relative.R
             t = relative.t + tangents @ theta[3:]
             places = self._seen_again(R, t, m)
@@ -228,7 +228,7 @@ class Ground:
             r = found - wanted
             J = self._jacobian([_sampled(g, places) for g in gradients], R, t, m, tangents)
             inside = np.isfinite(r) & np.isfinite(J).all(axis=1)
-            if inside.sum() < TUNING.least_pixels:
+            if inside.sum() < _TUNING.least_pixels:
                 return None
             J, r = np.where(inside[:, None], J, 0.0), np.where(inside, r, 0.0)
             hessian, gradient, spread = self._normal_equations(J, r, inside)
@@ -244,17 +244,17 @@ class Ground:
             gradient[3:] += known[3:, 3:] @ theta
             step = -np.linalg.solve(total, gradient)
             m, theta = m + step[:3], theta + step[3:]
-            if np.linalg.norm(step[:3]) < TUNING.rests * np.linalg.norm(m):
+            if np.linalg.norm(step[:3]) < _TUNING.rests * np.linalg.norm(m):
                 break
         shift = float(np.median(np.linalg.norm(
             places - self._seen_again(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
-        if correlation < TUNING.seen or shift < TUNING.least_shift or m @ self._normal <= 0 \
-                or not self._unevenness(r, J, R, t, m) <= TUNING.uneven:
+        if correlation < _TUNING.seen or shift < _TUNING.least_shift or m @ self._normal <= 0 \
+                or not self._unevenness(r, J, R, t, m) <= _TUNING.uneven:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
-        return _described(m, covariance, correlation)
+        return _described(m, covariance)
 
     def _unevenness(self, r: Array, J: Array, R: Array, t: Array, m: Array) -> float:
         """
@@ -282,7 +282,7 @@ class Ground:
     def _normal_equations(self, J: Array, r: Array,
                           inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Hessian (8, 8), gradient (8,), and the covariance (8, 8) that noise gives the latter."""
-        scale = 1.4826 * float(np.median(np.abs(r[inside]))) + 1e-6
+        scale = robust_scale(r[inside]) + 1e-6
         weights = 1 / (1 + (r / (2 * scale))**2)
         scores = np.stack([np.bincount(self._cells, column)
                            for column in (J * (weights * r)[:, None]).T])
@@ -303,7 +303,7 @@ def _sampled(image: Image, pixels: Array) -> Array:
 def _correlation(a: Array, b: Array) -> float:
     """Correlation of two samples (N,) where both are there; 0 if that is too little."""
     there = np.isfinite(a) & np.isfinite(b)
-    if there.sum() < max(TUNING.least_pixels, len(b) / 4):
+    if there.sum() < max(_TUNING.least_pixels, len(b) / 4):
         return 0.0
     a, b = a[there], b[there]
     power = float(a @ a) * float(b @ b)
@@ -316,13 +316,13 @@ def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
 
     Gives the derivative (2, 3) by the plane, and the lean (2,) itself.
     """
-    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / TUNING.lean
+    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _TUNING.lean
     length = float(np.linalg.norm(m))
     n = m / length
     return across @ (np.eye(3) - np.outer(n, n)) / length, across @ n
 
 
-def _described(m: Array, covariance: Array, correlation: float) -> GroundMotion:
+def _described(m: Array, covariance: Array) -> GroundMotion:
     """Length, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
     length = float(np.linalg.norm(m))
     x, y, z = (m / length).tolist()
@@ -331,4 +331,4 @@ def _described(m: Array, covariance: Array, correlation: float) -> GroundMotion:
                   [0.0, -z / upright**2 / length, y / upright**2 / length],
                   [upright / length, -x * y / upright / length, -x * z / upright / length]])
     return GroundMotion(np.array([length, np.arctan2(z, y), np.arctan2(x, upright)]),
-                        J @ covariance @ J.T, correlation)
+                        J @ covariance @ J.T)

@@ -35,7 +35,7 @@ _MAX_DAMPING = 1e6
 
 # chosen: by its weight alone, as if all others were right, a match makes steps too short; by the
 # bend of its loss, too long where many are false. Half way takes three steps of four.
-_LEAST_CURVED = 0.3
+LEAST_CURVED = 0.3
 
 # Robust standard deviations beyond which residuals do not belong together; chosen: rounds in which
 # these are left out.
@@ -100,11 +100,10 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Solution:
-    """A pose (R, t), its summed loss, and the residuals there."""
+    """A pose (R, t), and the residuals there."""
 
     R: Array
     t: Array
-    cost: float
     residuals: Residuals
 
     @property
@@ -317,7 +316,7 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
             damping *= 10
             if damping > _MAX_DAMPING or np.linalg.norm(step) < _STEP_TOLERANCE:
                 break
-    return Solution(R, t, cost, residuals)
+    return Solution(R, t, residuals)
 
 
 def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
@@ -369,7 +368,7 @@ def _step(residuals: Residuals, weights: Array, loss: Loss, damping: float) -> A
     A match curves as much as its robust loss does, or as a share of what its weight makes it.
     """
     J, r = residuals.jacobian, residuals.r
-    H = (J * np.maximum(loss.curvature(r * r), _LEAST_CURVED * weights)) @ J.T
+    H = (J * np.maximum(loss.curvature(r * r), LEAST_CURVED * weights)) @ J.T
     gradient = J @ (weights * residuals.sign * r)
     diagonal = H.diagonal()
     if not np.isfinite(H).all() or not diagonal.any():

@@ -27,12 +27,14 @@ from djet_ros.core.jet import (
     core_scale,
     epipolar_residuals,
     JetProblem,
+    LEAST_CURVED,
     Loss,
     minimise,
     Solution,
 )
 from djet_ros.core.paraboloid import times
-from djet_ros.core.tracking import TUNING
+from djet_ros.core.starts import thinned
+from djet_ros.core.tracking import TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 
@@ -69,9 +71,6 @@ _STEP = 1e-4
 
 # Robust standard deviations where the loss bends, as in the odometry.
 _BEND = 3.0
-
-# Of the curvature that a loss has by its weights alone; it is two thirds with normal noise.
-_LEAST_CURVED = 0.3
 
 # Pixels; matches that are off by less are exact, and must not divide by nothing.
 _LEAST_NOISE = 1e-4
@@ -120,7 +119,7 @@ class MatchedPair:
         inliers were selected with the calibration under test.
         """
         voting = np.flatnonzero(relative.voting)
-        some = voting[::-(-len(voting) // MOST_MATCHES)]
+        some = voting[thinned(len(voting), MOST_MATCHES)]
         x, y = (rays(K, points[some])[:, :2] for points in (relative.x, relative.placed))
         return cls(x, y, Pose(relative.R, relative.t))
 
@@ -239,8 +238,9 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
     left = _left_over(pair, lens, k1, solution, weights)
     squares = np.stack([left * left, left * r]) * weights
     by_own_k1 = r - left * (squares[1].sum() / max(squares[0].sum(), 1e-300))
-    # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
-    squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), _LEAST_CURVED)
+    # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6): two
+    # thirds of that with normal noise.
+    squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), LEAST_CURVED)
     moved = displacements(problem.rays_y[:2].T, lens, k1)
     share = np.sqrt((weights * left * left).sum() / max((weights * moved * moved).sum(), 1e-300))
     pulls = (weights * left / noise)[:, None] * _across(problem, solution, by_pixel)
@@ -277,7 +277,7 @@ def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Arra
     spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
     width = (spread[0] + spread[2]) / 2
     rays_x, rays_y = (np.vstack([one.T, np.ones(len(one))]) for one in (x, y))
-    return JetProblem(rays_x, rays_y, spread, TUNING.epipole_blur**2 * width**2), by_pixel
+    return JetProblem(rays_x, rays_y, spread, TRACK_TUNING.epipole_blur**2 * width**2), by_pixel
 
 
 def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:

@@ -124,8 +124,10 @@ class DescriptorSurface(_OfImages):
                                & ~at(previous.mask, x))
         self._mask = current.mask
         self._latest = no_paraboloids(len(x))
-        # How the reference of each match was seen last, and how far x is from its pixel.
+        # How the reference of each match was seen last, if through a warp, and how far x is from
+        # its pixel.
         self._warp = np.repeat(np.eye(3, 2)[None], len(x), axis=0)
+        self._is_warped = np.zeros(len(x), bool)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
         self._contrast: float | None = None
 
@@ -139,6 +141,7 @@ class DescriptorSurface(_OfImages):
         # Most matches rest from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
+        self._is_warped |= anew
         there, here, seen = (values.compress(anew, axis=0) for values in (self.x, y, warp))
         return self._kept(anew, usable, y, self._distances.between_pixels(
             self._previous.floating, there, self._current, here, seen,
@@ -149,8 +152,10 @@ class DescriptorSurface(_OfImages):
         radius = self._config.window // 2
         centres = np.rint(y - self._offset).astype(np.int64)
         usable = self._usable(centres, radius)
-        anew = usable & (centres + self._offset != self._latest.centres).any(1)
-        self._warp[anew] = np.eye(3, 2)
+        # Those seen through a warp may lie on the same place, and are of another run.
+        elsewhere = (centres + self._offset != self._latest.centres).any(1)
+        anew = usable & (elsewhere | self._is_warped)
+        self._warp[anew], self._is_warped[anew] = np.eye(3, 2), False
         pixels = np.rint(self.x).astype(np.int64)
         references = self._distances.reference(
             self._previous.tested, pixels[anew], self._contrast_around(centres, usable))
@@ -276,9 +281,9 @@ class PhotometricSurface(_OfImages):
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Second-order expansion of the intensity residual at the sub-pixel positions y."""
-        if warp is not None:
-            self._reference = self._sample(self._previous, self.x, warp)
-        difference = self._reference - self._sample(self._image, y)
+        reference = (self._reference if warp is None
+                     else self._sample(self._previous, self.x, warp))
+        difference = reference - self._sample(self._image, y)
         gx, gy = (self._sample(component, y) for component in self._gradient)
         W = self._weights
         a11, a12, a22 = (((gx * gx) @ W), ((gx * gy) @ W), ((gy * gy) @ W))

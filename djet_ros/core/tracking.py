@@ -71,7 +71,7 @@ class TrackTuning:
     inlier: float = 3.0
 
 
-TUNING = TrackTuning()
+TRACK_TUNING = TrackTuning()
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Track:
 
     def inliers(self) -> NDArray[np.bool_]:
         """(N,) bool mask of the matches that voted and agree with the pose."""
-        agree = np.abs(self.residuals.r) < TUNING.inlier * self.scale()
+        agree = np.abs(self.residuals.r) < TRACK_TUNING.inlier * self.scale()
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers
@@ -201,7 +201,7 @@ class _Algorithm:
                 return None
             # Step 2: global pose optimisation.
             found = self._optimised(paraboloids, voting, poses, ahead,
-                                    TUNING.steps_by_places if by_places else MAX_STEPS)
+                                    TRACK_TUNING.steps_by_places if by_places else MAX_STEPS)
             if number == 1:
                 self.first = found
             last = found.converged or number == most
@@ -241,7 +241,7 @@ class _Algorithm:
                    ahead: Ahead | None, steps: int) -> _Optimised:
         """Find the pose in the right basin of some."""
         config, places = self._config, self._surface.x[voting]
-        problem = jet_problem(self._K, places, paraboloids.of(voting), TUNING.epipole_blur,
+        problem = jet_problem(self._K, places, paraboloids.of(voting), TRACK_TUNING.epipole_blur,
                               config.weigh_by_fit)
         if len(poses) > 1:
             basin = right_basin(problem, places, poses, config, self._pair.before,
@@ -255,7 +255,7 @@ class _Algorithm:
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         if basin.others_move:
             # What does not fit may be most, and would tell a wrong noise.
-            self._ours[voting] = np.abs(solution.residuals.r) < TUNING.by_itself * loss.scale
+            self._ours[voting] = np.abs(solution.residuals.r) < TRACK_TUNING.by_itself * loss.scale
         return _Optimised(voting, places, problem, loss, solution, converged, basin.rivals)
 
     def _concluded(self, found: _Optimised) -> tuple[_Optimised, Array, tuple[Rival, ...]]:
@@ -333,10 +333,10 @@ def _told_apart(second: SecondMotion, prior: Pose | None, turn: Turn | None) -> 
     for one, other in orders:
         if prior is not None and goes_on(prior, both[one], both[other]):
             return one
-    if second.width < TUNING.small_body:
+    if second.width < TRACK_TUNING.small_body:
         return 0
     for one, other in orders:
-        if second.flatness[one] < TUNING.deep and second.flatness[other] > TUNING.flat:
+        if second.flatness[one] < TRACK_TUNING.deep and second.flatness[other] > TRACK_TUNING.flat:
             return one
     return None
 
@@ -381,7 +381,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     there = np.flatnonzero(plausible)
     x, y, rays_x, rays_y = (places.take(there, axis=0) for places in (x, y, rays_x, rays_y))
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
-    slopes = slopes_of_all(x, rho, TUNING.off / K[0, 0] * sigma)
+    slopes = slopes_of_all(x, rho, TRACK_TUNING.off / K[0, 0] * sigma)
     leaning = warp.take(there, axis=0) + slant_warp(K, pose.t, y, seen[there], slopes)
     alike = comparable(leaning)
     warp[there[alike]] = leaning[alike]

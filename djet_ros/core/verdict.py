@@ -16,7 +16,7 @@ from djet_ros.core.hamming import match_distances
 from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import quantile
 from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
-from djet_ros.core.tracking import Track, TUNING
+from djet_ros.core.tracking import Track, TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
 from scipy.special import ndtr
@@ -89,7 +89,7 @@ def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
     its middle with a probability of at most 4 w / (pi r).
     """
     radius = min(config.search_radius, 0.5) * max(shape)
-    chance = 4 * TUNING.inlier * track.scale() / (np.pi * radius)
+    chance = 4 * TRACK_TUNING.inlier * track.scale() / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting), chance) > 0
 
 

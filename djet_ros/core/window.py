@@ -102,7 +102,7 @@ class WindowTuning:
     few: int = 8
 
 
-TUNING = WindowTuning()
+WINDOW_TUNING = WindowTuning()
 
 # Side in pixels of a patch, by which its landmark is told: points nearer than that err alike.
 _PATCH = 26
@@ -140,7 +140,7 @@ class Window:
     settled: (M, 3) places, in the newest frame, of landmarks that it was the last to refine.
     """
 
-    def __init__(self, config: EstimatorConfig, tuning: WindowTuning = TUNING) -> None:
+    def __init__(self, config: EstimatorConfig, tuning: WindowTuning = WINDOW_TUNING) -> None:
         self._config, self._tuning = config, tuning
         self._distances = DescriptorDistances(config)
 
