@@ -47,7 +47,7 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
         covariance[:3] = covariance[:, :3] = 0.0
         reach = max(length.value, 1e-3) if length.known else UNKNOWN_LENGTH_SIGMA
         covariance[:3, :3] = np.eye(3) * reach**2
-    return _symmetric(covariance)
+    return symmetric(covariance)
 
 
 def standstill_covariance(relative: RelativePose, length: Length) -> Array:
@@ -64,7 +64,7 @@ def standstill_covariance(relative: RelativePose, length: Length) -> Array:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) * max(sigma, 1e-3)**2
     covariance[3:, 3:] = rotation
-    return _symmetric(covariance)
+    return symmetric(covariance)
 
 
 def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Array) -> Array:
@@ -75,7 +75,7 @@ def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Arra
     pose's rotation swings the motion like a lever.
     """
     lever = _lever(pose, motion)
-    return _symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
+    return symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class PathCovariance:
         root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T @ turn
         before = _PASSED_ON * _lever(pose, motion) @ self.with_pair
         both = before @ root.T
-        return replace(moved, pose=_symmetric(moved.pose + both + both.T),
+        return replace(moved, pose=symmetric(moved.pose + both + both.T),
                        with_pair=before + _ALIKE * root)
 
     def _stretched(self, pose: Array, motion: Array, common: Common) -> PathCovariance:
@@ -129,7 +129,7 @@ class PathCovariance:
         crossed = self.with_common * common.kept
         both = np.outer(crossed.sum(1), along)
         return PathCovariance(
-            _symmetric(self.pose + both + both.T
+            symmetric(self.pose + both + both.T
                        + common.variances.sum() * np.outer(along, along)),
             crossed + np.outer(along, common.variances))
 
@@ -165,5 +165,6 @@ def both_turned(R: Array) -> Array:
     return turn
 
 
-def _symmetric(covariance: Array) -> Array:
+def symmetric(covariance: Array) -> Array:
+    """Take off what rounding leaves a covariance that is not symmetric."""
     return np.asarray((covariance + covariance.T) / 2)
