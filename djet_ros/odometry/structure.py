@@ -121,7 +121,8 @@ class OneScale:
         own = self._wandered(addition, relative, seconds)
         if measured.known:
             self._hear(measured, addition.length, own, seconds)
-            if self._source.exact:
+            # Until the factor is known, lengths are as sure as they are measured.
+            if self._source.exact or not self._metric:
                 return relative, self._in_metres(measured)
         value = addition.length * float(np.exp(self._log))
         # The factor of a relative scale is that of the whole track, and no error of a step.

@@ -21,6 +21,9 @@ _UNKNOWN_ANGLE = np.pi
 # error is left a pair later: by `djet lab lengths`, a metre a frame.
 _ALIKE, _PASSED_ON = 0.25, 0.9
 
+# Metres, or units of the track, to which no place is known better.
+_SHORTEST = 1e-3
+
 # Covariance (6, 6) of a motion about which nothing is known.
 UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
 
@@ -35,9 +38,10 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
     if not np.isfinite(relative.covariance_6).all():
         return UNKNOWN_MOTION.copy()
     back, t = relative.R.T, relative.t
-    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt.
-    J = np.zeros((6, 6))
-    J[:3, :3], J[:3, 3:] = -length.value * back @ skew(t), -length.value * back
+    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt. Where it is
+    # measured that s is nothing, the direction is off all the same.
+    J, s = np.zeros((6, 6)), max(length.value, _SHORTEST)
+    J[:3, :3], J[:3, 3:] = -s * back @ skew(t), -s * back
     J[3:, :3] = -back
     covariance = J @ relative.covariance_6 @ J.T
     direction = back @ t
@@ -45,7 +49,7 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
         covariance[:3, :3] += length.sigma**2 * np.outer(direction, direction)
     else:
         covariance[:3] = covariance[:, :3] = 0.0
-        reach = max(length.value, 1e-3) if length.known else UNKNOWN_LENGTH_SIGMA
+        reach = max(length.value, _SHORTEST) if length.known else UNKNOWN_LENGTH_SIGMA
         covariance[:3, :3] = np.eye(3) * reach**2
     return symmetric(covariance)
 
@@ -62,7 +66,7 @@ def standstill_covariance(relative: RelativePose, length: Length) -> Array:
         # Standing still tells the rotation about as well as a displacement of a pixel would.
         rotation = np.eye(3) * 1e-6
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * max(sigma, 1e-3)**2
+    covariance[:3, :3] = np.eye(3) * max(sigma, _SHORTEST)**2
     covariance[3:, 3:] = rotation
     return symmetric(covariance)
 
