@@ -368,7 +368,7 @@ def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     speeds.add_speed(0, 0.0)
-    for number in range(4):  # something fills the image, and moves
+    for _ in range(4):  # something fills the image, and moves
         speeds.add_speed(drive.ns + 10**8, 0.0)
         result, = drive.go([pose(x=0.16, z=0.12)])
         assert result.scale_kind is Scale.METRIC and result.scale < 1e-3

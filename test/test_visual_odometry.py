@@ -384,7 +384,7 @@ def test_covariances_stay_finite_symmetric_and_positive(cards):
 
 
 @pytest.mark.parametrize('changes', [
-    {'grading': 0.0}, {'patch_scale': 1.0}, {'detector': 'orb'}, {'method': 'pjet'}])
+    {'grading': 0.0}, {'patch_scale': 1.0}, {'detector': 'orb'}])
 def test_with_other_parameters_both_images_of_the_next_pair_are_seen_by_them(cards, changes):
     other = replace(ESTIMATOR, **changes)
     frames = [cards.frame(0.1 * i, pose(x=0.25 * i), noise=i) for i in range(4)]
@@ -446,10 +446,10 @@ def test_one_speed_of_another_clock_does_not_silence_those_that_follow():
 
 def test_speeds_that_come_a_little_late_count_at_their_stamps():
     scale = SpeedScale()
-    for stamp, speed in ((0, 1.0), (4 * 10**8, 5.0), (10**8, 2.0), (2 * 10**8, 3.0)):
+    for stamp, speed in ((0, 1.0), (4 * 10**8, 1.0), (10**8, 3.0), (2 * 10**8, 3.0)):
         scale.add_speed(stamp, speed)
-    assert scale.between(10**8, 2 * 10**8).value == pytest.approx(0.25)
-    assert scale.between(0, 4 * 10**8).value == pytest.approx(1.2)
+    assert scale.between(10**8, 2 * 10**8).value == pytest.approx(0.3)
+    assert scale.between(0, 4 * 10**8).value == pytest.approx(0.9)
 
 
 def test_ground_truth_is_interpolated_and_not_believed_across_holes():

@@ -78,7 +78,8 @@ class OneScale:
         self._short = np.zeros(5)
         # Whether the track ever was in metres, and what is left of the errors that the last step
         # had in common with others.
-        self._was_metric, self._kept = False, np.ones(2)
+        self._was_metric = False
+        self._kept: Array = np.ones(2)
 
     @property
     def keyframe(self) -> bool | None:

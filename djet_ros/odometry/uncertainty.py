@@ -134,7 +134,7 @@ class PathCovariance:
         both = np.outer(crossed.sum(1), along)
         return PathCovariance(
             symmetric(self.pose + both + both.T
-                       + common.variances.sum() * np.outer(along, along)),
+                      + common.variances.sum() * np.outer(along, along)),
             crossed + np.outer(along, common.variances))
 
 

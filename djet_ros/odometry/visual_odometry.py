@@ -134,7 +134,7 @@ class VisualOdometry:
         """Take other parameters from the next frame on; the trajectory goes on."""
         another = self._last is not None and estimator != self._estimator.config
         self._config = odometry
-        self._estimator = TwoViewEstimator(estimator)
+        self._estimator: TwoViewEstimator = TwoViewEstimator(estimator)
         if another:  # it sees other features, and by other tests
             self._view = self._seen(self._reference)
         self._scale = scale
