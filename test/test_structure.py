@@ -389,7 +389,7 @@ def test_a_constant_length_that_is_wrong_is_wrong_alike_in_all_steps(cards):
     ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
     here, path = np.eye(4), PathCovariance()
     for number in range(count):
-        length = scale.of_step((number * 10**8, (number + 1) * 10**8), view, ahead)
+        _, length = scale.of_step((number * 10**8, (number + 1) * 10**8), view, ahead)
         assert length.sigma == pytest.approx(0.05)
         step = camera_motion(ahead, length.value)
         path = path.moved_by_pair(here, step, motion_covariance(ahead, length.own), length.common)
