@@ -18,6 +18,9 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
 from djet_ros.live.session import Session
+from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.images import BadMessage
+from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import MessageFactory, pose_of
 from djet_ros.odometry.moving_frames import MovingFrames
 from djet_ros.odometry.static_frames import StaticFrames
@@ -385,6 +388,27 @@ def test_a_mask_of_another_size_is_an_error_and_not_forgotten(drive: Drive) -> N
     one.image(drive.image(0))
     assert one.counts.rejected == {'mask_size': 1}
     assert 'odometry.mask_file has 10x10 pixels, the image 320x240' in str(one.problem)
+
+
+def test_a_mask_is_of_one_size_also_where_the_camera_is_of_any() -> None:
+    camera = Camera(K, np.empty(0), None)
+    masks = Masks(np.zeros((48, 64), bool))
+    assert masks.of(1, (48, 64), camera) is not None
+    masks.add(image(np.zeros((24, 32), np.uint8), stamp_ns=2))
+    for stamp in (2, 3):  # with another mask, and without one
+        with pytest.raises(BadMessage, match='mask_file has 64x48 pixels, the image 32x24'):
+            masks.of(stamp, (24, 32), camera)
+    assert masks.of(4, (48, 64), camera) is not None
+
+
+def test_masks_join_what_the_lens_does_not_show() -> None:
+    camera = Camera(K, np.array([0.4, 0.1, 0, 0, 0]), SIZE)
+    still = np.zeros(SIZE[::-1], bool)
+    still[100:140, 100:200] = True
+    unseen, both = (Masks(mask).of(1, still.shape, camera) for mask in (None, still))
+    assert unseen is not None and both is not None
+    assert unseen[0, 0] and not unseen[120, 160]
+    assert both[0, 0] and both[120, 160] and (both >= unseen).all()
 
 
 def test_a_mask_file_is_read_and_one_that_is_none_is_named(tmp_path: Path) -> None:

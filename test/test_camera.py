@@ -1,8 +1,10 @@
 """CameraInfo: what holds for raw and for rectified images, and what is refused."""
 
 import cv2
+from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.images import BadMessage
+from djet_ros.odometry.masks import Masks
 import numpy as np
 import pytest
 from ros_messages import camera_info, roi
@@ -29,7 +31,12 @@ def reason(*args, **changes):
     ('auto', '/camera/image_rect', True), ('auto', '/camera/image_rect_color', True),
     ('auto', '/camera/image_rect/compressed', True), ('auto', '/camera/image_raw', False),
     ('auto', '/rectory/image_raw', False), ('auto', '/camera/image_unrectified', False),
-    ('auto', '', False)])
+    ('auto', '', False), ('auto', '/camera/image_direct', False),
+    ('auto', '/camera/image_corrected', False), ('auto', '/camera/image_rect/theora', True),
+    ('auto', '/camera/image_rect_raw/compressedDepth', True),
+    ('auto', '/camera/left_rectified/image/ffmpeg', True), ('auto', '/rgb/rect/image', True),
+    ('auto', '/rgb/raw/image', False), ('auto', '/rect/image_raw/foxglove', False),
+    ('auto', '/rect/camera/image', False), ('auto', '/compressed', False)])
 def test_the_parameter_or_the_topic_says_whether_images_are_rectified(parameter, topic, expected):
     assert means_rectified(parameter, topic) is expected
 
@@ -97,6 +104,57 @@ def test_a_camera_of_matrices_brings_nothing_black_in_from_the_rim(model, outwar
     bright = np.full(SIZE[::-1], 200, np.uint8)
     assert np.array_equal(camera.K, K)
     assert (camera.undistort(bright) == 200).all()
+
+
+def beyond(camera, shape):
+    """(H, W) bool, where the image as it comes shows no point, or a second one."""
+    rows, columns = np.indices(shape)
+    rays = np.linalg.inv(camera.K) @ np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
+    seen, slopes = camera.pixels(rays[:2].T, camera.k1)
+    outside = ((seen < -0.5) | (seen > np.array(shape[::-1]) - 0.5)).any(1)
+    return (outside | (np.linalg.det(slopes) <= 0)).reshape(shape)
+
+
+# By model: beyond the sides, beyond the fold, beyond a fold that tangential coefficients bend.
+BEYOND = [('plumb_bob', [0.4, 0.1, 0, 0, 0], 130.0), ('plumb_bob', [-0.35, 0, 0, 0, 0], 70.0),
+          ('plumb_bob', [-0.35, 0, 3e-3, -5e-3, 0], 70.0),
+          ('rational_polynomial', [-0.4, 0, 0, 0, 0, 0.02, 0, 0], 70.0),
+          ('equidistant', [-0.3, 0, 0, 0], 45.0), ('equidistant', [0.6, 0.4, 0, 0], 130.0)]
+
+
+@pytest.mark.parametrize('model, D, focal', BEYOND)
+def test_pixels_that_the_image_does_not_show_are_unseen(model, D, focal):
+    K = np.array([[focal, 0, 80.5], [0, focal, 58.0], [0, 0, 1]])
+    camera = Camera(K, np.array(D), SIZE, model)
+    unseen, truth = camera.unseen(SIZE[::-1]), beyond(camera, SIZE[::-1])
+    assert unseen is not None
+    assert truth.mean() > 0.02
+    # A twentieth of a pixel is within how OpenCV rounds.
+    assert (truth & ~unseen).sum() == 0
+    assert (unseen & ~truth).mean() < 0.03
+
+
+def test_nothing_is_unseen_without_distortion_or_within_the_image():
+    assert Camera(K, np.empty(0), SIZE).unseen(SIZE[::-1]) is None
+    assert Camera(K, np.array([-0.2, 0.06, 0, 0, 0]), SIZE).unseen(SIZE[::-1]) is None
+
+
+def test_no_feature_stands_where_the_distortion_mirrors_the_image():
+    focal = np.array([[300.0, 0, 319.5], [0, 300, 239.5], [0, 0, 1]])
+    camera = Camera(focal, np.array([-0.35, 0, 0, 0, 0]), (640, 480))
+    raw = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
+    gray, left_out = camera.undistort(raw), Masks().of(0, raw.shape, camera)
+    mirrored = beyond(camera, raw.shape)
+    assert mirrored.mean() == pytest.approx(0.2, abs=0.02)
+
+    def there(mask):
+        """Count features that stand where the image is mirrored."""
+        points = TwoViewEstimator().view(gray, focal, left_out=mask).features.points
+        assert len(points) > 500
+        columns, rows = np.rint(points).astype(int).T
+        return mirrored[rows, columns].sum()
+    assert there(None) > 50
+    assert there(left_out) == 0
 
 
 def test_a_camera_of_matrices_undistorts_as_that_of_its_camera_info():

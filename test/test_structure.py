@@ -7,13 +7,14 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.types import Pose, Status, TRACKED
+from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.scale import Scale, scale_source, SpeedScale, Unmeasured
+from djet_ros.odometry.scale import ConstantScale, Scale, scale_source, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
-from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
+from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 import numpy as np
 import pytest
 
@@ -343,3 +344,71 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
     lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
     moved = (lengths > 0) & (ways > 0.005)
     assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)
+
+
+@pytest.mark.parametrize('frames_per_second', [10, 30])
+@pytest.mark.parametrize('size', [0.1, 0.025])
+def test_a_slow_camera_is_metric_however_fast_its_frames_come(cards, size, frames_per_second):
+    """At 30 frames a second each step is 7 mm, or 1.75 mm, and the speed is known to a mm."""
+    speeds = SpeedScale()
+    odometry, here, ns, results = VisualOdometry(ESTIMATOR, OdometryConfig(), speeds), 0.0, 0, []
+    for number in range(25):
+        frame = cards.frame(0.0, pose(x=here / size), noise=number)
+        if number < 22:
+            speeds.add_speed(ns, 2.1 * size)
+        results.append(odometry.process(Frame(frame.gray, frame.K, ns, 'camera')))
+        here += 2.1 * size / frames_per_second
+        ns += 10**9 // frames_per_second if number < 21 else 7 * 10**8
+    told = results[1:]
+    assert all(result.scale_kind is Scale.METRIC for result in told)
+    assert not told[-1].measured
+    assert lengths(told) == pytest.approx(np.full(24, 2.1 * size / frames_per_second), rel=0.05)
+
+
+def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
+    speeds = SpeedScale()
+    drive = Drive(cards, speeds)
+    speeds.add_speed(0, 0.0)
+    for _ in range(4):  # something fills the image, and moves
+        speeds.add_speed(drive.ns + 10**8, 0.0)
+        result, = drive.go([pose(x=0.16, z=0.12)])
+        assert result.scale_kind is Scale.METRIC and result.scale < 1e-3
+        assert np.linalg.eigvalsh(result.motion_covariance)[0] > 0
+    speeds.add_speed(drive.ns + 1, 2.0)
+    speeds.add_speed(drive.ns + 10**8, 2.0)
+    drive.go([pose(x=0.16, z=0.12)])
+    drive.here = drive.here @ pose(x=0.16, z=0.12)
+    silent = drive.look(gap_ns=7 * 10**8)
+    assert not silent.measured
+    assert np.linalg.norm(silent.motion[:3, 3]) == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_constant_length_that_is_wrong_is_wrong_alike_in_all_steps(cards):
+    frame, scale, count = cards.frame(0.0), OneScale(), 100
+    view = TwoViewEstimator(ESTIMATOR).view(frame.gray, frame.K)
+    scale.configure(ESTIMATOR, ConstantScale(1.0, 0.05), 0.05)
+    ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
+    here, path = np.eye(4), PathCovariance()
+    for number in range(count):
+        _, length = scale.of_step((number * 10**8, (number + 1) * 10**8), view, ahead)
+        assert length.sigma == pytest.approx(0.05)
+        step = camera_motion(ahead, length.value)
+        path = path.moved_by_pair(here, step, motion_covariance(ahead, length.own), length.common)
+        here = here @ step
+    assert here[2, 3] == pytest.approx(count)
+    assert np.sqrt(path.pose[2, 2]) == pytest.approx(0.05 * count, rel=1e-3)
+
+
+def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
+    speeds = SpeedScale()
+    drive = Drive(cards, speeds, max_gap=2.0)
+    for _ in range(3):
+        speeds.add_speed(drive.ns, 2.0)
+        speeds.add_speed(drive.ns + 10**8, 2.0)
+        drive.go([pose(x=0.16, z=0.12)])
+    before = drive.look(gap_ns=10**9)
+    drive.look(gap_ns=3 * 10**9)
+    after = drive.look()
+    assert before.stationary and after.stationary
+    assert before.scale_kind is Scale.METRIC
+    assert after.scale_kind is Scale.RELATIVE

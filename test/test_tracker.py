@@ -8,7 +8,9 @@ from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
+from djet_ros.core.masks import at
 from djet_ros.core.types import Status
+from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
 from djet_ros.odometry.messages import (
     frame_status,
@@ -157,6 +159,27 @@ def test_a_mask_holds_for_an_image_that_was_expected_before_it_came(drive, threa
 
     alone, expected = seen(False), seen(True)
     assert alone.x[:, 0].min() > SIZE[0] // 2
+    np.testing.assert_array_equal(expected.x, alone.x)
+    np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
+
+
+def test_what_the_lens_does_not_show_tells_nothing_expected_or_not(drive, threads):
+    D = np.array([0.3, 0.1, 0, 0, 0])
+    unseen = Camera(K, D, SIZE).unseen(SIZE[::-1])
+
+    def seen(ahead):
+        one = tracker(info=False)
+        one.camera_info(camera_info(K, SIZE, d=D))
+        messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive[:3])]
+        for i, message in enumerate(messages):
+            if ahead and i + 1 < len(messages):
+                one.expect(messages[i + 1])
+            one.image(message)
+        return one.last.relative
+
+    alone, expected = seen(False), seen(True)
+    assert not at(unseen, alone.x).any() and not at(unseen, alone.y_opt).any()
+    assert at(unseen, np.indices(SIZE).reshape(2, -1).T).mean() > 0.05
     np.testing.assert_array_equal(expected.x, alone.x)
     np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
 

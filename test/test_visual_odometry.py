@@ -1,7 +1,10 @@
 """The odometry: what it does with good, bad, still and missing frames, and how sure it is."""
 
+from dataclasses import replace
+
 from cards import Cards, K, pose
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
@@ -82,6 +85,24 @@ def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
     # … and what was between them is unknown from then on.
     assert (np.diag(results[2].pose_covariance) >= np.diag(results[1].pose_covariance)).all()
     assert results[3].pose_covariance[0, 0] > 1e5
+
+
+def test_what_was_seen_before_an_image_in_doubt_is_not_looked_for_in_it():
+    """The camera may go on as it did, but where things were in an older image tells nothing."""
+    world, body, estimator = Cards(), Cards(seed=6), TwoViewEstimator(ESTIMATOR)
+    vo, here, there, views, results = odometry(ConstantScale(1.0)), np.eye(4), np.eye(4), [], []
+    alike, apart = (pose(x=0.2), pose(x=0.2)), (pose(z=0.12), pose(x=0.1, z=-0.25))
+    for number, steps in enumerate((alike, apart, apart, alike, alike)):
+        gray = world.gray(here, noise=number)
+        gray[:, 160:] = body.gray(there, noise=number)[:, 160:]
+        results.append(vo.process(Frame(gray, K, number * 10**8)))
+        views.append(estimator.view(gray, K))
+        here, there = here @ steps[0], there @ steps[1]
+    assert [result.status for result in results[1:]] == [
+        Status.OK, Status.TWO_MOTIONS, Status.TWO_MOTIONS, Status.OK]
+    before, after = results[1].relative, results[4].relative
+    motion = RelativePose(Status.OK, before.R, before.t)
+    assert np.array_equal(estimator.estimate(*views[3:], motion).x, after.x)
 
 
 def test_a_compromise_between_two_bodies_is_not_carried_on():
@@ -362,6 +383,22 @@ def test_covariances_stay_finite_symmetric_and_positive(cards):
         assert covariance.max() < 1e12
 
 
+@pytest.mark.parametrize('changes', [
+    {'grading': 0.0}, {'patch_scale': 1.0}, {'detector': 'orb'}])
+def test_with_other_parameters_both_images_of_the_next_pair_are_seen_by_them(cards, changes):
+    other = replace(ESTIMATOR, **changes)
+    frames = [cards.frame(0.1 * i, pose(x=0.25 * i), noise=i) for i in range(4)]
+    for before, after in ((ESTIMATOR, other), (other, ESTIMATOR)):
+        vo = VisualOdometry(before)
+        prior = [vo.process(frame) for frame in frames[:3]][-1].relative
+        vo.configure(after, OdometryConfig(), Unmeasured())
+        estimator = TwoViewEstimator(after)
+        views = [estimator.view(frame.gray, frame.K) for frame in frames[2:]]
+        expected, found = estimator.estimate(*views, prior), vo.process(frames[3]).relative
+        assert np.array_equal(found.x, expected.x)
+        assert np.array_equal(found.R, expected.R) and np.array_equal(found.t, expected.t)
+
+
 # Scale
 
 def test_unit_scale_knows_nothing():
@@ -396,6 +433,23 @@ def test_senseless_speeds_are_ignored():
     assert scale.between(0, 10**8).value == pytest.approx(0.1)
     scale.reset()
     assert not scale.between(0, 10**8).known
+
+
+def test_one_speed_of_another_clock_does_not_silence_those_that_follow():
+    scale = SpeedScale()
+    for stamp in (10**9, 10**18, *range(2 * 10**9, 3 * 10**9, 10**8)):
+        scale.add_speed(stamp, 2.0)
+    length = scale.between(25 * 10**8, 26 * 10**8)
+    assert length.known and length.value == pytest.approx(0.2)
+    assert '0.1 s before' in scale.why_unknown(3 * 10**9)
+
+
+def test_speeds_that_come_a_little_late_count_at_their_stamps():
+    scale = SpeedScale()
+    for stamp, speed in ((0, 1.0), (4 * 10**8, 1.0), (10**8, 3.0), (2 * 10**8, 3.0)):
+        scale.add_speed(stamp, speed)
+    assert scale.between(10**8, 2 * 10**8).value == pytest.approx(0.3)
+    assert scale.between(0, 4 * 10**8).value == pytest.approx(0.9)
 
 
 def test_ground_truth_is_interpolated_and_not_believed_across_holes():

@@ -78,7 +78,8 @@ class OdometryConfig:
         'such as those of the own bonnet, are left out')
     rectified: str = parameter(
         'auto', 'whether images come rectified: true (camera is P), false (camera is K, D), auto '
-        "(true where the image topic's last name has 'rect' in it, else false)",
+        "(true where the image topic's last name, or else the one before it, has the word 'rect' "
+        "or 'rectified', as image_rect_color and rect/image do, else false)",
         choices=('auto', 'true', 'false'))
     gray_range: str = parameter(
         '0 65535', "'low high': of images of 16 bits, the values that become black and white; all "

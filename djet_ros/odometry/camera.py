@@ -3,20 +3,20 @@ sensor_msgs CameraInfo to the camera matrix of an undistorted image, and the und
 
 Which part of a CameraInfo holds depends on whether the images come rectified: P for rectified
 ones, K and D for raw ones. Nothing in a message tells; the parameter ``odometry.rectified`` does,
-and its value ``auto`` goes by the name of the image topic, as image_proc names them: image_rect,
-image_rect_color.
+and its value ``auto`` goes by the name of the image topic: see ``means_rectified``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.core.types import Array
 from djet_ros.odometry.images import BadMessage, Gray
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS
 import numpy as np
+from numpy.typing import NDArray
 
 # Numbers of coefficients that OpenCV knows for the polynomial models.
 _POLYNOMIAL = (4, 5, 8, 12, 14)
@@ -29,6 +29,23 @@ _SHORTEST, _LONGEST, _FARTHEST = 1e-2, 1e3, 10.0
 # Share of the undistorted image that must be seen in the image that comes, and the points on
 # either of its sides by which that is told.
 _LEAST_SEEN, _GRID = 0.1, 16
+
+# Directions from the optical axis, and places along each, by which a fold is found.
+_DIRECTIONS, _ALONG = 32, 1000
+
+# By what words a topic's name tells whether its images are rectified, and the names that
+# image_transport and its plugins append to it.
+_RECTIFIED, _NOT_RECTIFIED = {'rect', 'rectified'}, {'raw', 'unrect', 'unrectified'}
+_TRANSPORTS = {'raw', 'compressed', 'compressedDepth', 'theora', 'zstd', 'ffmpeg', 'foxglove',
+               'h264', 'h265', 'avif'}
+
+
+class _Undistortion(NamedTuple):
+    """How images of a shape (H, W) are undistorted: OpenCV's maps, and what they don't show."""
+
+    shape: tuple[int, ...]
+    maps: tuple[Any, Any]
+    unseen: NDArray[np.bool_] | None
 
 
 class Camera:
@@ -50,7 +67,7 @@ class Camera:
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
         self._distortion = _distortion(model, D) if D.any() else None
-        self._maps: tuple[Any, Any] | None = None
+        self._undistorting: _Undistortion | None = None
 
     @classmethod
     def from_info(cls, info: Any, rectified: bool) -> Camera:
@@ -83,11 +100,18 @@ class Camera:
             check_lens(self.raw_K, (width, height))
         if self._distortion is None:
             return gray
-        if self._maps is None or self._maps[0].shape[:2] != gray.shape:
-            self._maps = self._undistortion(width, height)
         # A black rim would be an edge that moves with the camera.
-        return np.asarray(cv2.remap(gray, *self._maps, cv2.INTER_LINEAR,
+        return np.asarray(cv2.remap(gray, *self._undistortion(gray.shape).maps, cv2.INTER_LINEAR,
                                     borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+
+    def unseen(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """
+        (H, W) bool, pixels of an undistorted image that the image as it comes does not show.
+
+        They lie beyond its sides, or beyond where the distortion folds over, and shows for a
+        second time what is nearer to the axis. None where there are none.
+        """
+        return None if self._distortion is None else self._undistortion(shape).unseen
 
     @property
     def k1(self) -> float:
@@ -115,13 +139,44 @@ class Camera:
         return (np.asarray(pixels, float).reshape(-1, 2),
                 np.asarray(slopes[:, by_way:by_way + 2], float).reshape(-1, 2, 2))
 
-    def _undistortion(self, width: int, height: int) -> tuple[Any, Any]:
-        model, D = self._distortion or ('', np.empty(0))
-        self._check_distortion(width, height)
-        module = cv2.fisheye if model == 'equidistant' else cv2
-        first, second = module.initUndistortRectifyMap(
-            self.raw_K, D, np.eye(3), self.K, (width, height), cv2.CV_16SC2)
-        return first, second
+    def _undistortion(self, shape: tuple[int, ...]) -> _Undistortion:
+        """Tell how images (H, W) are undistorted; computed once, as sizes seldom change."""
+        if self._undistorting is None or self._undistorting.shape != shape:
+            height, width = shape
+            model, D = self.distortion
+            self._check_distortion(width, height)
+            module = cv2.fisheye if model == 'equidistant' else cv2
+            maps, (x, y) = (module.initUndistortRectifyMap(
+                self.raw_K, D, np.eye(3), self.K, (width, height), kind)
+                for kind in (cv2.CV_16SC2, cv2.CV_32FC1))
+            # Up to half a pixel beyond the middles of the outermost ones something is seen.
+            seen = (np.abs(x - (width - 1) / 2) <= width / 2) \
+                & (np.abs(y - (height - 1) / 2) <= height / 2)
+            unseen = ~seen | self._folded(width, height)
+            self._undistorting = _Undistortion(shape, maps, unseen if unseen.any() else None)
+        return self._undistorting
+
+    def _folded(self, width: int, height: int) -> NDArray[np.bool_]:
+        """
+        (H, W) bool, pixels as far from the optical axis as where the distortion folds, or farther.
+
+        There it ceases to bring out what is farther out. Tangential coefficients bend that circle
+        a little, and the nearest place counts.
+        """
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+        away = np.hypot(rays[0], rays[1])
+        step = away.max() / _ALONG
+        radii = step * np.arange(1, _ALONG + 1)
+        angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        places = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        # What is too far off for a number is folded.
+        with np.errstate(all='ignore'):
+            _, slopes = self.pixels(places.reshape(-1, 2), self.k1)
+            unfolded = np.linalg.det(slopes).reshape(_ALONG, _DIRECTIONS) > 0
+        folded = np.flatnonzero(~unfolded.all(1))
+        fold = folded[0] * step if len(folded) else np.inf
+        return np.asarray(away.reshape(height, width) > fold)
 
     def _check_distortion(self, width: int, height: int) -> None:
         """Refuse a distortion by which hardly anything of the image would be seen."""
@@ -142,12 +197,19 @@ def means_rectified(rectified: str, image_topic: str) -> bool:
     """
     Tell whether images come rectified, by the parameter or, with 'auto', by the topic's name.
 
-    A transport's suffix (image_rect/compressed) does not count as the name.
+    Its last name tells (image_rect_color), by its words, or else the one before (rect/image); a
+    transport's suffix (image_rect/compressed) is none of them.
     """
     if rectified != 'auto':
         return rectified == 'true'
-    names = [name for name in image_topic.split('/') if name not in ('', 'compressed', 'raw')]
-    return bool(names) and 'rect' in names[-1] and 'unrect' not in names[-1]
+    names = [name for name in image_topic.split('/') if name]
+    while names and names[-1] in _TRANSPORTS:
+        names.pop()
+    for words in (set(name.split('_')) for name in reversed(names[-2:])):
+        if words & (_RECTIFIED | _NOT_RECTIFIED):
+            # Drivers have image_rect_raw, which is rectified.
+            return bool(words & _RECTIFIED)
+    return False
 
 
 def same_camera(a: Any, b: Any) -> bool:

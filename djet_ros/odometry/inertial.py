@@ -96,7 +96,7 @@ class Gyro:
 
     def reset(self) -> None:
         """Forget all samples; the bias is the device's, and stays known."""
-        self._rates = Stamped(_KEPT)
+        self._rates = Stamped[Array](_KEPT)
         self._saturated: list[int] = []
         self._equal = 0
         self._latest: tuple[tuple[object, ...], _Integral | None] | None = None

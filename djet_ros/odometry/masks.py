@@ -1,8 +1,9 @@
-"""Pixels that are left out of an image: by a still mask, and by one for each stamp."""
+"""Pixels that are left out of an image: by its lens, by a still mask, by one for each stamp."""
 
 from __future__ import annotations
 
 from collections import deque
+from functools import reduce
 from typing import Any
 
 from djet_ros.odometry.camera import Camera
@@ -28,7 +29,7 @@ class Masks:
 
     def __init__(self, still: NDArray[np.bool_] | None = None) -> None:
         self._still = still
-        self._undistorted: tuple[Camera, NDArray[np.bool_]] | None = None
+        self._undistorted: tuple[Camera, tuple[int, ...], NDArray[np.bool_]] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -47,27 +48,27 @@ class Masks:
         """
         Give what is left out of an undistorted image, (H, W) bool, or None.
 
-        shape: of the image as it came. Raises BadMessage where a mask is none, or for another
-        size.
+        shape: of the image as it came. Where there are no masks, what the camera does not see is
+        given as the camera has it. Raises BadMessage where a mask is none, or for another size.
         """
         found = [message for one, message in self._waiting if one == stamp]
         while self._waiting and self._waiting[0][0] <= stamp:
             self._waiting.popleft()
         moving = None if not found else _undistorted(left_out(gray_image(found[-1])), shape,
                                                      camera, 'mask')
-        still = self._of_camera(shape, camera)
-        if moving is None or still is None:
-            return still if moving is None else moving
-        return moving | still
+        parts = [part for part in (moving, self._of_camera(shape, camera), camera.unseen(shape))
+                 if part is not None]
+        return reduce(np.logical_or, parts) if parts else None
 
     def _of_camera(self, shape: tuple[int, ...], camera: Camera) -> NDArray[np.bool_] | None:
         """Give the still mask without the distortion of a camera, which seldom changes."""
         if self._still is None:
             return None
-        if self._undistorted is None or self._undistorted[0] is not camera:
-            self._undistorted = camera, _undistorted(self._still, shape, camera,
-                                                     'odometry.mask_file')
-        return self._undistorted[1]
+        if self._undistorted is None or self._undistorted[0] is not camera \
+                or self._undistorted[1] != shape:
+            self._undistorted = camera, shape, _undistorted(self._still, shape, camera,
+                                                            'odometry.mask_file')
+        return self._undistorted[2]
 
 
 def _undistorted(mask: NDArray[np.bool_], shape: tuple[int, ...], camera: Camera, what: str

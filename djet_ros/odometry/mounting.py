@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from djet_ros.core.geometry import skew
 from djet_ros.core.types import Array
-from djet_ros.odometry.uncertainty import both_turned
+from djet_ros.odometry.uncertainty import both_turned, symmetric
 import numpy as np
 
 
@@ -18,14 +18,14 @@ def pose_of_base(pose: Array, covariance: Array, T: Array) -> tuple[Array, Array
     result = np.asarray(T @ pose @ np.linalg.inv(T))
     # The base's origin swings about the camera: p' = R_T p + t - R' t.
     J = _lever(T, skew(result[:3, :3] @ T[:3, 3]))
-    return result, _symmetric(J @ covariance @ J.T)
+    return result, symmetric(J @ covariance @ J.T)
 
 
 def twist_of_base(velocity: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
     """Velocity (6,) of the base along its axes, and covariance (6, 6), from the camera's."""
     # The base's origin is seen from the camera at -R_T^T t, and turns with it.
     J = _lever(T, skew(T[:3, 3]))
-    return np.asarray(J @ velocity), _symmetric(J @ covariance @ J.T)
+    return np.asarray(J @ velocity), symmetric(J @ covariance @ J.T)
 
 
 def _lever(T: Array, arm: Array) -> Array:
@@ -33,7 +33,3 @@ def _lever(T: Array, arm: Array) -> Array:
     J = both_turned(T[:3, :3])
     J[:3, 3:] = arm @ T[:3, :3]
     return J
-
-
-def _symmetric(covariance: Array) -> Array:
-    return np.asarray((covariance + covariance.T) / 2)

@@ -20,7 +20,7 @@ class PoseTrack:
     """Where a frame was in another; kept: how many of the newest poses."""
 
     def __init__(self, kept: int = _KEPT) -> None:
-        self._poses = Stamped(kept)
+        self._poses = Stamped[Array](kept)
 
     def reset(self) -> None:
         """Forget all poses."""

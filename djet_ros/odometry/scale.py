@@ -20,6 +20,7 @@ from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
 from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.interpolation import positions_at
+from djet_ros.odometry.stamped import Stamped
 import numpy as np
 from numpy.typing import NDArray
 
@@ -189,41 +190,41 @@ class SpeedScale(ScaleSource):
 
     def why_unknown(self, stamp_ns: int) -> str:
         """Say how far the newest speed is off."""
-        if not self._stamps:
+        if not self._speeds:
             return 'no speed has come'
-        off = (self._stamps[-1] - stamp_ns) * 1e-9
+        off = (self._speeds.stamps[-1] - stamp_ns) * 1e-9
         return (f'the newest speed is stamped {abs(off):.1f} s '
                 f'{"after" if off > 0 else "before"} the newest image')
 
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
-        """Take a measured speed; one beyond any sense or earlier than the last is ignored."""
-        if not abs(metres_per_second) <= _FASTEST \
-                or (self._stamps and stamp_ns <= self._stamps[-1]):
+        """Take a measured speed; one beyond any sense, or of a stamp that has one, is ignored."""
+        if not abs(metres_per_second) <= _FASTEST or stamp_ns in self._speeds:
             return
-        self._stamps.append(stamp_ns)
-        self._speeds.append(abs(float(metres_per_second)))
-        if len(self._stamps) > 2 * _KEPT_SPEEDS:
-            del self._stamps[:_KEPT_SPEEDS], self._speeds[:_KEPT_SPEEDS]
+        if self._speeds.goes_back(stamp_ns):
+            self.reset()
+        self._speeds.add(stamp_ns, abs(float(metres_per_second)))
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Integrate the speed from start to end."""
-        if not self._stamps:
+        if not self._speeds:
             return unknown(1.0)
-        inside = slice(bisect_right(self._stamps, start_ns), bisect_left(self._stamps, end_ns))
-        stamps = np.array([start_ns, *self._stamps[inside], end_ns])
+        stamps = self._speeds.stamps
+        first, last = bisect_right(stamps, start_ns), bisect_left(stamps, end_ns)
+        times = np.array([start_ns, *stamps[first:last], end_ns])
+        known = stamps[max(first - 1, 0):last + 1]
         # Seconds from the start: absolute ones would lose digits.
-        speeds = np.interp((stamps - start_ns) * 1e-9,
-                           [(stamp - start_ns) * 1e-9 for stamp in self._stamps], self._speeds)
-        metres = float(np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(stamps) * 1e-9))
-        nearest = self._stamps[max(bisect_right(self._stamps, end_ns) - 1, 0)]
+        speeds = np.interp((times - start_ns) * 1e-9,
+                           [(stamp - start_ns) * 1e-9 for stamp in known],
+                           [self._speeds[stamp] for stamp in known])
+        metres = float(np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times) * 1e-9))
+        nearest = stamps[max(bisect_right(stamps, end_ns) - 1, 0)]
         if abs(end_ns - nearest) > _LONGEST_HOLD_NS:
             return unknown(metres)
         return Length(metres, max(metres * self._uncertainty, 1e-3), True)
 
     def reset(self) -> None:
         """Forget all speeds."""
-        self._stamps: list[int] = []
-        self._speeds: list[float] = []
+        self._speeds = Stamped[float](_KEPT_SPEEDS)
 
 
 class CameraHeightScale(ScaleSource):

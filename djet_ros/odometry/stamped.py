@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_right, insort
+from typing import Generic, TypeVar
 
-from djet_ros.core.types import Array
+Value = TypeVar('Value')
 
 # Stamps that go back by more belong to another time, as when a bag begins again.
 _BACK_NS = 500_000_000
 
 
-class Stamped:
+class Stamped(Generic[Value]):
     """Values by their stamps in ns, sorted; kept: how many of the newest."""
 
     def __init__(self, kept: int) -> None:
@@ -20,7 +21,7 @@ class Stamped:
     def clear(self) -> None:
         """Forget everything."""
         self.stamps: list[int] = []
-        self._values: dict[int, Array] = {}
+        self._values: dict[int, Value] = {}
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -28,14 +29,14 @@ class Stamped:
     def __contains__(self, stamp_ns: int) -> bool:
         return stamp_ns in self._values
 
-    def __getitem__(self, stamp_ns: int) -> Array:
+    def __getitem__(self, stamp_ns: int) -> Value:
         return self._values[stamp_ns]
 
     def goes_back(self, stamp_ns: int) -> bool:
         """Tell whether time begins again with a stamp."""
         return bool(self.stamps) and stamp_ns < self.stamps[-1] - _BACK_NS
 
-    def add(self, stamp_ns: int, value: Array) -> None:
+    def add(self, stamp_ns: int, value: Value) -> None:
         """Take a value of a stamp that has none yet."""
         insort(self.stamps, stamp_ns)
         self._values[stamp_ns] = value

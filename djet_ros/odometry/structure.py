@@ -37,8 +37,8 @@ _LEAST_NOISE = 0.02
 # of them in a row are no accident.
 _SURPRISE, _IN_A_ROW = 16.0, 8
 
-# A length below this, in metres, says that the camera stands, and nothing of the factor.
-_STANDING = 0.01
+# Seconds; chosen: short lengths over which tell together what each does not.
+_TOGETHER = 1.0
 
 
 # Least share of landmarks that agree with a right motion (0.75 was the least that was seen), how
@@ -66,6 +66,7 @@ class OneScale:
         self._source, self._share, self._carried = source, share, source.carried
         if estimator != self._estimator:
             self._estimator, self._window = estimator, Window(estimator)
+        self._short = np.zeros(5)
         return anew
 
     def reset(self) -> None:
@@ -73,9 +74,12 @@ class OneScale:
         self._speed: float | None = None
         self._log, self._variance, self._metric = 0.0, 0.0, False
         self._surprises = 0
+        # Of short lengths since one told the factor: see _told.
+        self._short = np.zeros(5)
         # Whether the track ever was in metres, and what is left of the errors that the last step
         # had in common with others.
-        self._was_metric, self._kept = False, np.ones(2)
+        self._was_metric = False
+        self._kept: Array = np.ones(2)
 
     @property
     def keyframe(self) -> bool | None:
@@ -92,8 +96,9 @@ class OneScale:
         if not self._carried:
             return
         self._window.start(view)
+        self._short = np.zeros(5)
         if self._speed is not None:
-            self._variance += _TORN**2
+            self._doubt(_TORN**2)
 
     def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose
                 ) -> tuple[RelativePose, Length]:
@@ -105,26 +110,26 @@ class OneScale:
         """
         measured = self._source.between(*span_ns)
         if not self._carried:
-            return relative, measured
+            return relative, self._in_metres(measured)
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
         addition = self._added(current, relative, guess)
         if addition is None:
-            return relative, (
-                measured if measured.known else unknown(guess * float(np.exp(self._log))))
+            return relative, (self._in_metres(measured) if measured.known
+                              else unknown(guess * float(np.exp(self._log))))
         if not relative.t.any():
             relative = _as_landmarks_tell(relative, addition, guess)
         own = self._wandered(addition, relative, seconds)
-        if measured.known and self._source.exact:
-            self._set(measured, addition.length)
-            return relative, replace(measured, common=self._common())
-        if measured.known and measured.value > _STANDING:
-            self._observe(measured, addition.length, own)
+        if measured.known:
+            self._hear(measured, addition.length, own, seconds)
+            # Until the factor is known, lengths are as sure as they are measured.
+            if self._source.exact or not self._metric:
+                return relative, self._in_metres(measured)
         value = addition.length * float(np.exp(self._log))
         # The factor of a relative scale is that of the whole track, and no error of a step.
         common = np.hypot(np.sqrt(self._variance), self._share) if self._metric else 0.0
         return relative, Length(value, value * float(np.hypot(own, common)), True, self._metric,
-                                measured.known, self._common())
+                                measured.known, self._common(self._variance, self._metric))
 
     def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> None:
         """
@@ -186,11 +191,19 @@ class OneScale:
         self.begin(view)
         return None
 
-    def _common(self) -> Common:
-        """Tell what the errors of this step's length have in common with those of others."""
-        self._was_metric = self._was_metric or self._metric
+    def _in_metres(self, measured: Length) -> Length:
+        """Take a measured length as it is: no factor errs in it, but all such err alike."""
+        return replace(measured, common=self._common(0.0, True)) if measured.known else measured
+
+    def _common(self, variance: float, metric: bool) -> Common:
+        """
+        Tell what the errors of this step's length have in common with those of others.
+
+        variance: of its factor's logarithm; metric: whether it is in metres.
+        """
+        self._was_metric = self._was_metric or metric
         share = self._share if self._was_metric else 0.0
-        common = Common(np.array([self._variance, share**2]), self._kept)
+        common = Common(np.array([variance, share**2]), self._kept)
         self._kept = np.ones(2)
         return common
 
@@ -199,16 +212,49 @@ class OneScale:
         own = min(addition.sigma / addition.length, 1.0)
         if relative.t.any():  # without parallax, only a turn is sure
             self._speed = addition.length / seconds
-        self._variance += (_WANDERING * own)**2
-        self._metric = bool(self._metric and self._variance < _LOST**2)
+        self._doubt((_WANDERING * own)**2)
         return own
 
-    def _observe(self, measured: Length, length: float, own: float) -> None:
-        """Take a length in metres as an observation of the logarithm of the factor."""
-        observed = float(np.log(measured.value / length))
+    def _doubt(self, variance: float) -> None:
+        """Be less sure of the factor."""
+        self._variance += variance
+        self._metric = bool(self._metric and self._variance < _LOST**2)
+
+    def _hear(self, measured: Length, length: float, own: float, seconds: float) -> None:
+        """Learn the factor from a length in metres, where it tells any."""
+        told = self._told(measured, length, own, seconds)
+        if told is not None and self._source.exact:
+            self._log, self._variance = told[0], 0.0
+            self._metric, self._kept[0] = True, 0.0
+        elif told is not None:
+            self._observe(*told)
+
+    def _told(self, measured: Length, length: float, own: float, seconds: float
+              ) -> tuple[float, float] | None:
+        """
+        Give the logarithm of the factor by a length in metres, and its variance, if it tells any.
+
+        What may be noise about zero says that the camera stands. Beyond _SURPRISE it is none, and
+        the logarithm is that of a length with an error e of at most a quarter of it: what is
+        left out of log(1 + e) = e - e^2 / 2 + ... is less than an eighth of e. The faster frames
+        come, the shorter steps are. Those of a second tell together what each does not, where
+        their errors are independent: n of them are n times as long, and sqrt(n) times as unsure.
+        """
         # What all measurements have in common does not become surer by their number.
-        noise = max((measured.sigma / measured.value)**2 - self._share**2, _LEAST_NOISE**2)
-        noise += own**2
+        variance = max(measured.sigma**2 - (self._share * measured.value)**2, 0.0)
+        step = np.array([measured.value, variance, length, (own * length)**2, seconds])
+        # One that tells by itself is not held against others.
+        taken = step if _tells(step) else self._short + step
+        told = _tells(taken)
+        self._short = taken if not told and taken[4] < _TOGETHER else np.zeros(5)
+        if not told:
+            return None
+        metres, variance, length, unsure, _ = taken.tolist()
+        noise = max(variance / metres**2, _LEAST_NOISE**2) + unsure / length**2
+        return float(np.log(metres / length)), noise
+
+    def _observe(self, observed: float, noise: float) -> None:
+        """Take an observation of the logarithm of the factor, with its variance."""
         if not self._metric:
             self._log, self._variance, self._metric = observed, noise, True
             self._kept[0] = 0.0
@@ -225,11 +271,10 @@ class OneScale:
         self._variance *= 1 - gain
         self._kept[0] *= 1 - gain
 
-    def _set(self, measured: Length, length: float) -> None:
-        """Take a length that is exactly known."""
-        if measured.value > _STANDING:
-            self._log, self._variance = float(np.log(measured.value / length)), 0.0
-            self._metric, self._kept[0] = True, 0.0
+
+def _tells(lengths: Array) -> bool:
+    """Tell whether a length (metres, variance, ...) is no noise about zero."""
+    return bool(lengths[0]**2 > _SURPRISE * lengths[1])
 
 
 def _as_landmarks_tell(relative: RelativePose, addition: Addition, usual: float) -> RelativePose:

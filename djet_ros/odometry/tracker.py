@@ -45,7 +45,7 @@ class Outgoing(NamedTuple):
 
 class _Seen(NamedTuple):
     """
-    An undistorted image, the shape of the one that came, and its view where nothing hides.
+    An undistorted image, the shape of the one that came, and its view where no mask hides any.
 
     coarse: what is left of an image of 16 bits, where that is little.
     """
@@ -234,8 +234,10 @@ class Tracker:
             self.verdict = problem.reason
             return self._reject(problem, stamp)
         self._health.gray(seen.coarse)
+        # A view that was begun leaves out what the camera does not see, and no more.
+        whole = left_out is self._camera.unseen(seen.shape)
         return self._process(Frame(seen.gray, self._camera.K, stamp, message.header.frame_id,
-                                   left_out), seen.view if left_out is None else None)
+                                   left_out), seen.view if whole else None)
 
     @property
     def mounted(self) -> bool:
@@ -506,5 +508,6 @@ def _seen(message: Any, camera: Camera, limits: tuple[int, int],
     """See an image by a camera, and prepare its view where there is an estimator for it."""
     raw = gray_image(message, limits)
     gray = camera.undistort(raw)
-    view = None if estimator is None else estimator.view(gray, camera.K)
+    view = None if estimator is None else estimator.view(
+        gray, camera.K, left_out=camera.unseen(raw.shape))
     return _Seen(gray, raw.shape, view, coarse(message, raw))

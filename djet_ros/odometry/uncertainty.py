@@ -21,6 +21,9 @@ _UNKNOWN_ANGLE = np.pi
 # error is left a pair later: by `djet lab lengths`, a metre a frame.
 _ALIKE, _PASSED_ON = 0.25, 0.9
 
+# Metres, or units of the track, to which no place is known better.
+_SHORTEST = 1e-3
+
 # Covariance (6, 6) of a motion about which nothing is known.
 UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
 
@@ -35,9 +38,10 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
     if not np.isfinite(relative.covariance_6).all():
         return UNKNOWN_MOTION.copy()
     back, t = relative.R.T, relative.t
-    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt.
-    J = np.zeros((6, 6))
-    J[:3, :3], J[:3, 3:] = -length.value * back @ skew(t), -length.value * back
+    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt. Where it is
+    # measured that s is nothing, the direction is off all the same.
+    J, s = np.zeros((6, 6)), max(length.value, _SHORTEST)
+    J[:3, :3], J[:3, 3:] = -s * back @ skew(t), -s * back
     J[3:, :3] = -back
     covariance = J @ relative.covariance_6 @ J.T
     direction = back @ t
@@ -45,9 +49,9 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
         covariance[:3, :3] += length.sigma**2 * np.outer(direction, direction)
     else:
         covariance[:3] = covariance[:, :3] = 0.0
-        reach = max(length.value, 1e-3) if length.known else UNKNOWN_LENGTH_SIGMA
+        reach = max(length.value, _SHORTEST) if length.known else UNKNOWN_LENGTH_SIGMA
         covariance[:3, :3] = np.eye(3) * reach**2
-    return _symmetric(covariance)
+    return symmetric(covariance)
 
 
 def standstill_covariance(relative: RelativePose, length: Length) -> Array:
@@ -62,9 +66,9 @@ def standstill_covariance(relative: RelativePose, length: Length) -> Array:
         # Standing still tells the rotation about as well as a displacement of a pixel would.
         rotation = np.eye(3) * 1e-6
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * max(sigma, 1e-3)**2
+    covariance[:3, :3] = np.eye(3) * max(sigma, _SHORTEST)**2
     covariance[3:, 3:] = rotation
-    return _symmetric(covariance)
+    return symmetric(covariance)
 
 
 def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Array) -> Array:
@@ -75,7 +79,7 @@ def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Arra
     pose's rotation swings the motion like a lever.
     """
     lever = _lever(pose, motion)
-    return _symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
+    return symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ class PathCovariance:
         root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T @ turn
         before = _PASSED_ON * _lever(pose, motion) @ self.with_pair
         both = before @ root.T
-        return replace(moved, pose=_symmetric(moved.pose + both + both.T),
+        return replace(moved, pose=symmetric(moved.pose + both + both.T),
                        with_pair=before + _ALIKE * root)
 
     def _stretched(self, pose: Array, motion: Array, common: Common) -> PathCovariance:
@@ -129,8 +133,8 @@ class PathCovariance:
         crossed = self.with_common * common.kept
         both = np.outer(crossed.sum(1), along)
         return PathCovariance(
-            _symmetric(self.pose + both + both.T
-                       + common.variances.sum() * np.outer(along, along)),
+            symmetric(self.pose + both + both.T
+                      + common.variances.sum() * np.outer(along, along)),
             crossed + np.outer(along, common.variances))
 
 
@@ -165,5 +169,6 @@ def both_turned(R: Array) -> Array:
     return turn
 
 
-def _symmetric(covariance: Array) -> Array:
+def symmetric(covariance: Array) -> Array:
+    """Take off what rounding leaves a covariance that is not symmetric."""
     return np.asarray((covariance + covariance.T) / 2)

@@ -133,8 +133,11 @@ class VisualOdometry:
     def configure(self, estimator: EstimatorConfig, odometry: OdometryConfig,
                   scale: ScaleSource) -> None:
         """Take other parameters from the next frame on; the trajectory goes on."""
+        another = self._last is not None and estimator != self._estimator.config
         self._config = odometry
-        self._estimator = TwoViewEstimator(estimator)
+        self._estimator: TwoViewEstimator = TwoViewEstimator(estimator)
+        if another:  # it sees other features, and by other tests
+            self._view = self._seen(self._reference)
         self._scale = scale
         anew = self._one_scale.configure(estimator, scale, odometry.scale_uncertainty)
         if anew and self._last is not None:
@@ -175,7 +178,7 @@ class VisualOdometry:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
         # Features are found once: now for the current frame, next time for the reference.
         if view is None:
-            view = self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
+            view = self._seen(frame)
         if status is not Status.OK:
             return self._start(frame, view, status, backwards=bool(
                 last and frame.stamp_ns < last.stamp_ns))
@@ -213,6 +216,9 @@ class VisualOdometry:
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
         return result
+
+    def _seen(self, frame: Frame) -> View:
+        return self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
 
     def _waits(self, relative: RelativePose) -> bool:
         """Tell whether the reference stays until a pair with it tells the way."""
@@ -358,6 +364,10 @@ class VisualOdometry:
                 self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative)
             self._refer_to(frame, view)
             self._pose, self._path = result.pose, path
+            if self._prior is not None:
+                # Its matches are with an older image: the camera may go on like this, but what
+                # it saw is not where they were.
+                self._prior = RelativePose(Status.OK, self._prior.R, self._prior.t)
         if given_up:
             self._prior = None
         return result
