@@ -79,7 +79,8 @@ def test_the_version_is_the_packages() -> None:
 
 @pytest.mark.parametrize('arguments', [
     (), ('reply',), ('--fast',), ('--', 'demo', '--fast'), ('demo', '--fast'), ('-', 'demo'),
-    ('lab',), ('lab', 'demo'), ('lab', 'bench', '--fast')])
+    ('lab',), ('lab', 'demo'), ('lab', 'bench', '--fast'), ('bench', '--help'),
+    ('replay', 'bag', '--outp', 'results'), ('slam', 'bag', '--imu', 'true')])
 def test_a_wrong_command_line_gives_one_line_and_exit_code_2(arguments: tuple[str, ...]) -> None:
     answer = djet(*arguments)
     assert answer.returncode == 2
