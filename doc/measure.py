@@ -170,7 +170,7 @@ def digest_of_the_code() -> str:
 def begun(output: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Give the unfinished results of an earlier run with these settings, or empty ones."""
     if output.exists():
-        earlier: dict[str, Any] = json.loads(output.read_text())
+        earlier: dict[str, Any] = json.loads(output.read_text('utf-8'))
         if not earlier['complete'] and earlier['settings'] == settings:
             return earlier
     return {'complete': False, 'settings': settings, 'versions': versions(),
@@ -342,7 +342,7 @@ def replayed(folder: Path, values: dict[str, Any], output: Path) -> dict[str, An
     """Replay a sequence with some parameters; gives what its summary tells of the whole way."""
     config = from_flat(values)
     with closing(open_recording(folder)) as recording, ResultsFolder(output, config) as results:
-        summary = Replay(recording, config, results, folder.name).run().summary
+        summary = Replay(recording, config, folder.name).run(results).summary
     return {what: {name: rounded(value) if value is not None else None
                    for name, value in summary[what].items()} for what in ('drift', 'positions')}
 

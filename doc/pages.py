@@ -38,15 +38,15 @@ NO_WAY = ('rotation', 'standstill')
 
 
 def main(check: bool) -> int:
-    results = json.loads(RESULTS.read_text())
+    results = json.loads(RESULTS.read_text('utf-8'))
     stale = []
     for page in PAGES:
-        text = page.read_text()
+        text = page.read_text('utf-8')
         filled = BLOCK.sub(lambda found: found[1] + found[2] + BLOCKS[found[1]](results), text)
         if filled != text:
             stale.append(page.relative_to(ROOT).as_posix())
             if not check:
-                page.write_text(filled)
+                page.write_text(filled, 'utf-8')
     if check and stale:
         print(f'not what the data give, run make pages: {", ".join(stale)}', file=sys.stderr)
         return 1
@@ -54,7 +54,7 @@ def main(check: bool) -> int:
 
 
 def data(name: str) -> Any:
-    return yaml.safe_load((DOC / f'{name}.yaml').read_text())
+    return yaml.safe_load((DOC / f'{name}.yaml').read_text('utf-8'))
 
 
 def paragraph(text: str) -> str:

@@ -100,7 +100,7 @@ class Unmeasured(Exception):
 
 def main() -> int:
     args = arguments()
-    tables = yaml.safe_load(OUTPUT.read_text())
+    tables = yaml.safe_load(OUTPUT.read_text('utf-8'))
     failed = False
     for name in args.tables:
         try:
@@ -257,7 +257,7 @@ def block(place: Path, size: str, seed: int) -> Path:
 def slam(place: Path, source: Path, *words: Any) -> dict[str, Any]:
     """Give the summary of ``djet slam``."""
     djet('slam', source, '--output', place / 'slam', '--overwrite', *words)
-    summary: dict[str, Any] = json.loads((place / 'slam' / 'slam.json').read_text())
+    summary: dict[str, Any] = json.loads((place / 'slam' / 'slam.json').read_text('utf-8'))
     return summary
 
 
@@ -267,7 +267,7 @@ def slam(place: Path, source: Path, *words: Any) -> dict[str, Any]:
 def soak(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Run many frames through the odometry."""
     djet('lab', 'soak', '--output', place / 'soak.json')
-    found = json.loads((place / 'soak.json').read_text())
+    found = json.loads((place / 'soak.json').read_text('utf-8'))
     statuses, stretches = found['status'], found['stretches']
     tracked = sum(statuses.get(name, 0) for name in ('OK', 'NO_PARALLAX'))
     jumps = statuses.get('TIME_JUMP', 0)
@@ -347,7 +347,7 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def covered(folder: Path, name: str = '') -> list[list[str]]:
     """Rows of a run of coverage, both of a scene's in one; without those that tell no pose."""
-    found = json.loads((folder / 'coverage.json').read_text())
+    found = json.loads((folder / 'coverage.json').read_text('utf-8'))
     at = [found['levels'].index(level) for level in (0.95, 0.999)]
     by_scene: dict[str, list[list[str]]] = {}
     for row in found['rows']:
@@ -549,7 +549,7 @@ class Node:
 
     def memory_mb(self) -> float:
         """Resident memory of the largest of its processes."""
-        pages = max(int((process / 'statm').read_text().split()[1])
+        pages = max(int((process / 'statm').read_text('utf-8').split()[1])
                     for process in self._processes())
         return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
@@ -572,7 +572,7 @@ class Node:
     def _cpu_ms(self) -> float:
         ticks = 0
         for process in self._processes():
-            fields = (process / 'stat').read_text().rsplit(')', 1)[1].split()
+            fields = (process / 'stat').read_text('utf-8').rsplit(')', 1)[1].split()
             ticks += int(fields[11]) + int(fields[12])
         return 1e3 * ticks / os.sysconf('SC_CLK_TCK')
 

@@ -10,6 +10,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import tempfile
 import tracemalloc
 
 import cv2
@@ -21,7 +22,9 @@ from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.decoding import decoder, jazzy, MAKE, message_type, MOST_ELEMENTS
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import BagRecording
+from djet_ros.recordings.storages import open_storage
 from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE
+from djet_ros.recordings.storages.chunked import MOST_HELD, MOST_WAITING
 from djet_ros.recordings.storages.compression import zstd
 import numpy as np
 import pytest
@@ -227,6 +230,40 @@ def test_a_folder_that_is_no_bag_is_never_overwritten(small_kitti, tmp_path):
     with pytest.raises(DjetError, match='exists and is no bag folder'):
         write_kitti_bag(KittiSequence(small_kitti()), tmp_path / 'home', overwrite=True)
     assert (tmp_path / 'home' / 'thesis.txt').read_text() == 'mine'
+
+
+def keep_notes(folder):
+    (folder / 'notes.txt').write_text('mine')
+
+
+def keep_a_recording(folder):
+    shutil.copy(folder / 'out.mcap', folder / 'out_0.mcap')
+
+
+def keep_a_folder(folder):
+    (folder / 'photos').mkdir()
+
+
+def rename_the_file(folder):
+    (folder / 'out.mcap').rename(folder / 'rosbag2_0.mcap')
+
+
+def lose_the_metadata(folder):
+    (folder / 'metadata.yaml').unlink()
+
+
+@pytest.mark.parametrize('change', [keep_notes, keep_a_recording, keep_a_folder, rename_the_file,
+                                    lose_the_metadata])
+def test_a_folder_that_holds_anything_but_a_bag_of_ours_is_never_overwritten(
+        small_kitti, tmp_path, change):
+    sequence = KittiSequence(small_kitti(frames=2))
+    write_kitti_bag(sequence, tmp_path / 'out')
+    change(tmp_path / 'out')
+    before = sorted((tmp_path / 'out').iterdir())
+    with pytest.raises(DjetError, match='out exists and is no bag folder as this command writes'):
+        write_kitti_bag(sequence, tmp_path / 'out', overwrite=True)
+    assert sorted((tmp_path / 'out').iterdir()) == before
+    assert [path.name for path in tmp_path.iterdir() if 'out' in path.name] == ['out']
 
 
 def interrupt(written):
@@ -596,7 +633,28 @@ def test_a_compressed_file_cut_short_gives_its_first_messages(tmp_path):
     delivered, said = read_until_broken(path)
     assert len(delivered) > 30
     assert str(file) in said
-    assert not list(Path(os.environ.get('TMPDIR', '/tmp')).glob('djet-*/bag.mcap'))
+    assert not list(Path(os.environ.get('TMPDIR', '/tmp')).glob('djet-*/bag.mcap*'))
+
+
+def test_of_a_bag_compressed_file_by_file_one_file_at_a_time_is_unpacked(tmp_path, monkeypatch):
+    """Each pass reads all of it, and so do two at once."""
+    (tmp_path / 'scratch').mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'scratch'))
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    for part in range(3):
+        one = record(tmp_path / f'part_{part}', (('/pose', pose(s), s) for s in range(
+            10 * part + 1, 10 * part + 11)), mode=CompressionMode.FILE)
+        shutil.move(one / f'part_{part}.mcap.zstd', bag / f'bag_{part}.mcap.zstd')
+    with Bag(bag) as opened:
+        for _ in range(2):
+            stamps = []
+            for first, second in zip(opened.messages(), opened.messages(), strict=True):
+                assert len(list((tmp_path / 'scratch').glob('*/*'))) == 1
+                assert first.stamp_ns == second.stamp_ns
+                stamps.append(first.stamp_ns)
+            assert stamps == list(range(1, 31))
+    assert list((tmp_path / 'scratch').iterdir()) == []
 
 
 @pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
@@ -689,6 +747,8 @@ def test_a_wrong_database_is_refused(whole, tmp_path, statement, said):
     ('[/etc/passwd]', "'/etc/passwd', which lies outside the bag"),
     ('[bag.mcap, gone.mcap]', "'gone.mcap', which does not exist"),
     ('[]', 'lists no file'),
+    ('[bag.mcap, bag.mcap]', "lists 'bag.mcap' 2 times"),
+    ('[bag.mcap, bag/bag.mcap]', "lists 'bag.mcap' 2 times"),
     ('7', "no list 'relative_file_paths'"),
     ('[{a: b}]', "no list 'relative_file_paths'"),
     ('[', 'is not valid YAML'),
@@ -737,6 +797,47 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
     assert 'more than the 1000 bytes announced' in liar
     assert f'announces {2**63} bytes' in absurd
     assert 'a zstd message is cut short or too large' in long
+
+
+def mcap_of(records, times):
+    """Build an MCAP file of one zstd chunk, as often as wanted."""
+    def record_of(code, body):
+        return struct.pack('<BQ', code, len(body)) + body
+
+    def text(value):
+        return struct.pack('<I', len(value)) + value
+
+    schema = struct.pack('<H', 1) + text(b'sensor_msgs/msg/Image') + text(b'ros2msg') + text(b'')
+    channel = struct.pack('<HH', 1, 1) + text(b'/image') + text(b'cdr') + text(b'')
+    data = record_of(3, schema) + record_of(4, channel) + records(record_of)
+    packed = zstd.compress(data)
+    chunk = record_of(6, struct.pack('<QQQI', 1, 1, len(data), 0) + text(b'zstd')
+                      + struct.pack('<Q', len(packed)) + packed)
+    return (b'\x89MCAP0\r\n' + record_of(1, text(b'ros2') + text(b'')) + chunk * times
+            + record_of(15, bytes(4)) + record_of(2, bytes(20)) + b'\x89MCAP0\r\n')
+
+
+def test_chunks_that_unpack_to_more_than_memory_holds_are_refused(tmp_path):
+    """All of them begin at the same time, so that none is done before the last was read."""
+    message = struct.pack('<HIQQ', 1, 0, 1, 1)
+    for data in (mcap_of(lambda record: record(5, message) * (MOST_WAITING // 2 + 1), 2),
+                 mcap_of(lambda record: record(5, message + bytes(MOST_HELD // 5)), 6)):
+        assert len(data) < 100_000
+        (tmp_path / 'bomb').write_bytes(data)
+        with pytest.raises(BrokenFile, match='so far out of order, at byte .* have to be held'):
+            next(open_storage(tmp_path / 'bomb').messages({1}))
+
+
+def test_chunks_in_the_order_of_their_topics_are_merged_by_time(tmp_path):
+    """As a tool writes them that copies one topic after the other; far more than four overlap."""
+    path = tmp_path / 'bag'
+    with ResultBag(path) as bag:
+        for topic in range(8):
+            for stamp in range(1, 40):
+                bag.write(f'/image{topic}', image(8 * stamp + topic), 8 * stamp + topic)
+    with Bag(path) as opened:
+        messages = [(m.stamp_ns, m.topic) for m in opened.messages()]
+    assert messages == [(stamp, f'/image{stamp % 8}') for stamp in range(8, 320)]
 
 
 def whole_message(tmp_path, data):

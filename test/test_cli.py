@@ -73,22 +73,14 @@ def test_every_command_has_help(command: str) -> None:
     assert answer.stderr == ''
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('verb', LAB)
-def test_the_old_spelling_of_a_lab_verb_works_with_a_hint_of_one_line(verb: str) -> None:
-    old, new = djet(verb, '--help'), djet('lab', verb, '--help')
-    assert (old.returncode, old.stdout) == (0, new.stdout)
-    assert old.stderr.count('\n') == 1
-    assert f'djet lab {verb}' in old.stderr
-
-
 def test_the_version_is_the_packages() -> None:
     assert djet('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
 
 
 @pytest.mark.parametrize('arguments', [
     (), ('reply',), ('--fast',), ('--', 'demo', '--fast'), ('demo', '--fast'), ('-', 'demo'),
-    ('lab',), ('lab', 'demo'), ('lab', 'bench', '--fast')])
+    ('lab',), ('lab', 'demo'), ('lab', 'bench', '--fast'), ('bench', '--help'),
+    ('replay', 'bag', '--outp', 'results'), ('slam', 'bag', '--imu', 'true')])
 def test_a_wrong_command_line_gives_one_line_and_exit_code_2(arguments: tuple[str, ...]) -> None:
     answer = djet(*arguments)
     assert answer.returncode == 2

@@ -474,10 +474,12 @@ def test_missing_poses_are_one_line_and_exit_code_2(small_kitti, tmp_path):
     assert 'has no ground truth for two frames in a row' in answer.stderr
 
 
-def test_a_scheduler_that_is_not_there_is_one_line_and_exit_code_2(road, tmp_path):
+def test_a_scheduler_that_is_not_there_is_one_line_and_costs_no_earlier_records(road, tmp_path):
     pytest.importorskip('distributed')
-    answer = djet('evaluate', road, '--end', '3', '--output', tmp_path,
+    (tmp_path / 'records.jsonl').write_text('of an earlier run\n')
+    answer = djet('evaluate', road, '--end', '3', '--output', tmp_path, '--overwrite',
                   '--scheduler', 'tcp://127.0.0.1:9')
+    assert (tmp_path / 'records.jsonl').read_text() == 'of an earlier run\n'
     assert answer.returncode == 2
     assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in answer.stderr.splitlines()[-1]
 

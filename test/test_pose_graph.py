@@ -69,7 +69,7 @@ class Drive:
 def replayed(path, source=None, **parameters):
     config = from_flat({'odometry.scale': 'constant', **parameters}) if parameters else Config()
     with ResultsFolder(path, config) as folder:
-        Replay(source or Drive(), config, folder, 'drive').run()
+        Replay(source or Drive(), config, 'drive').run(folder)
     return path
 
 

@@ -13,6 +13,7 @@ import time
 from cards import Cards, DEPTHS, K, pose, SIZE
 import cv2
 from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
@@ -43,9 +44,9 @@ STEP = pose(x=0.25, z=0.15, yaw=0.01)
 SECOND = 10**9
 
 
-def djet(*words, expect=0):
+def djet(*words, expect=0, **settings):
     done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
-                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1', **settings})
     assert done.returncode == expect, done.stderr
     assert 'Traceback' not in done.stderr
     return done
@@ -411,6 +412,27 @@ def test_results_are_replaced_only_on_demand_and_nothing_else_is(bag, replayed, 
                                         expect=2).stderr
 
 
+@pytest.mark.parametrize('mistake', [
+    ('absent',), ('bag', '--mask-file', 'absent.png'), ('bag', '--poses', 'absent.txt'),
+    ('bag', '--scale', 'speed'), ('bag', '--preset', 'bset'), ('bag', '--imu-topic', '/imu')])
+def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replayed, tmp_path):
+    results = tmp_path / 'results'
+    shutil.copytree(replayed[0], results)
+    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    source, *words = mistake
+    said = djet('replay', bag if source == 'bag' else tmp_path / source, *words, '--output',
+                results, '--overwrite', expect=2).stderr
+    assert said.count('\n') == 1
+    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+
+
+def test_results_are_utf_8_whatever_the_locale_is(bag, tmp_path):
+    djet('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
+         PYTHONCOERCECLOCALE='0')
+    assert 'rad/s²' in (tmp_path / 'out' / 'config.yaml').read_text('utf-8')
+    assert load_yaml(tmp_path / 'out' / 'config.yaml') == Config()
+
+
 # What is refused
 
 def missing(tmp_path, bag):
@@ -471,6 +493,10 @@ def bad_config(tmp_path, bag):
     (lambda t, b: [b, '--scale', 'camera_height'], 'give the metres from the ground'),
     (lambda t, b: [b, '--scale', 'constant'], 'scale_value is 0; give the metres of each'),
     (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
+    (lambda t, b: [b, '--imu', 'true', '--imu-topic', '/other'], "no topic '/other' for 'imu'"),
+    *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
+       f"--{what}-topic is '/some', but nothing asks for it; set odometry.")
+      for what in ('speed', 'imu', 'guess', 'mask')],
 ])
 def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     done = djet('replay', *make(tmp_path, bag), '--output', tmp_path / 'results', expect=2)

@@ -4,6 +4,7 @@ from dataclasses import replace
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tracemalloc
@@ -620,6 +621,33 @@ def test_the_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--scale', 'constant',
                    expect=2)
     assert 'have their parameters already' in refused.stderr
+
+
+def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_path):
+    shutil.copytree(closed, tmp_path / 'slam')
+    before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
+    results = tmp_path / 'slam' / 'replay'
+    for mistake, said in (((tmp_path / 'absent',), 'does not exist'),
+                          ((drive, '--mask-file', tmp_path / 'absent.png'), 'absent.png'),
+                          ((drive, '--loop-gap', '-1'), 'loop_gap is -1'),
+                          ((results, '--source', tmp_path / 'absent'), 'absent'),
+                          ((results, '--mask-topic', '/mask'), 'nothing asks for it'),
+                          ((results, '--imu-topic', '/imu'), 'nothing asks for it')):
+        refused = djet('slam', *mistake, '--output', tmp_path / 'slam', '--overwrite', expect=2)
+        assert said in refused.stderr
+        assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
+                if path.is_file()} == before
+
+
+def test_a_run_over_earlier_results_leaves_none_of_them(closed, drive, tmp_path):
+    out = tmp_path / 'slam'
+    shutil.copytree(closed, out)
+    (out / 'notes.txt').write_text('mine')
+    djet('slam', out / 'replay', '--output', out, '--overwrite', '--links', 2, *FLAGS)
+    assert json.loads((out / 'slam.json').read_text())['parameters']['links'] == 2
+    djet('slam', drive, '--output', out, '--overwrite', *FLAGS)
+    assert json.loads((out / 'slam.json').read_text())['parameters']['links'] != 2
+    assert (out / 'notes.txt').read_text() == 'mine'
 
 
 def test_links_to_more_keyframes_are_edges_of_unknown_length(closed, tmp_path):

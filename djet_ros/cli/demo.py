@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     for method, folder in results.items():
         _djet('replay', bag, '--output', folder, '--method', method, *overwrite)
 
-    console().print(_comparison({method: json.loads((folder / SUMMARY).read_text())
+    console().print(_comparison({method: json.loads((folder / SUMMARY).read_text('utf-8'))
                                  for method, folder in results.items()}))
     for folder in results.values():
         print(f'plot: {folder / PLOT}')

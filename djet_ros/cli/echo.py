@@ -10,12 +10,13 @@ from threading import Event
 from time import monotonic
 from typing import Any
 
+from djet_ros.cli import terminal
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
 from djet_ros.config.sections import NODE_NAME
 import numpy as np
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 DESCRIPTION = f"""\
 Show the integrated poses of a live odometry (djet live, or vo_node under ROS), a line each; with
@@ -101,9 +102,9 @@ class Monitor:
     def diagnostics(self, message: Any) -> None:
         """Take the status of the node, if it is its."""
         for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            if 'frames processed' in values:
-                self.summary, self.values, self.news = status.message, values, True
+            if status.name == f'{self.node}: visual odometry':
+                self.values = {pair.key: pair.value for pair in status.values}
+                self.summary, self.news = status.message, True
                 self.level = int(status.level)
 
     @property
@@ -115,10 +116,10 @@ class Monitor:
     def table(self) -> Table:
         """Show it all."""
         table = Table(title=self.node, show_header=False, min_width=48)
-        table.add_row('state', f'[{_COLOURS.get(self.level, "red")}]{self.summary}')
+        table.add_row('state', Text(self.summary, _COLOURS.get(self.level, 'red')))
         table.add_row('path', self.length)
         for name in _SHOWN:
-            table.add_row(name, self.values.get(name, '–'))
+            table.add_row(name, Text(self.values.get(name, '–')))
         return table
 
     def line(self) -> str:
@@ -158,7 +159,7 @@ def _print_pose(message: Any) -> None:
 
 def _show(view: Monitor, graph: Any, stop: Event, waiting: _Waiting) -> None:
     """Keep a terminal up to date, or print a line for each diagnostics message."""
-    console = Console()
+    console = terminal.console()
     if console.is_terminal:
         with Live(view.table(), console=console, auto_refresh=False) as live:
             while not stop.is_set():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 import os
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from djet_ros import __version__
 from djet_ros.errors import DjetError
@@ -45,7 +45,14 @@ LAB = {
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that reports a wrong command line in one line, without the whole usage."""
+    """
+    A parser that reports a wrong command line in one line, without the whole usage.
+
+    Options stand in full: ``--imu`` must not be ``--imu-topic`` where there is no ``--imu``.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings, allow_abbrev=False)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'djet: error: {message} (see {self.prog} --help)\n')
@@ -78,9 +85,8 @@ def run(argv: Sequence[str]) -> int:
     """Run one subcommand, letting its exceptions through."""
     parser = _Parser(prog='djet', description='Visual odometry by D-JET, from bags and datasets.')
     parser.add_argument('--version', action='version', version=f'djet_ros {__version__}')
-    words = _as_spelt_today(argv)
-    _add_commands(parser, COMMANDS, words)
-    args = parser.parse_args(words)
+    _add_commands(parser, COMMANDS, argv)
+    args = parser.parse_args(argv)
     code: int = args.run(args)
     return code
 
@@ -102,17 +108,6 @@ def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, str],
             command.description = module.DESCRIPTION
             module.add_arguments(command)
             command.set_defaults(run=module.run)
-
-
-def _as_spelt_today(argv: Sequence[str]) -> list[str]:
-    """Put ``lab`` before its verbs, which stood at the first level in version 0.1, and say so."""
-    words, place = list(argv), _first_plain(argv)
-    if place is not None and words[place] in LAB:
-        verb = words[place]
-        print(f"djet: 'djet {verb}' is 'djet lab {verb}' now; the old spelling goes with the next "
-              'version', file=sys.stderr)
-        words.insert(place, 'lab')
-    return words
 
 
 def _first_plain(words: Sequence[str]) -> int | None:

@@ -38,6 +38,12 @@ def check_output(args: argparse.Namespace, *suffixes: str) -> None:
     make_folder(args.output.parent)
 
 
+def check_json_output(args: argparse.Namespace) -> None:
+    """Raise DjetError as ``check_output`` does, also where the plot can't be beside --output."""
+    check_output(args, '.json')
+    check_file(args.output.with_suffix('.png'), args.overwrite)
+
+
 def write_json(path: Path, figures: dict[str, Any], draw: Callable[[Path], None]) -> None:
     """Write figures as JSON, draw the plot beside them, and say where both are."""
     write_whole(path, json.dumps(figures, indent=2) + '\n')

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
 import math
 from pathlib import Path
 import sys
@@ -36,6 +38,12 @@ _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value'
           'odometry.mask', 'odometry.mask_file')
 
 
+# By what parameters that is asked for of which an option names the topic.
+_ASKED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true',
+             'guess': 'odometry.guess to true or odometry.scale to guess, without a guess_frame',
+             'mask': 'odometry.mask to true'}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE',
@@ -59,7 +67,8 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
 
 def run(args: argparse.Namespace) -> int:
     """Replay with a progress bar on stderr, and show what came of it on stdout."""
-    outcome = replayed(args, configured(args), args.source, args.output)
+    with prepared(args, configured(args), args.source, args.output) as replay:
+        outcome = replay()
     if outcome.summary['frames']:
         console().print(_table(outcome.summary))
         print(f'results: {args.output}')
@@ -78,17 +87,32 @@ def configured(args: argparse.Namespace, *nodes: str) -> Config:
     return with_values(config, flag_values(args))
 
 
-def replayed(args: argparse.Namespace, config: Config, recording: Path, folder: Path) -> Outcome:
-    """Replay a recording, of which the options tell the topics and poses, into a folder."""
-    source = open_recording(recording, args.image_topic, args.info_topic, args.poses,
-                            beside={what: getattr(args, f'{what}_topic', None)
-                                    for what in _wanted_beside(config.odometry)})
-    try:
+@contextmanager
+def prepared(args: argparse.Namespace, config: Config, recording: Path, folder: Path
+             ) -> Iterator[Callable[[], Outcome]]:
+    """
+    Open a recording, of which the options tell the topics and poses; give what replays it.
+
+    Then make room in the folder, where an earlier run's results stay if anything is refused.
+    """
+    wanted = _wanted_beside(config.odometry)
+    check_topics(args, wanted)
+    with open_recording(recording, args.image_topic, args.info_topic, args.poses,
+                        beside={what: getattr(args, f'{what}_topic', None)
+                                for what in wanted}) as source:
+        replay = Replay(source, config, str(recording))
         with ResultsFolder(folder, config, args.overwrite) as results, \
                 progress_bar('replay', len(source)) as advance:
-            return Replay(source, config, results, str(recording)).run(advance)
-    finally:
-        source.close()
+            yield partial(replay.run, results, advance)
+
+
+def check_topics(args: argparse.Namespace, wanted: Collection[str]) -> None:
+    """Raise DjetError where an option names the topic of something that is not asked for."""
+    for what, ask in _ASKED_BY.items():
+        topic = getattr(args, f'{what}_topic', None)
+        if topic is not None and what not in wanted:
+            raise DjetError(f"--{what}-topic is '{topic}', but nothing asks for it; set {ask}, "
+                            'or leave it out')
 
 
 def _wanted_beside(config: OdometryConfig) -> list[str]:

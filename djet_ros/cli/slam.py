@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.options import add_output
-from djet_ros.cli.replay import add_replay_options, configured, replayed
+from djet_ros.cli.replay import add_replay_options, check_topics, configured, prepared
 from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
@@ -18,7 +18,7 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
 from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
-from djet_ros.recordings.outputs import make_room
+from djet_ros.recordings.outputs import check_room, make_folder, make_room
 from djet_ros.recordings.recording import open_recording, Recording
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     given = flag_values(args)
     of_slam = {name: given.pop(name) for name in PARAMETERS if name in given}
     config = configured(args, NODE_NAME, GRAPH_NAME)
-    make_room(args.output, FILES, args.overwrite)
+    check_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
         if args.config or given:
@@ -63,18 +63,23 @@ def run(args: argparse.Namespace) -> int:
                             'the recording itself, to replay it with others')
     else:
         results = args.output / 'replay'
-        outcome = replayed(args, config, args.input, results)
+        with prepared(args, config, args.input, results) as replay:
+            # They would be of another replay than the one beside them.
+            make_room(args.output, FILES, args.overwrite)
+            outcome = replay()
         if outcome.problem:
             raise DjetError(outcome.problem)
     config = with_values(load_yaml(results / 'config.yaml'), of_slam)
     source, name = _source(results, args, config)
     try:
         steps = read_steps(results)
+        make_folder(args.output)
         with progress_bar('frames') as progress:
             slam = run_slam(steps, source, config, progress, args.output)
         truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
     finally:
         source.close()
+    make_room(args.output, FILES, args.overwrite)
     summary = write_report(args.output, slam, truth, name, config)
     console().print(_table(summary))
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
@@ -86,12 +91,14 @@ def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Re
     summary = read_yaml(results / REPLAY_SUMMARY)
     if not isinstance(summary, dict) or not isinstance(summary.get('source'), str):
         raise DjetError(f'{results / REPLAY_SUMMARY} does not say which recording was replayed')
+    beside = {'mask': args.mask_topic} if config.odometry.mask else {}
+    if results == args.input:
+        check_topics(args, beside)
     path = args.source or Path(summary['source'])
     if not path.exists():
         raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
                         '--source where it is')
     topic = args.image_topic or (str(summary.get('image_topic')) if is_bag(path) else None)
-    beside = {'mask': args.mask_topic} if config.odometry.mask else {}
     return (open_recording(path, topic, args.info_topic, args.poses, beside), summary['source'])
 
 

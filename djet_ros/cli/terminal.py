@@ -26,9 +26,14 @@ _FILE_WIDTH = 200
 
 
 def console() -> Console:
-    """Give what tables are printed on: as wide as the terminal, or as wide as they are."""
-    found = Console()
-    return found if found.is_terminal or 'COLUMNS' in os.environ else Console(width=_FILE_WIDTH)
+    """
+    Give what tables are printed on: as wide as the terminal, or as wide as they are.
+
+    Names come from strangers' folders and bags: what looks like rich's markup is not.
+    """
+    found = Console(markup=False)
+    return (found if found.is_terminal or 'COLUMNS' in os.environ
+            else Console(markup=False, width=_FILE_WIDTH))
 
 
 class _Rate(ProgressColumn):
@@ -46,9 +51,9 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[..., 
     That goes on by one without arguments, else to (done) or (done, of how many).
     """
     console = Console(stderr=True)
-    bar = Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), _Rate(),
-                   TimeRemainingColumn(), console=console, transient=True,
-                   disable=not console.is_terminal)
+    bar = Progress(TextColumn('{task.description}', markup=False), BarColumn(),
+                   MofNCompleteColumn(), _Rate(), TimeRemainingColumn(), console=console,
+                   transient=True, disable=not console.is_terminal)
     # A bar of rich 13 that is disabled still leaves an empty line behind where it ends.
     with bar if console.is_terminal else nullcontext():
         task = bar.add_task(what, total=total)

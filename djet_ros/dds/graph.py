@@ -314,7 +314,7 @@ def _configuration(environment: Mapping[str, str]) -> str:
 def _chooses_interfaces(uri: str) -> bool:
     """Tell whether a Cyclone configuration, which is XML or names of files, chooses interfaces."""
     files = [Path(name) for name in re.findall('file://([^,]+)', uri)]
-    texts = [uri, *(file.read_text(errors='replace') for file in files if file.is_file())]
+    texts = [uri, *(file.read_text('utf-8', 'replace') for file in files if file.is_file())]
     return any('<NetworkInterface' in text for text in texts)
 
 

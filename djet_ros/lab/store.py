@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -42,7 +43,8 @@ class RecordStore(Closing, Generic[R]):
         self._kind = kind
         settings = _with_versions(settings)
         if self.path.exists() and not overwrite:
-            self._read(settings)
+            # What is cut off is the last line that a killed run has left unfinished.
+            os.truncate(self.path, self._read(settings))
             self._file = self.path.open('a', encoding='ascii')
         else:
             self._file = self.path.open('w', encoding='ascii')
@@ -61,17 +63,20 @@ class RecordStore(Closing, Generic[R]):
         self._file.write(json.dumps(line, allow_nan=False) + '\n')
         self._file.flush()
 
-    def _read(self, settings: dict[str, Any]) -> None:
-        whole = _whole_lines(self.path)
-        if not whole or json.loads(whole[0]) != settings:
-            before = _parsed(self.path, 1, whole[0]) if whole else {}
+    def _read(self, settings: dict[str, Any]) -> int:
+        """Take the chunks of an earlier run, and give how many bytes of its file are good."""
+        content = self.path.read_bytes()
+        length = content.rfind(b'\n') + 1
+        whole = content[:length].decode('ascii', 'replace').splitlines()
+        before = _parsed(self.path, 1, whole[0]) if whole else {}
+        if before != settings:
             other = [name for name in settings if settings[name] != before.get(name)]
             raise DjetError(f'{self.path.parent} holds results of other settings '
                             f'({", ".join(other)}); choose another folder, or --overwrite')
         for number, line in enumerate(whole[1:], 2):
-            content = _parsed(self.path, number, line)
-            self.chunks[content['chunk']] = [self._record(values)
-                                             for values in content['records']]
+            chunk = _parsed(self.path, number, line)
+            self.chunks[chunk['chunk']] = [self._record(values) for values in chunk['records']]
+        return length
 
     def _record(self, values: dict[str, Any]) -> R:
         told = {name: float('nan') if value is None else value for name, value in values.items()}
@@ -82,15 +87,6 @@ class RecordStore(Closing, Generic[R]):
 def _with_versions(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {'djet_ros': __version__,
             'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__}, **settings}
-
-
-def _whole_lines(path: Path) -> list[str]:
-    """Lines of the file, cutting off a last one that a killed run has left unfinished."""
-    content = path.read_bytes()
-    whole = content[:content.rfind(b'\n') + 1]
-    if len(whole) < len(content):
-        path.write_bytes(whole)
-    return whole.decode('ascii', 'replace').splitlines()
 
 
 def _parsed(path: Path, number: int, line: str) -> dict[str, Any]:

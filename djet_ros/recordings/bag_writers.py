@@ -15,7 +15,6 @@ from typing import Any
 
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import OPTICAL_TO_BODY
-from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, MAKE
 from djet_ros.recordings.frame_sequence import FrameSequence
@@ -34,6 +33,8 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+# Of the one file that each storage writes, named after its folder.
+SUFFIXES = ('.mcap', '.db3')
 
 FOREVER = QosTime(9223372036, 854775807)
 
@@ -60,12 +61,13 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     ``progress`` is called with the number of frames written so far. The bag appears under its
     name when it is complete; a failure or an interrupt leaves nothing (a kill a hidden folder
     beside it), and with ``overwrite`` leaves the old bag. Raises DjetError where ``out`` exists
-    or can't be written.
+    (with ``overwrite``: and holds anything but such a bag) or can't be written.
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
     recording = SequenceRecording(sequence, imu=True)
-    with _left_whole(out), appearing(out, overwrite, is_bag, 'bag folder') as folder:
+    with _left_whole(out), appearing(out, overwrite, _is_written_here,
+                                     'bag folder as this command writes it') as folder:
         writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
         with writer:
             _write_map_frame(writer, int(sequence.stamps_ns[0]))
@@ -123,6 +125,13 @@ class ResultBag(Closing):
         except OSError as error:
             raise DjetError(f'{self.path} could not be written: {error.strerror}; what was '
                             'written before is readable') from error
+
+
+def _is_written_here(folder: Path) -> bool:
+    """Tell whether a folder holds a bag as ``write_kitti_bag`` leaves it, and nothing else."""
+    held = {path.name for path in folder.iterdir() if path.is_file() and not path.is_symlink()}
+    return len(held) == len(list(folder.iterdir())) and held in (
+        {'metadata.yaml', f'{folder.name}{suffix}'} for suffix in SUFFIXES)
 
 
 def _write(writer: Writer, topic: str, message: Any, stamp_ns: int) -> None:

@@ -42,13 +42,15 @@ class Bag(Closing):
 
     Takes a rosbag2 folder (with or without metadata.yaml), one of its files (.mcap, .db3, also
     .zstd), or a ROS 1 bag. Raises DjetError where that is not what the path holds. Close it, or
-    use it in a ``with`` statement: a bag compressed file by file is unpacked for as long.
+    use it in a ``with`` statement: of a bag compressed file by file, one file is unpacked for as
+    long.
     """
 
     def __init__(self, path: Path) -> None:
         """Find out the topics."""
         self.path = path
         self._stack = ExitStack()
+        self._scratch: Path | None = None
         try:
             with _blaming(path):
                 files = _files(path)
@@ -72,6 +74,8 @@ class Bag(Closing):
             chosen = {connection.number: connection for connection in storage.connections
                       if topics is None or connection.topic in topics}
             with _blaming(file):
+                # Its place may have been needed for another.
+                self._unpacked(file)
                 yield from _decoded(storage, chosen)
 
     def close(self) -> None:
@@ -80,12 +84,20 @@ class Bag(Closing):
 
     def _opened(self, file: Path) -> Storage:
         with _blaming(file):
-            with file.open('rb') as stream:
-                packed = stream.read(len(ZSTD_MAGIC)) == ZSTD_MAGIC
-            if packed:
-                folder = self._stack.enter_context(TemporaryDirectory(prefix='djet-'))
-                return open_storage(decompress_file(file, Path(folder)))
-            return open_storage(file)
+            return open_storage(self._unpacked(file))
+
+    def _unpacked(self, file: Path) -> Path:
+        """Give a file, or what it holds unpacked, which takes the place of what was unpacked."""
+        with file.open('rb') as stream:
+            if stream.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
+                return file
+        if self._scratch is None:
+            self._scratch = Path(self._stack.enter_context(TemporaryDirectory(prefix='djet-')))
+        if not (self._scratch / file.name).exists():
+            for other in self._scratch.iterdir():
+                other.unlink()
+            decompress_file(file, self._scratch)
+        return self._scratch / file.name
 
 
 def is_bag(path: Path) -> bool:
@@ -162,4 +174,7 @@ def _listed(folder: Path) -> list[Path]:
             raise DjetError(f'{listed}, which does not exist; copy it there')
     if not paths:
         raise DjetError(f'{metadata} lists no file; remove it to read the storage files')
+    name, count = Counter(path.name for path in paths).most_common(1)[0]
+    if count > 1:
+        raise DjetError(f"{metadata} lists '{one_line(name)}' {count} times; correct the list")
     return [folder / path.name for path in paths]

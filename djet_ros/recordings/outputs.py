@@ -78,13 +78,12 @@ def _check_bars(folder: Path) -> None:
 def write_whole(path: Path, text: str) -> None:
     """Put a text into a file, in the place of what it held: all or nothing. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f'.{path.name}')
-    try:
-        beside.write_text(text, 'utf-8')
-        os.replace(beside, path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
+    # A file in a folder that nobody else has: its mode is that of any new file, not of a
+    # temporary one.
+    with TemporaryDirectory(prefix='.djet-', dir=path.parent) as beside:
+        new = Path(beside) / 'new'
+        new.write_text(text, 'utf-8')
+        os.replace(new, path)
 
 
 @contextmanager

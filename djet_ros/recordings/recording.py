@@ -214,6 +214,9 @@ class BagRecording(Recording):
             elif strict and what == 'tf':
                 raise DjetError(f'{self.bag.path} has no /tf, which odometry.guess_frame asks '
                                 'for; record it too')
+            elif strict and name is not None:
+                raise DjetError(f"{self.bag.path} has no topic '{name}' for '{what}'; choose with "
+                                f'--{what}-topic from: {", ".join(fitting) or "none"}')
             elif strict:
                 raise DjetError(f"{self.bag.path}: one topic of '{what}' is needed; choose one "
                                 f'with --{what}-topic from: {", ".join(fitting) or "none"}')

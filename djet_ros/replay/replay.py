@@ -95,16 +95,15 @@ class Replay:
     """
     One run of a recording through the tracker, with everything that comes of it written.
 
-    name: path of the recording, for people. What goes wrong in the middle does not raise: it ends
-    the run, and the summary and the outcome say what it was.
+    name: path of the recording, for people. All that can be refused is refused before there is a
+    folder. What goes wrong in the middle does not raise: it ends the run, and the summary and the
+    outcome say what it was.
     """
 
-    def __init__(self, recording: Recording, config: Config, folder: ResultsFolder, name: str
-                 ) -> None:
+    def __init__(self, recording: Recording, config: Config, name: str) -> None:
         """Prepare the run; DjetError where the scale needs what the recording does not have."""
         self._recording = recording
         self._config = config
-        self._folder = folder
         self._name = name
         self._frames = _static_frames(recording) if config.odometry.base_frame else StaticFrames()
         self._tracker = Tracker(config, message_type, _scale(recording, config),
@@ -118,8 +117,9 @@ class Replay:
         self._truth = GroundTruth()
         self._log = _Log()
 
-    def run(self, progress: Callable[[], None] | None = None) -> Outcome:
+    def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
         """Run to the end, calling progress after each image; an interrupt is passed on."""
+        self._folder = folder
         started = perf_counter()
         complete, problem = False, 'broken off'
         try:

@@ -62,7 +62,7 @@ class ResultsFolder(Closing):
         self.path = path
         try:
             make_room(path, (*_FILES, BAG), overwrite, marks=(SUMMARY, 'config.yaml'))
-            (path / 'config.yaml').write_text(dump_yaml(config))
+            (path / 'config.yaml').write_text(dump_yaml(config), 'utf-8')
             self._table = LineFile(path / 'frames.csv')
         except OSError as error:
             raise DjetError(f'{path} could not be begun: {error.strerror or error}; make room, or '
@@ -108,7 +108,7 @@ class ResultsFolder(Closing):
     def add_errors(self, pairs: list[Step], errors: PairErrors) -> None:
         """Write the errors of all pairs, empty where there is none."""
         try:
-            with (self.path / 'errors.csv').open('w', newline='') as file:
+            with (self.path / 'errors.csv').open('w', encoding='utf-8', newline='') as file:
                 rows = csv.writer(file, lineterminator='\n')
                 rows.writerow(('previous_stamp_ns', 'stamp_ns', 'status', 'rotation_error_deg',
                                'translation_error_deg'))

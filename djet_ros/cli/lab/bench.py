@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_output, write_json
+from djet_ros.cli.options import add_json_output, check_json_output, write_json
 from djet_ros.cli.terminal import console, new_table
 from djet_ros.errors import DjetError
 from djet_ros.lab.bench import bench, QUOTED_POINTS
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write and show the figures."""
-    check_output(args)
+    check_json_output(args)
     if args.pairs < 1:
         raise DjetError(f'--pairs is {args.pairs}; it must be at least 1')
     with Console(stderr=True).status('measuring ...') as status:

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_output, split, write_json
+from djet_ros.cli.options import add_json_output, check_json_output, split, write_json
 from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate the triangles, write and show them."""
-    check_output(args)
+    check_json_output(args)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
     methods, name = split(args.methods), plain_name(args.source)

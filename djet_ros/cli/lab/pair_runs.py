@@ -77,12 +77,14 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
         make_folder(args.output)
         settings = {'sequences': [dataset.settings() for dataset in datasets],
                     'methods': [method.settings() for method in competing]}
-        with RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store:
-            workers = (dask_workers(args.scheduler) if args.scheduler
-                       else local_workers(args.workers))
-            with workers as executor, progress_bar('pairs') as progress:
-                records = run(executor, chunks_of(datasets),
-                              partial(evaluate_chunk, methods=list(competing)), store, progress)
+        workers = (dask_workers(args.scheduler) if args.scheduler
+                   else local_workers(args.workers))
+        # First the workers: where there are none, earlier records stay.
+        with (workers as executor,
+              RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store,
+              progress_bar('pairs') as progress):
+            records = run(executor, chunks_of(datasets),
+                          partial(evaluate_chunk, methods=list(competing)), store, progress)
         yield datasets, records
     finally:
         shutil.rmtree(workspace, ignore_errors=True)

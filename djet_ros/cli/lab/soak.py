@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_output, write_json
+from djet_ros.cli.options import add_json_output, check_json_output, write_json
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.lab.soak import SIZE, soak
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Soak, write and show the figures."""
-    check_output(args)
+    check_json_output(args)
     with progress_bar('frames', args.frames) as progress:
         figures = soak(args.frames, args.max_growth, progress)
     latency = figures['latency_ms']

@@ -43,9 +43,10 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
     try:
         _clear(folder, truth, overwrite)
         (folder / _LABEL).write_text(f'djet render {name}: seed {seed}, {len(poses)} frames, '
-                                     f'{scene.size[0]}x{scene.size[1]}\n')
+                                     f'{scene.size[0]}x{scene.size[1]}\n', 'utf-8')
         (folder / 'calib.txt').write_text(
-            f'P0: {_projection(scene.K)}\nTr_imu_to_cam: {_projection(TO_CAMERA)}\n')
+            f'P0: {_projection(scene.K)}\nTr_imu_to_cam: {_projection(TO_CAMERA)}\n',
+            'utf-8')
         for index, pose in enumerate(poses):
             path = folder / 'image_0' / f'{index:06d}.png'
             path.write_bytes(_png(scene.render(pose, index)))
@@ -55,7 +56,8 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
             _write_imu(folder / _IMU, feel(poses, FRAME_PERIOD, mems or Mems(), seed,
                                            scene.level))
         (folder / 'times.txt').write_text(''.join(f'{i * FRAME_PERIOD:.6e}\n'
-                                                  for i in range(len(poses))))
+                                                  for i in range(len(poses))),
+                                          'utf-8')
     except OSError as error:
         raise DjetError(f'{error.filename or out} could not be written: {error.strerror}; '
                         'choose another folder or make room') from error
@@ -97,7 +99,7 @@ def _write_imu(path: Path, felt: FeltMotion) -> None:
         for stamp, rate, force in zip(felt.stamps_ns.tolist(), felt.rates.tolist(),
                                       felt.accelerations.tolist(), strict=True))
     path.write_text(f'# true bias of the rates in rad/s: {first} at first, {last} at last\n'
-                    f'{_IMU_COLUMNS}\n{rows}')
+                    f'{_IMU_COLUMNS}\n{rows}', 'utf-8')
 
 
 def _png(gray: NDArray[np.uint8]) -> bytes:

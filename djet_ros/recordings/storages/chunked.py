@@ -4,8 +4,8 @@ Recordings that are a row of compressed chunks (MCAP, ROS 1 bags), read in time 
 The storage readers of rosbags want a file that was closed properly, and decompress a chunk
 without a bound. Recorders lose power, and files come from strangers; so here a file without an
 index is walked from its start, everything before a break is delivered before the break is
-reported, and no chunk takes more memory than LARGEST_PIECE. Memory holds a few chunks and, per
-message that waits for its turn, its place; never the whole file.
+reported, and no chunk takes more memory than LARGEST_PIECE. Memory holds the chunks of which a
+message waits for its turn, within bounds; never the whole file.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
-from functools import lru_cache
 from heapq import heappop, heappush
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE
 
-# Chunks of one recorder overlap by a message or two; more are open where tools merged topics.
-OPEN_CHUNKS = 4
+# Chunks of one recorder overlap by a message or two; more are held where tools merged topics, or
+# wrote one after the other. These are half a gigabyte of chunks, and 150 MB of messages' places.
+MOST_HELD = 4 * LARGEST_PIECE
+MOST_WAITING = 1 << 19
 # Messages outside chunks are read in stretches of about this size.
 STRETCH = 4 << 20
 
@@ -54,6 +55,43 @@ class Place(NamedTuple):
     stamp: int
     begin: int
     end: int
+
+
+class Waiting:
+    """Messages that wait for their turn, and the chunks that they keep in memory."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, int, int, memoryview]] = []
+        # Of each chunk: its size, and how many of its messages wait.
+        self._sizes: dict[int, int] = {}
+        self._counts: Counter[int] = Counter()
+        self._held = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._heap)
+
+    def add(self, chunk: int, place: Place, data: memoryview) -> bool:
+        """Take a message of a chunk, whose records are given; False where that is one too many."""
+        heappush(self._heap, (place.stamp, chunk, place.begin, place.connection,
+                              data[place.begin:place.end]))
+        if chunk not in self._sizes:
+            self._sizes[chunk] = len(data)
+            self._held += len(data)
+        self._counts[chunk] += 1
+        return len(self._heap) <= MOST_WAITING and self._held <= MOST_HELD
+
+    def first(self) -> int:
+        """Give the earliest stamp, in ns."""
+        return self._heap[0][0]
+
+    def pop(self) -> tuple[int, int, memoryview]:
+        """Take out the earliest: connection number, stamp in ns, serialised message."""
+        stamp, chunk, _, connection, data = heappop(self._heap)
+        self._counts[chunk] -= 1
+        if not self._counts[chunk]:
+            self._held -= self._sizes.pop(chunk)
+            del self._counts[chunk]
+        return connection, stamp, data
 
 
 class ChunkedFile(ABC):
@@ -120,28 +158,41 @@ class ChunkedFile(ABC):
         """
         with self.path.open('rb') as file:
             chunks = sorted(self._chunks)
-            unpacked = lru_cache(maxsize=OPEN_CHUNKS)(lambda n: self._unpack(file, chunks[n]))
-            waiting: list[tuple[int, int, int, int, int]] = []
+            waiting = Waiting()
             broken = self._broken
             loaded = 0
             while True:
                 while loaded < len(chunks) and (
-                        not waiting or chunks[loaded].start <= waiting[0][0]):
-                    try:
-                        for place in self._places(unpacked(loaded)):
-                            if place.connection in wanted:
-                                heappush(waiting, (place.stamp, loaded, place.begin, place.end,
-                                                   place.connection))
-                    except BrokenFile as error:
-                        broken = broken or str(error)
+                        not waiting or chunks[loaded].start <= waiting.first()):
+                    if torn := self._load(file, chunks[loaded], loaded, wanted, waiting):
+                        broken = broken or torn
                         del chunks[loaded + 1:]
                     loaded += 1
                 if not waiting:
                     break
-                stamp, number, begin, end, connection = heappop(waiting)
-                yield connection, stamp, unpacked(number).data[begin:end]
+                yield waiting.pop()
         if broken:
             raise BrokenFile(f'{broken}; everything before that was read')
+
+    def _load(self, file: BinaryIO, chunk: Chunk, number: int, wanted: Collection[int],
+              waiting: Waiting) -> str | None:
+        """Let the messages of a chunk wait; give how it is broken, if it is."""
+        full = False
+        try:
+            records = self._unpack(file, chunk)
+            for place in self._places(records):
+                if place.connection in wanted and not waiting.add(number, place, records.data):
+                    full = True
+                    break
+        except BrokenFile as error:
+            return str(error)
+        if full:
+            # What waits may belong after what was not read: none of it can be delivered.
+            raise BrokenFile(
+                f'its messages are so far out of order, at byte {chunk.offset}, that more than '
+                f'{MOST_WAITING} of them or {MOST_HELD >> 20} MB of chunks would have to be held '
+                'to sort them; everything before that was read')
+        return None
 
 
 def read_exactly(file: BinaryIO, offset: int, length: int) -> bytes:

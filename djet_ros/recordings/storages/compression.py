@@ -64,9 +64,10 @@ def decompress_file(path: Path, folder: Path) -> Path:
     """
     Unpack a .zstd file into a folder, which must be removed later, and give the new path.
 
-    At most half of the free space there is taken. A file that is cut short gives what is there.
+    It has the old name. At most half of the free space there is taken. A file that is cut short
+    gives what is there; one that can't be unpacked leaves nothing.
     """
-    unpacked = folder / path.stem
+    unpacked = folder / path.name
     room = shutil.disk_usage(folder).free // 2
     stream = zstd.ZstdDecompressor()
     try:
@@ -79,6 +80,9 @@ def decompress_file(path: Path, folder: Path) -> Path:
                 if room < 0:
                     raise BrokenFile('it takes unpacked more than half of the free space in '
                                      f'{folder.parent}; set TMPDIR to a larger disk')
-    except zstd.ZstdError as error:
-        raise BrokenFile(f'its zstd data is damaged ({error})') from error
+    except BaseException as error:
+        unpacked.unlink(missing_ok=True)
+        if isinstance(error, zstd.ZstdError):
+            raise BrokenFile(f'its zstd data is damaged ({error})') from error
+        raise
     return unpacked

@@ -1,0 +1,90 @@
+"""What is written takes the place of nothing that it was not told to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import stat
+
+from djet_ros.cli.main import main
+from djet_ros.errors import DjetError
+from djet_ros.lab.store import FILE_NAME, RecordStore
+from djet_ros.recordings.outputs import write_whole
+import pytest
+
+
+@dataclass(frozen=True)
+class Count:
+    """The plainest record."""
+
+    number: int
+
+
+def held(folder: Path) -> dict[str, str]:
+    """Give the files of a folder with their content."""
+    return {path.name: path.read_text('utf-8') for path in folder.iterdir()}
+
+
+def test_a_file_is_written_without_touching_any_other(tmp_path: Path) -> None:
+    mine = {f'{before}bashrc{after}': 'mine' for before in ('.', '_') for after in ('', '~')}
+    for name, text in mine.items():
+        (tmp_path / name).write_text(text, 'utf-8')
+    write_whole(tmp_path / 'bashrc', 'ours')
+    assert held(tmp_path) == {**mine, 'bashrc': 'ours'}
+
+
+def test_who_may_read_a_new_file_may_read_one_that_was_written_whole(tmp_path: Path) -> None:
+    for umask in (0o022, 0o027, 0o077):
+        before = os.umask(umask)
+        try:
+            (tmp_path / 'plain').write_text('x', 'utf-8')
+            write_whole(tmp_path / 'whole', 'x')
+        finally:
+            os.umask(before)
+        modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ('plain', 'whole')}
+        assert modes == {0o666 & ~umask}
+        (tmp_path / 'plain').unlink()
+
+
+def test_a_file_that_can_not_be_written_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / 'folder' / 'of').mkdir(parents=True)
+    with pytest.raises(OSError):
+        write_whole(tmp_path / 'folder', 'x')
+    assert [path.name for path in tmp_path.iterdir()] == ['folder']
+
+
+@pytest.mark.parametrize('verb', [('bench', 'sequence'), ('closure', 'sequence'), ('soak',)])
+def test_figures_are_json_and_their_plot_overwrites_no_photo(
+        verb: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'f.png').write_text('my photo', 'utf-8')
+    for name, why in (('g.png', 'its name must end in .json'),
+                      ('f.json', f'{tmp_path / "f.png"} exists already; choose another name')):
+        assert main(['lab', *verb, '--output', str(tmp_path / name)]) == 2
+        said = capsys.readouterr().err
+        assert why in said
+        assert said.count('\n') == 1
+    assert held(tmp_path) == {'f.png': 'my photo'}
+
+
+@pytest.mark.parametrize('text', [
+    'groceries', 'bread\nmilk', '{"shop": "corner"}\n{"item": "bread"}', '{"shop": "corner"}\n'])
+def test_records_that_are_not_ours_are_refused_as_they_are(text: str, tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).write_text(text, 'utf-8')
+    with pytest.raises(DjetError, match='--overwrite'):
+        RecordStore(tmp_path, Count, {'frames': 3})
+    assert held(tmp_path) == {FILE_NAME: text}
+
+
+def test_records_of_a_killed_run_lose_only_the_line_that_was_cut(tmp_path: Path) -> None:
+    with RecordStore(tmp_path, Count, {'frames': 3}) as store:
+        store.add('a', [Count(1), Count(2)])
+    whole = held(tmp_path)
+    with (tmp_path / FILE_NAME).open('a', encoding='utf-8') as file:
+        file.write('{"chunk": "b", "reco')
+    with RecordStore(tmp_path, Count, {'frames': 3}) as store:
+        assert store.chunks == {'a': [Count(1), Count(2)]}
+        assert held(tmp_path) == whole
+        store.add('b', [Count(3)])
+    with RecordStore(tmp_path, Count, {'frames': 3}) as store:
+        assert store.chunks == {'a': [Count(1), Count(2)], 'b': [Count(3)]}
