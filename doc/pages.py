@@ -15,7 +15,9 @@ import sys
 import textwrap
 from typing import Any
 
+from djet_ros.lab.ablation import ON_PLACES
 from djet_ros.lab.methods import TITLES
+from djet_ros.lab.scenes import SCENES
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,7 +34,7 @@ DIGITS = {'rotation': 4, 'direction': 3}
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
 # Scenes in which the camera does not move from its place have no direction to compare.
-NO_WAY = ('rotation', 'standstill')
+NO_WAY = {name for name, entry in SCENES.items() if not entry.parallax}
 
 
 def main(check: bool) -> int:
@@ -290,11 +292,65 @@ def ablation(results: Any) -> str:
     part = results['parts'].get('ablation')
     if part is None:
         return 'Not measured yet.\n'
-    rows = [(TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
-             pair_of(one, 'median')) for one in part['variants']]
     return (paragraph(f'Over {part["variants"][0]["pairs"]} pairs: the first {part["frames"]} '
-                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each.')
-            + table(('method', 'change', 'mean (failed)', 'median'), rows))
+                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each. '
+                      'Ratios are of mean errors, on pairs that both tell, with the 95 % interval '
+                      'of a paired bootstrap over pairs.')
+            + table(VARIANTS, map(variant, part['variants'])) + '\n' + paragraph(verdict(part)))
+
+
+VARIANTS = ('method', 'change', 'mean (failed)', 'median', 'rotation over `best`',
+            'direction over `best`')
+
+
+def variant(one: Any) -> tuple[str, ...]:
+    """Lay out a row of the ablation."""
+    return (TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
+            pair_of(one, 'median'), *(interval(one, what) for what in DIGITS))
+
+
+def interval(one: Any, what: str) -> str:
+    value, least, most = one.get('ratio', {}).get(what, (None,) * 3)
+    return '–' if value is None else f'{value:.2f} ({least:.2f} to {most:.2f})'
+
+
+def verdict(part: Any) -> str:
+    """Say which changes of D-JET the pairs tell from it, and which they do not."""
+    changed = [one for one in part['variants'] if one['method'] == 'djet' and one['change']]
+    if not all('ratio' in one for one in changed):
+        return 'Which of these differences the pairs tell from chance was not measured yet.'
+    said: dict[str, list[str]] = {}
+    for one in changed:
+        said.setdefault(told(one['ratio']), []).append(one['change'])
+    return ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD if word in said)
+
+
+TOLD = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
+        'Better in one, and not told apart in the other', 'Better in one, worse in the other',
+        'Not told from `best`, whose intervals hold 1')
+
+
+def told(ratio: Any) -> str:
+    """Tell by the intervals of both ratios which of TOLD holds."""
+    known = [bounds for bounds in ratio.values() if None not in bounds]
+    worse, better = (sum(least > 1 for _, least, _ in known),
+                     sum(most < 1 for _, _, most in known))
+    if worse and better:
+        return TOLD[4]
+    if worse or better:
+        return TOLD[(0 if worse else 2) + (worse + better < len(ratio))]
+    return TOLD[5]
+
+
+def joined(results: Any) -> str:
+    """Hold surfaces and gray levels together against each of them alone."""
+    part = results['parts'].get('ablation')
+    ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', ''))
+    found = {(one['method'], one['change']): one for one in part['variants']} if part else {}
+    if ('rpe', ON_PLACES) not in found:
+        return 'Surfaces and gray levels were not yet measured each by itself.\n'
+    return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, see "What makes the '
+                      'difference":') + table(VARIANTS, (variant(found[way]) for way in ways)))
 
 
 def speed(results: Any) -> str:
@@ -369,7 +425,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'measured with': measured_with, 'compared': compared,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
     'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
-    'ablation': ablation, 'speed': speed,
+    'ablation': ablation, 'joined': joined, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height',
         'coverage')},

@@ -341,7 +341,8 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     return {'how': f'`djet lab coverage --scenes all --seeds 0-9 --frames {COVERED}`, and on real '
                    'frames; each pair by itself / in a row, from the motion before.',
             'header': ['', 'pairs', 'poses', 'wrong and sure', 'moved, but untold',
-                       'given up (right)', 'NEES over its expectation, median', 'inside 95 %', 'beyond 99.9 %'],
+                       'given up (right)', 'NEES over its expectation, median', 'inside 95 %',
+                       'beyond 99.9 %'],
             'rows': rows}
 
 

@@ -147,8 +147,8 @@ def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
     for start in dict.fromkeys(row.start for row in rows):
         out.print(_shares([row for row in rows if row.start == start],
                           f'poses inside their own ellipsoids, pairs {start}'))
-    print('untold: pairs with a pose that failed without a direction, such as NO_PARALLAX where the '
-          'camera moved\n'
+    print('untold: pairs with a pose that failed without a direction, such as NO_PARALLAX where '
+          'the camera moved\n'
           'none: pairs given up; right: of those, the ones whose best guess was right\n'
           f'failed: {FAILURE}\n'
           f'sure: of those, the ones that claim better than {SURE_ROTATION:g} and '
