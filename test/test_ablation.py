@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.lab.ablation import ablation_methods, ON_PLACES, PARTS, Ratio, ratio_of_means
@@ -50,6 +52,49 @@ def test_reprojection_error_stands_beside_on_the_places_by_gray_levels(road):
     assert record.rotation == tuple(Rotation.from_matrix(on_places.R.T).as_rotvec().tolist())
     # The paper's preset joins nothing: there are no such places.
     assert not any(method.on_places for method in ablation_methods(['paper'], PARTS, (), {}))
+
+
+def variant(change: str, rotation: list[float], direction: list[float],
+            method: str = 'djet') -> dict[str, object]:
+    """Give a row of results.json."""
+    errors = dict.fromkeys(('mean', 'median'), 0.1)
+    return {'method': method, 'change': change, 'pairs': 6, 'failed': 0, 'rotation': errors,
+            'direction': errors, 'ratio': {'rotation': rotation, 'direction': direction}}
+
+
+def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
+    page = pages()
+    part = {'of': ['road'], 'frames': 7, 'seeds': [0], 'variants': [
+        variant('', [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]),
+        variant('squares', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0]),
+        variant('alone', [1.3, 1.1, 1.5], [1.1, 0.9, 1.3]),
+        variant('slow', [0.9, 0.8, 0.95], [0.9, 0.7, 1.1]),
+        variant('wide', [1.2, 0.9, 1.5], [0.9, 0.8, 1.2]),
+        variant(ON_PLACES, [1.2, 0.9, 1.5], [1.1, 0.8, 1.4], 'rpe'),
+        variant('', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0], 'rpe')]}
+    said = page.verdict(part)
+    assert said == ('Worse in both: squares. Worse in one, and not told apart in the other: alone. '
+                    'Better in one, and not told apart in the other: slow. Not told from `best`, '
+                    'whose intervals hold 1: wide.')
+    part['variants'].append(variant('surfaces alone', [1.3, 1.1, 1.5], [1.4, 1.2, 1.6]))
+    joined = page.joined({'parts': {'ablation': part}})
+    assert f'| RP-E | {ON_PLACES} |' in joined and '1.20 (0.90 to 1.50)' in joined
+    for one in part['variants']:
+        del one['ratio']  # as earlier versions measured it
+    assert 'not measured yet' in page.verdict(part)
+    assert page.ablation({'parts': {'ablation': part}}).count('| – | – |') == 8
+
+
+def pages() -> ModuleType:
+    spec = spec_from_file_location('pages', Path(__file__).parents[1] / 'doc' / 'pages.py')
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_scenes_without_parallax_have_no_direction_in_the_readme():
+    assert pages().NO_WAY == {'rotation', 'standstill', 'traffic'}
 
 
 def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
