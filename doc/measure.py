@@ -280,9 +280,10 @@ def by_method(datasets: Sequence[Dataset], methods: Sequence[Method], *,
 
 
 def ratios(records: Sequence[PairRecord], base: Sequence[PairRecord]) -> dict[str, Any]:
-    """Give mean errors over those of others on the same pairs, each with its interval."""
-    found = zip(('rotation', 'direction'), ratios_to_base(records, base))
-    return {'ratio': {what: [rounded(value) for value in astuple(one)] for what, one in found}}
+    """Give errors over those of others on the same pairs, each with its interval."""
+    return {'ratio': {what: {kind: [rounded(value) for value in astuple(one)]
+                             for kind, one in by_kind.items()}
+                      for what, by_kind in ratios_to_base(records, base).items()}}
 
 
 def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[str, Any]:

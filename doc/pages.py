@@ -294,35 +294,37 @@ def ablation(results: Any) -> str:
         return 'Not measured yet.\n'
     return (paragraph(f'Over {part["variants"][0]["pairs"]} pairs: the first {part["frames"]} '
                       f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each. '
-                      'Ratios are of mean errors, on pairs that both tell, with the 95 % interval '
-                      'of a paired bootstrap over pairs.')
+                      'Ratios are on pairs that both tell, with the 95 % interval of a paired '
+                      'bootstrap over pairs.')
             + table(VARIANTS, map(variant, part['variants'])) + '\n' + paragraph(verdict(part)))
 
 
-VARIANTS = ('method', 'change', 'mean (failed)', 'median', 'rotation over `best`',
-            'direction over `best`')
+VARIANTS = ('method', 'change', 'mean (failed)', 'median', 'rotation over `best`: mean', 'median',
+            'direction over `best`: mean', 'median')
 
 
 def variant(one: Any) -> tuple[str, ...]:
     """Lay out a row of the ablation."""
     return (TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
-            pair_of(one, 'median'), *(interval(one, what) for what in DIGITS))
+            pair_of(one, 'median'), *(interval(one, what, kind) for what in DIGITS
+                                      for kind in ('mean', 'median')))
 
 
-def interval(one: Any, what: str) -> str:
-    value, least, most = one.get('ratio', {}).get(what, (None,) * 3)
+def interval(one: Any, what: str, kind: str) -> str:
+    value, least, most = one['ratio'][what][kind] if 'ratio' in one else (None,) * 3
     return '–' if value is None else f'{value:.2f} ({least:.2f} to {most:.2f})'
 
 
 def verdict(part: Any) -> str:
-    """Say which changes of D-JET the pairs tell from it, and which they do not."""
+    """Say which changes of D-JET the pairs tell from it by their means, and which they do not."""
     changed = [one for one in part['variants'] if one['method'] == 'djet' and one['change']]
     if not all('ratio' in one for one in changed):
         return 'Which of these differences the pairs tell from chance was not measured yet.'
     said: dict[str, list[str]] = {}
     for one in changed:
         said.setdefault(told(one['ratio']), []).append(one['change'])
-    return ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD if word in said)
+    return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD
+                                   if word in said)
 
 
 TOLD = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
@@ -332,7 +334,7 @@ TOLD = ('Worse in both', 'Worse in one, and not told apart in the other', 'Bette
 
 def told(ratio: Any) -> str:
     """Tell by the intervals of both ratios which of TOLD holds."""
-    known = [bounds for bounds in ratio.values() if None not in bounds]
+    known = [by_kind['mean'] for by_kind in ratio.values() if None not in by_kind['mean']]
     worse, better = (sum(least > 1 for _, least, _ in known),
                      sum(most < 1 for _, _, most in known))
     if worse and better:

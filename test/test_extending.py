@@ -28,7 +28,7 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> None:
             del table[name]  # type: ignore[attr-defined]
     scope: dict[str, object] = {}
     for code in re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL):
-        exec(code, scope)  # noqa: S102
+        exec(code, scope)
 
 
 @pytest.mark.usefixtures('extended')

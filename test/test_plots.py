@@ -28,7 +28,7 @@ def test_errors_far_below_those_of_a_dataset_are_drawn_where_they_are(
     errors = [2e-5, 0.0, float('nan'), 0.03]
     records = [record(pair, error) for pair, error in enumerate(errors)]
     plots.plot_errors_by_frame(tmp_path / 'errors.png', 'road', plots.grouped(records))
-    above, below = ([line.get_ydata() for line in axes.lines][0]
+    above, below = (axes.lines[0].get_ydata()
                     for axes in drawn['errors.png'].axes[:2])
     # A logarithmic axis has no zero, and an unknown error no place.
     assert np.allclose(above, [2e-5, 1e-6, np.nan, 0.03], equal_nan=True, rtol=1e-12)

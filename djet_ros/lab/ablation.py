@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
+from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.methods import check_names, configured, Method
 from djet_ros.lab.pairs import PairRecord
@@ -114,7 +115,7 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
 
 @dataclass(frozen=True)
 class Ratio:
-    """A mean error over another's on the same pairs, and the bounds of its 95 % interval."""
+    """One error over another's on the same pairs, and the bounds of its 95 % interval."""
 
     value: float
     least: float
@@ -126,9 +127,10 @@ class Ratio:
         return self.least > 1 or self.most < 1
 
 
-def ratio_of_means(errors: Sequence[float], base: Sequence[float]) -> Ratio:
+def ratio_of(errors: Sequence[float], base: Sequence[float],
+             statistic: Callable[..., Array] = np.mean) -> Ratio:
     """
-    Mean of errors over that of base, pair by pair the same ones; of pairs that both know.
+    Mean or median of errors over that of base, pair by pair the same ones; of pairs both know.
 
     The interval is that of the percentile bootstrap over pairs (Efron and Tibshirani, An
     Introduction to the Bootstrap, chapter 13), always by the same draws; all NaN where nothing
@@ -139,22 +141,25 @@ def ratio_of_means(errors: Sequence[float], base: Sequence[float]) -> Ratio:
     count = both.shape[1]
     if not count:
         return Ratio(*[float('nan')] * 3)
-    drawn = both[:, np.random.default_rng(0).integers(count, size=(_DRAWS, count))].mean(axis=2)
+    draws = np.random.default_rng(0).integers(count, size=(_DRAWS, count))
+    drawn, whole = statistic(both[:, draws], axis=2), statistic(both, axis=1)
     if not drawn[1].all():
         return Ratio(*[float('nan')] * 3)
     least, most = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
-    return Ratio(float(both[0].mean() / both[1].mean()), float(least), float(most))
+    return Ratio(float(whole[0] / whole[1]), float(least), float(most))
 
 
 def ratios_to_base(records: Sequence[PairRecord], base: Sequence[PairRecord]
-                   ) -> tuple[Ratio, Ratio]:
-    """Ratios of mean errors to those of base, of rotation and of direction."""
+                   ) -> dict[str, dict[str, Ratio]]:
+    """Errors over those of base on the same pairs: 'rotation', 'direction'; 'mean', 'median'."""
     at = {(record.sequence, record.pair): record for record in base}
     paired = [(record, at[record.sequence, record.pair]) for record in records]
-    rotation, direction = (ratio_of_means(*zip(*(
-        (getattr(own, name), getattr(other, name)) for own, other in paired)))
-        for name in ('rotation_error_deg', 'translation_error_deg'))
-    return rotation, direction
+    found: dict[str, dict[str, Ratio]] = {}
+    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
+        own, others = zip(*((getattr(one, name), getattr(other, name)) for one, other in paired))
+        found[what] = {kind: ratio_of(own, others, statistic)
+                       for kind, statistic in (('mean', np.mean), ('median', np.median))}
+    return found
 
 
 def _changed(method: Method, change: Change) -> Method:

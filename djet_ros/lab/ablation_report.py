@@ -35,9 +35,9 @@ _GOOD_START = ('All were given the pose of RP-E, preset best, as a start, and on
                'that agree with it.')
 _PUBLISHED = ("The paper's Table 2, as printed there: another sequence (VAROS, all frames), and "
               'errors in what the table calls degrees.')
-_RATIOS = ('Mean errors over those of D-JET as the preset has it, on the pairs that both tell, and '
-           'in brackets the 95 % interval of a paired bootstrap over pairs: where that holds 1, '
-           'the pairs do not tell which is better.')
+_RATIOS = ('Mean and median errors over those of D-JET as the preset has it, on the pairs that '
+           'both tell. In brackets is the 95 % interval of a paired bootstrap over pairs: where '
+           'it holds 1, the pairs do not tell which is better.')
 _MARKERS = {'djet': 'o', 'rpe': 'D', 'five_point': 's'}
 _LINE = 0.24
 
@@ -73,10 +73,12 @@ def ratios_table(records: Sequence[PairRecord]) -> Table:
     for (sequence, preset, method, change), own in variants.items():
         base = variants[sequence, preset, 'djet', '']
         if own is not base:
-            lines.append(Line((sequence, preset, TITLES[method], change or '–', *map(
-                _in_words, ratios_to_base(own, base)))))
-    return Table(_RATIOS, ('sequence', 'preset', 'method', 'change', 'rot.', 'tr.'), tuple(lines),
-                 2, 4)
+            by_kind = ratios_to_base(own, base)
+            lines.append(Line((sequence, preset, TITLES[method], change or '–', *(
+                _in_words(ratio) for what in ('rotation', 'direction')
+                for ratio in by_kind[what].values()))))
+    return Table(_RATIOS, ('sequence', 'preset', 'method', 'change', 'rot. mean', 'rot. median',
+                           'tr. mean', 'tr. median'), tuple(lines), 2, 4)
 
 
 def _in_words(ratio: Ratio) -> str:
