@@ -14,7 +14,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import partial
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
@@ -32,7 +32,7 @@ from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.ablation import ablation_methods, PARTS
+from djet_ros.lab.ablation import ablation_methods, PARTS, ratios_to_base
 from djet_ros.lab.bench import bench
 from djet_ros.lab.closure import closures, summary
 from djet_ros.lab.coverage import normalised_square
@@ -259,21 +259,31 @@ def opened_for(job: Job, place: Path) -> list[Dataset]:
     return open_datasets(folders, Selection(end=job.frames), place)
 
 
-def by_method(datasets: Sequence[Dataset], methods: Sequence[Method]) -> list[dict[str, Any]]:
-    """Estimate all pairs, each by itself, and sum up by method."""
+def by_method(datasets: Sequence[Dataset], methods: Sequence[Method], *,
+              compared: bool = False) -> list[dict[str, Any]]:
+    """Estimate all pairs, each by itself, and sum up by method; compared: with the first, too."""
     records = [record for dataset in datasets
                for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
-    found = []
+    found: list[dict[str, Any]] = []
+    base: list[PairRecord] = []
     for method in methods:
         own = [record for record in records if (record.method, record.preset, record.change)
                == (method.name, method.preset, method.change)]
+        base = base or own
         outcomes = [Outcome(record.sequence, record.status, record.rotation_error_deg,
                             record.translation_error_deg, record.failed) for record in own]
         found.append({'method': method.name, 'preset': method.preset, 'change': method.change,
                       **summed(outcomes),
                       'ms': rounded(np.median([record.milliseconds for record in own])),
-                      **drifts(datasets, own)})
+                      **drifts(datasets, own), **(ratios(own, base) if compared else {})})
     return found
+
+
+def ratios(records: Sequence[PairRecord], base: Sequence[PairRecord]) -> dict[str, Any]:
+    """Give errors over those of others on the same pairs, each with its interval."""
+    return {'ratio': {what: {kind: [rounded(value) for value in astuple(one)]
+                             for kind, one in by_kind.items()}
+                      for what, by_kind in ratios_to_base(records, base).items()}}
 
 
 def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[str, Any]:
@@ -362,7 +372,7 @@ def ablation(seeds: tuple[int, ...]) -> dict[str, Any]:
             Job(scene, seeds, None, ABLATED_FRAMES, 0), Path(name) / scene)]
         methods = ablation_methods(['best'], PARTS, ABLATED_WINDOWS, {})
         found = {'of': list(ABLATED), 'frames': ABLATED_FRAMES, 'seeds': list(seeds),
-                 'variants': by_method(datasets, methods)}
+                 'variants': by_method(datasets, methods, compared=True)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 

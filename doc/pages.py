@@ -15,7 +15,9 @@ import sys
 import textwrap
 from typing import Any
 
+from djet_ros.lab.ablation import ON_PLACES
 from djet_ros.lab.methods import TITLES
+from djet_ros.lab.scenes import SCENES
 from djet_ros.live.parameters import FIXED, SHARED
 from djet_ros.odometry.images import ENCODINGS
 import yaml
@@ -34,7 +36,7 @@ DIGITS = {'rotation': 4, 'direction': 3}
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
 # Scenes in which the camera does not move from its place have no direction to compare.
-NO_WAY = ('rotation', 'standstill')
+NO_WAY = {name for name, entry in SCENES.items() if not entry.parallax}
 
 
 def main(check: bool) -> int:
@@ -313,11 +315,67 @@ def ablation(results: Any) -> str:
     part = results['parts'].get('ablation')
     if part is None:
         return 'Not measured yet.\n'
-    rows = [(TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
-             pair_of(one, 'median')) for one in part['variants']]
     return (paragraph(f'Over {part["variants"][0]["pairs"]} pairs: the first {part["frames"]} '
-                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each.')
-            + table(('method', 'change', 'mean (failed)', 'median'), rows))
+                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each. '
+                      'Ratios are on pairs that both tell, with the 95 % interval of a paired '
+                      'bootstrap over pairs.')
+            + table(VARIANTS, map(variant, part['variants'])) + '\n' + paragraph(verdict(part)))
+
+
+VARIANTS = ('method', 'change', 'mean (failed)', 'median', 'rotation over `best`: mean', 'median',
+            'direction over `best`: mean', 'median')
+
+
+def variant(one: Any) -> tuple[str, ...]:
+    """Lay out a row of the ablation."""
+    return (TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
+            pair_of(one, 'median'), *(interval(one, what, kind) for what in DIGITS
+                                      for kind in ('mean', 'median')))
+
+
+def interval(one: Any, what: str, kind: str) -> str:
+    value, least, most = one['ratio'][what][kind] if 'ratio' in one else (None,) * 3
+    return '–' if value is None else f'{value:.2f} ({least:.2f} to {most:.2f})'
+
+
+def verdict(part: Any) -> str:
+    """Say which changes of D-JET the pairs tell from it by their means, and which they do not."""
+    changed = [one for one in part['variants'] if one['method'] == 'djet' and one['change']]
+    if not all('ratio' in one for one in changed):
+        return 'Which of these differences the pairs tell from chance was not measured yet.'
+    said: dict[str, list[str]] = {}
+    for one in changed:
+        said.setdefault(told(one['ratio']), []).append(one['change'])
+    return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD
+                                   if word in said)
+
+
+TOLD = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
+        'Better in one, and not told apart in the other', 'Better in one, worse in the other',
+        'Not told from `best`, whose intervals hold 1')
+
+
+def told(ratio: Any) -> str:
+    """Tell by the intervals of both ratios which of TOLD holds."""
+    known = [by_kind['mean'] for by_kind in ratio.values() if None not in by_kind['mean']]
+    worse, better = (sum(least > 1 for _, least, _ in known),
+                     sum(most < 1 for _, _, most in known))
+    if worse and better:
+        return TOLD[4]
+    if worse or better:
+        return TOLD[(0 if worse else 2) + (worse + better < len(ratio))]
+    return TOLD[5]
+
+
+def joined(results: Any) -> str:
+    """Hold surfaces and gray levels together against each of them alone."""
+    part = results['parts'].get('ablation')
+    ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', ''))
+    found = {(one['method'], one['change']): one for one in part['variants']} if part else {}
+    if ('rpe', ON_PLACES) not in found:
+        return 'Surfaces and gray levels were not yet measured each by itself.\n'
+    return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, see "What makes the '
+                      'difference":') + table(VARIANTS, (variant(found[way]) for way in ways)))
 
 
 def speed(results: Any) -> str:
@@ -336,11 +394,19 @@ def speed(results: Any) -> str:
               for key, value in part[by].items()]
     return (paragraph(f'Of {known_as(part["of"])}, {part["pairs"]} pairs, from file to pose.')
             + table(('', 'one thread', 'all cores'), rows) + '\n'
-            + paragraph('The D-JET stage, surfaces and optimisation, in ms. A pixel of a surface '
-                        f'costs 1/{part["kernel_speedup_over_cv2"]:.0f} of a descriptor by '
-                        '`cv2.ORB.compute`; a frame that is kept takes '
+            + paragraph('The D-JET stage, surfaces and optimisation, in ms. '
+                        f'{kernel(part)}A frame that is kept takes '
                         f'{part["bytes_per_frame"] / 1e6:.1f} MB.')
             + table(('', 'ms'), growth))
+
+
+def kernel(part: Any) -> str:
+    """Tell what a pixel of a surface costs, where it is known how many tests it takes."""
+    if 'kernel_tests' not in part:
+        return ''
+    return (f'A pixel of a surface, of {part["kernel_tests"]} tests, costs '
+            f'1/{part["kernel_speedup_over_cv2"]:.0f} of a descriptor of 256 by '
+            '`cv2.ORB.compute`, whose keypoints are listed before. ')
 
 
 def sequences(results: Any) -> list[tuple[str, Any]]:
@@ -394,7 +460,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'measured with': measured_with, 'compared': compared,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
     'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
-    'ablation': ablation, 'speed': speed,
+    'ablation': ablation, 'joined': joined, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height',
         'coverage')},

@@ -340,8 +340,9 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
         rows += covered(place / real.name, f'TartanAir {real.name}')
     return {'how': f'`djet lab coverage --scenes all --seeds 0-9 --frames {COVERED}`, and on real '
                    'frames; each pair by itself / in a row, from the motion before.',
-            'header': ['', 'poses', 'wrong and sure', 'given up (right)',
-                       'NEES over its expectation, median', 'inside 95 %', 'beyond 99.9 %'],
+            'header': ['', 'pairs', 'poses', 'wrong and sure', 'moved, but untold',
+                       'given up (right)', 'NEES over its expectation, median', 'inside 95 %',
+                       'beyond 99.9 %'],
             'rows': rows}
 
 
@@ -349,15 +350,22 @@ def covered(folder: Path, name: str = '') -> list[list[str]]:
     """Rows of a run of coverage, both of a scene's in one; without those that tell no pose."""
     found = json.loads((folder / 'coverage.json').read_text('utf-8'))
     at = [found['levels'].index(level) for level in (0.95, 0.999)]
-    by_scene: dict[str, list[list[str]]] = {}
+    by_scene: dict[str, list[dict[str, Any]]] = {}
     for row in found['rows']:
-        if np.isfinite(row['median'] or np.nan):
-            within, beyond = row['inside'][at[0]][0], 1 - row['inside'][at[1]][0]
-            by_scene.setdefault(name or row['scene'], []).append([
-                str(row['told']), str(row['wrong_and_sure']),
-                f"{row['given_up']} ({row['needlessly']})", f"{row['median']:.2f}",
-                f'{within:.1%}', f'{beyond:.1%}'])
-    return [[scene, *map(' / '.join, zip(*rows))] for scene, rows in by_scene.items()]
+        by_scene.setdefault(name or row['scene'], []).append(row)
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        within, beyond = row['inside'][at[0]][0], 1 - row['inside'][at[1]][0]
+        return [str(row['pairs']), str(row['told']), str(row['wrong_and_sure']),
+                str(row.get('untold', '–')), f"{row['given_up']} ({row['needlessly']})",
+                known(row['median'], '.2f'), known(within, '.1%'), known(beyond, '.1%')]
+
+    return [[scene, *map(' / '.join, zip(*map(cells, rows)))] for scene, rows in by_scene.items()
+            if any(row['told'] or row.get('untold') for row in rows)]
+
+
+def known(value: float, form: str) -> str:
+    return f'{value:{form}}' if np.isfinite(value) else '–'
 
 
 def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from djet_ros.lab.bench import least_in_turn
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
@@ -44,9 +45,26 @@ def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(output)
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_the_stages_add_up_to_the_time_that_a_pair_takes(output):
+def test_repeats_are_made_in_turn_and_the_least_of_each_counts():
+    order, times = [], iter(range(100, 0, -1))
+
+    def noted(name):
+        def measurement():
+            order.append(name)
+            return float(next(times))
+        return measurement
+
+    least = least_in_turn({name: noted(name) for name in 'abc'})
+    assert order == ['a', 'b', 'c'] * (len(order) // 3) and len(order) > 3
+    assert least == {'a': 103.0 - len(order), 'b': 102.0 - len(order), 'c': 101.0 - len(order)}
+
+
+def test_no_stage_is_negative_and_with_the_rest_they_are_the_time_of_a_pair(output):
     figures = json.loads(output.read_text())
     for run in (figures, figures['all_cores']):
+        # "decode + features" is what the others leave, which they must not exceed.
+        assert run['stages_ms'].keys() >= {'decode + features', 'matching', 'jet', 'result'}
+        assert all(ms >= 0 for ms in run['stages_ms'].values())
         assert 0.9 < sum(run['stages_ms'].values()) * run['pairs_per_second'] / 1e3 < 1
 
 

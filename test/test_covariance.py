@@ -7,7 +7,7 @@ from pathlib import Path
 from djet_ros.core.covariance import pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.geometry import sphere_tangents, unit
+from djet_ros.core.geometry import sphere_log, sphere_tangents, unit
 from djet_ros.core.jet import Loss, Residuals
 from djet_ros.core.surfaces import DescriptorSurface, with_minimum
 from djet_ros.core.types import Status
@@ -29,7 +29,7 @@ def normalised_squared_error(name: str, first: int) -> float:
                                 for gray in (pair.previous, pair.current)))
     assert pose.status is Status.OK
     error = np.concatenate([Rotation.from_matrix(pair.R @ pose.R.T).as_rotvec(),
-                            sphere_tangents(pose.t).T @ (unit(pair.t) - pose.t)])
+                            sphere_log(pose.t, unit(pair.t))])
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from importlib.util import module_from_spec, spec_from_file_location
 import json
 from pathlib import Path
 import subprocess
 import sys
+from types import ModuleType
 
 from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
 from djet_ros.core.types import RelativePose, Status
@@ -51,6 +54,27 @@ def test_errors_drawn_from_the_covariance_lie_inside_as_often_as_claimed() -> No
     assert row.median == pytest.approx(1, abs=0.1)
 
 
+def off_by(degrees: float, claimed: float = 0.05) -> float:
+    """Square of a pose whose direction alone is off, with a claim in degrees of each axis."""
+    true_motion = camera_motion(RelativePose(Status.OK, np.eye(3), np.array([0, 0, -1.0])))
+    angle = np.radians(degrees)
+    return normalised_square(RelativePose(
+        Status.OK, np.eye(3), np.array([0.0, np.sin(angle), -np.cos(angle)]),
+        np.eye(5) * np.radians(claimed)**2), true_motion)
+
+
+@pytest.mark.parametrize('degrees', [0.05, 1.0, 45.0, 90.0, 135.0, 179.9, 180.0])
+def test_a_direction_is_as_far_off_as_its_angle_says(degrees: float) -> None:
+    assert off_by(degrees) == pytest.approx((degrees / 0.05)**2, rel=1e-6)
+
+
+def test_a_direction_that_is_sure_and_points_backwards_lies_in_no_ellipsoid() -> None:
+    flipped = record(square=off_by(180.0), failed=True)
+    row, = coverage_rows([flipped])
+    assert flipped.wrong_and_sure and row.failed == 1
+    assert all(share == 0 for share, _, _ in row.inside)
+
+
 def test_the_bounds_of_a_share_hold_it_with_the_confidence_that_they_claim() -> None:
     tries = 60
     for true in (0.02, 0.5, 0.95):
@@ -76,6 +100,37 @@ def test_pairs_are_summed_up_by_scene() -> None:
     assert [(row.scene, row.pairs, row.told, row.given_up, row.needlessly, row.wrong_and_sure)
             for row in rows] == [('road', 1, 1, 0, 0, 0), ('indoor', 3, 1, 1, 1, 1)]
     assert rows[1].inside[-1][0] == 0
+
+
+def test_a_motion_that_was_taken_for_none_is_counted() -> None:
+    nan = float('nan')
+    stood = record(square=nan, status=Status.NO_PARALLAX)
+    moved = record(square=nan, status=Status.NO_PARALLAX, failed=True)
+    row, = coverage_rows([record(failed=True), stood, moved,
+                          record(square=nan, status=Status.DEGENERATE, failed=True)])
+    assert (row.pairs, row.told, row.failed, row.untold, row.given_up) == (4, 1, 1, 1, 1)
+
+
+def test_a_recorded_table_shows_what_was_untold_and_a_dash_where_that_was_not_counted(
+        tmp_path: Path) -> None:
+    nan = float('nan')
+    rows = [asdict(row) for row in coverage_rows([
+        record(), record(scene='rotation', square=nan, status=Status.NO_PARALLAX),
+        record(scene='whip', square=nan, status=Status.NO_PARALLAX, failed=True)])]
+    del rows[0]['untold']
+    (tmp_path / 'coverage.json').write_text(json.dumps({'levels': LEVELS, 'rows': rows}))
+    road, whip = recorder().covered(tmp_path)
+    assert road[:5] == ['road', '1', '1', '0', '–']
+    assert whip == ['whip', '1', '0', '0', '1', '0 (0)', '–', '–', '–']
+
+
+def recorder() -> ModuleType:
+    path = Path(__file__).parents[1] / 'doc' / 'record.py'
+    spec = spec_from_file_location('record', path)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.slow

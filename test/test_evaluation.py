@@ -95,12 +95,13 @@ def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
     assert all(int(row['pairs']) == FRAMES - 1 for row in table)
 
 
-def test_the_best_preset_finds_exact_motion_to_a_fraction_of_a_degree(evaluated):
+def test_the_best_preset_finds_exact_motion_to_a_hundredth_of_a_degree(evaluated):
     best, paper = ({row['method']: row for row in rows(evaluated / 'table1.csv')
                     if row['preset'] == preset} for preset in ('best', 'paper'))
     for method in ('djet', 'rpe', 'pjet'):
-        assert float(best[method]['rotation_median_deg']) < 0.2
-        assert float(best[method]['translation_median_deg']) < 5
+        # Twice what was measured, of the worst of them.
+        assert float(best[method]['rotation_median_deg']) < 0.012
+        assert float(best[method]['translation_median_deg']) < 0.2
     # Descriptors at whole pixels are what D-JET minimises, as the paper has it.
     assert float(paper['djet']['hamming_mean']) < float(paper['rpe']['hamming_mean'])
 
@@ -528,6 +529,12 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     assert answer.returncode == 0, answer.stderr
     found = [(row['preset'], row['method'], row['change'])
              for row in rows(tmp_path / 'ablation.csv')]
+    by_row = dict(zip(found, rows(tmp_path / 'ablation.csv')))
+    for change in ('window 3×3', 'window not re-centred'):
+        # A change changes what is found, and on whole frames of a street breaks nothing.
+        assert (by_row['best', 'djet', change]['rotation_mean_deg']
+                != by_row['best', 'djet', '']['rotation_mean_deg'])
+        assert int(by_row['best', 'djet', change]['failures']) == 0
     assert found == [
         ('best', 'djet', ''), ('best', 'rpe', ''), ('best', 'five_point', ''),
         ('best', 'djet', 'window 3×3'),
@@ -538,7 +545,9 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
         ('paper', 'djet', 'window not re-centred'),
         ('paper', 'djet', 'starts: several'), ('paper', 'rpe', 'starts: several')]
     text = (tmp_path / 'ablation.md').read_text()
-    # The paper's Table 2 stands below.
+    # How rows compare with the preset stands below, each with an interval,
+    assert re.search(r'best \| RP-E \| – (\| [0-9.]+ \([0-9.]+ to [0-9.]+\) ){4}\|', text)
+    # and the paper's Table 2.
     assert '| *VAROS* | *D-JET* | *15×15* | *0.127* | *0.258* | *22.31* |' in text
     assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
 

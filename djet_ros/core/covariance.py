@@ -212,7 +212,11 @@ def _growth(least: float, larger: Sequence[_Cells], reach: float) -> float:
 
 
 def difference(R: Array, t: Array, other: Pose) -> Array:
-    """How another motion differs (5,) from (R, t), in the parameters of a covariance of that."""
+    """
+    How another motion differs (5,) from (R, t), in the parameters of a covariance of that.
+
+    Matches tell t up to its sign, so it is the nearer of both signs that differs, by its chord.
+    """
     sign = 1.0 if other.t @ t >= 0 else -1.0
     return np.concatenate([rotation_log(other.R @ R.T),
                            sphere_tangents(t).T @ (sign * other.t - t)])

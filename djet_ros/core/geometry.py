@@ -71,6 +71,20 @@ def sphere_tangents(t: Array) -> Array:
                      [-sign * x, -y]]).transpose(*range(2, t.ndim + 1), 0, 1)
 
 
+def sphere_log(t: Array, other: Array) -> Array:
+    """
+    Step (2,) from a direction t (3,) to another, along its tangents, as long as the arc in rad.
+
+    Opposite directions are half a turn apart; which way is taken then means nothing.
+    """
+    tangents = sphere_tangents(t)
+    across, along = tangents.T @ other, other @ t
+    chord = np.hypot(*across)
+    if not chord:
+        return np.array([np.pi if along < 0 else 0.0, 0.0])
+    return np.asarray(across * (np.arctan2(chord, along) / chord))
+
+
 def inverse_of(K: Array) -> Array:
     """Inverse (3, 3) of a camera matrix (3, 3): each is asked for some fifty times a frame."""
     return _inverse(np.asarray(K, float).tobytes())

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
+from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.methods import check_names, configured, Method
+from djet_ros.lab.pairs import PairRecord
+import numpy as np
 
 # Parameters that re-projection error has as well: a change of these is tried on both.
 _OF_BOTH = {'starts', 'loss', 'search_radius'}
 
-# Keypoints that go only part of the way need more rounds to arrive.
+# Keypoints that go only part of the way need more rounds to arrive, and each moves the pose by so
+# little that it would be taken to rest.
 _ROUNDS = 20
+_UNHURRIED: dict[str, Any] = {'max_iterations': _ROUNDS, 'epsilon': 1e-9}
+
+# Re-projection error where D-JET's gray levels have the matches: all that joining adds but for the
+# surfaces. The places themselves are seen through the warps of D-JET's pose.
+ON_PLACES = 'on places by gray levels'
+
+# Of the bootstrap.
+_DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -36,9 +48,9 @@ def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
         'weights': [Change('all samples weigh alike', {'window_sigma': 0.0}),
                     Change('samples weighed, sigma 1 px', {'window_sigma': 1.0})],
         'step': [Change('step: full', {'step': 'full'}),
-                 Change('step: 1 px at most', {'step': 'pixel', 'max_iterations': _ROUNDS}),
-                 *(Change(f'step: {share:.0%} of the way', {
-                     'step': 'share', 'step_share': share, 'max_iterations': _ROUNDS})
+                 Change(f'step: 1 px at most, {_ROUNDS} rounds', {'step': 'pixel', **_UNHURRIED}),
+                 *(Change(f'step: {share:.0%} of the way, {_ROUNDS} rounds', {
+                     'step': 'share', 'step_share': share, **_UNHURRIED})
                    for share in (0.1, 0.2, 0.3))],
         'loss': [Change(f'loss: {word}', {'loss': name})
                  for name, word in (('none', 'squares'), ('huber', 'Huber'), ('cauchy', 'Cauchy'),
@@ -74,7 +86,8 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
     """
     Let D-JET start with each preset and with each single change of it.
 
-    Beside them start RP-E, with the changes that it knows too, and the 5-point method.
+    Beside them start RP-E, with the changes that it knows too, and the 5-point method; where
+    joining is changed, RP-E on the places that gray levels give as well (see ON_PLACES).
     good_start: see Method; presets with the 5-point start take it among several then. Raises
     DjetError on unknown names and on windows that can't be.
     """
@@ -95,7 +108,58 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
             competing.append(_changed(base['djet'], change))
             if change.values.keys() <= _OF_BOTH:
                 competing.append(_changed(base['rpe'], change))
+        if 'joining' in parts and base['djet'].config.join_matches:
+            competing.append(replace(base['rpe'], change=ON_PLACES, on_places=True))
     return competing
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """One error over another's on the same pairs, and the bounds of its 95 % interval."""
+
+    value: float
+    least: float
+    most: float
+
+    @property
+    def told(self) -> bool:
+        """Whether one is outside: otherwise the pairs do not tell which is better."""
+        return self.least > 1 or self.most < 1
+
+
+def ratio_of(errors: Sequence[float], base: Sequence[float],
+             statistic: Callable[..., Array] = np.mean) -> Ratio:
+    """
+    Mean or median of errors over that of base, pair by pair the same ones; of pairs both know.
+
+    The interval is that of the percentile bootstrap over pairs (Efron and Tibshirani, An
+    Introduction to the Bootstrap, chapter 13), always by the same draws; all NaN where nothing
+    is known, or no error is left to divide by.
+    """
+    both = np.array([errors, base], dtype=float)
+    both = both[:, np.isfinite(both).all(axis=0)]
+    count = both.shape[1]
+    if not count:
+        return Ratio(*[float('nan')] * 3)
+    draws = np.random.default_rng(0).integers(count, size=(_DRAWS, count))
+    drawn, whole = statistic(both[:, draws], axis=2), statistic(both, axis=1)
+    if not drawn[1].all():
+        return Ratio(*[float('nan')] * 3)
+    least, most = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
+    return Ratio(float(whole[0] / whole[1]), float(least), float(most))
+
+
+def ratios_to_base(records: Sequence[PairRecord], base: Sequence[PairRecord]
+                   ) -> dict[str, dict[str, Ratio]]:
+    """Errors over those of base on the same pairs: 'rotation', 'direction'; 'mean', 'median'."""
+    at = {(record.sequence, record.pair): record for record in base}
+    paired = [(record, at[record.sequence, record.pair]) for record in records]
+    found: dict[str, dict[str, Ratio]] = {}
+    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
+        own, others = zip(*((getattr(one, name), getattr(other, name)) for one, other in paired))
+        found[what] = {kind: ratio_of(own, others, statistic)
+                       for kind, statistic in (('mean', np.mean), ('median', np.median))}
+    return found
 
 
 def _changed(method: Method, change: Change) -> Method:

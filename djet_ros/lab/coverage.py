@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rotation_log, sphere_tangents, unit
+from djet_ros.core.geometry import rotation_log, sphere_log, unit
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.scenes.sequence import rendered_scene
@@ -74,6 +74,15 @@ class Coverage:
         return self.status == Status.OK.value and bool(np.isfinite(self.square))
 
     @property
+    def untold(self) -> bool:
+        """
+        Whether there is a pose that failed, but no direction to hold against the truth.
+
+        That is a motion which was taken for none: NO_PARALLAX where the camera moved.
+        """
+        return self.status in (s.value for s in TRACKED) and not self.told and self.failed
+
+    @property
     def wrong_and_sure(self) -> bool:
         """Whether the pose is far off, and claims to be exact."""
         return (self.told and self.failed and self.rotation_claim_deg < SURE_ROTATION
@@ -92,7 +101,9 @@ class CoverageRow:
 
     median: that of the squares, over its expectation; inside: by LEVELS, the share of the told
     pairs in that ellipsoid, with the bounds that hold the true share with 95 % (Clopper and
-    Pearson, Biometrika 1934); given_up: pairs without a pose, needlessly: with a right guess.
+    Pearson, Biometrika 1934); failed: of the told pairs; untold: see Coverage; given_up: pairs
+    without a pose, needlessly: with a right guess. Each pair that went wrong is in one of failed,
+    untold and given_up.
     """
 
     scene: str
@@ -100,6 +111,7 @@ class CoverageRow:
     pairs: int
     told: int
     failed: int
+    untold: int
     given_up: int
     needlessly: int
     wrong_and_sure: int
@@ -172,8 +184,7 @@ def normalised_square(pose: RelativePose, true_motion: Array) -> float:
     """
     R = true_motion[:3, :3].T
     t = unit(-R @ true_motion[:3, 3])
-    error = np.concatenate([rotation_log(R @ pose.R.T),
-                            sphere_tangents(pose.t).T @ (t - pose.t)])
+    error = np.concatenate([rotation_log(R @ pose.R.T), sphere_log(pose.t, t)])
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
@@ -191,6 +202,7 @@ def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
     return CoverageRow(
         scene, start, len(records), len(squares),
         sum(record.failed for record in records if record.told),
+        sum(record.untold for record in records),
         sum(record.status not in tracked for record in records),
         sum(record.needlessly_given_up for record in records),
         sum(record.wrong_and_sure for record in records),

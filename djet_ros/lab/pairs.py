@@ -117,6 +117,8 @@ class Given:
 def estimate(method: Method, given: Given) -> RelativePose:
     """Estimate a pair by a method."""
     config = method.config
+    if method.on_places:
+        given = _with_places(method, given)
     if method.name in peers.ESTIMATORS:
         return peers.estimate(method.name, *given.views, given.x, given.y,
                               config.ransac_threshold, config.min_matches)
@@ -208,6 +210,14 @@ def _with_good_start(given: Given) -> Given:
     if not robust.inliers.any():
         return given
     return replace(given, x=robust.x[robust.inliers], y=robust.y[robust.inliers], start=robust)
+
+
+def _with_places(method: Method, given: Given) -> Given:
+    """Take the matches that voted in D-JET to where gray levels have them; as they are without."""
+    config = replace(method.config, method='djet')
+    found = TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
+    voting = found.voting
+    return replace(given, x=found.x[voting], y=found.placed[voting]) if voting.any() else given
 
 
 def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,

@@ -5,18 +5,34 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+Look = TypeVar('Look')
+
+
+class ByMethod(dict[str, Look]):
+    """How methods are drawn; those that have nothing of their own here are drawn like others."""
+
+    def __init__(self, entries: dict[str, Look], others: Look) -> None:
+        super().__init__(entries)
+        self._others = others
+
+    def __missing__(self, name: str) -> Look:
+        return self._others
+
+
 # Palette of Okabe and Ito; lines differ by their dashes as well.
-COLOURS = {'djet': '#0072B2', 'rpe': '#D55E00', 'pjet': '#009E73', 'five_point': '#CC79A7',
-           'opencv_ransac': '#8C8C8C', 'usac_magsac': '#E69F00', 'poselib': '#56B4E9',
-           'sift_poselib': '#000000', 'klt_poselib': '#7F4F24'}
-DASHES = {'djet': '-', 'rpe': '--', 'pjet': '-.', 'five_point': ':',
-          'opencv_ransac': (0, (1, 1)), 'usac_magsac': (0, (5, 1)), 'poselib': (0, (3, 1, 1, 1)),
-          'sift_poselib': (0, (5, 1, 1, 1, 1, 1)), 'klt_poselib': (0, (8, 2))}
+COLOURS = ByMethod({
+    'djet': '#0072B2', 'rpe': '#D55E00', 'pjet': '#009E73', 'five_point': '#CC79A7',
+    'opencv_ransac': '#8C8C8C', 'usac_magsac': '#E69F00', 'poselib': '#56B4E9',
+    'sift_poselib': '#000000', 'klt_poselib': '#7F4F24'}, others='#9467BD')
+DASHES: ByMethod[Any] = ByMethod({
+    'djet': '-', 'rpe': '--', 'pjet': '-.', 'five_point': ':', 'opencv_ransac': (0, (1, 1)),
+    'usac_magsac': (0, (5, 1)), 'poselib': (0, (3, 1, 1, 1)),
+    'sift_poselib': (0, (5, 1, 1, 1, 1, 1)), 'klt_poselib': (0, (8, 2))}, others=(0, (2, 2)))
 
 STYLE: dict[Any, Any] = {
     'font.size': 10, 'axes.titlesize': 11, 'axes.labelsize': 10, 'legend.fontsize': 9,

@@ -147,7 +147,9 @@ def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
     for start in dict.fromkeys(row.start for row in rows):
         out.print(_shares([row for row in rows if row.start == start],
                           f'poses inside their own ellipsoids, pairs {start}'))
-    print('none: pairs given up; right: of those, the ones whose best guess was right\n'
+    print('untold: pairs with a pose that failed without a direction, such as NO_PARALLAX where '
+          'the camera moved\n'
+          'none: pairs given up; right: of those, the ones whose best guess was right\n'
           f'failed: {FAILURE}\n'
           f'sure: of those, the ones that claim better than {SURE_ROTATION:g} and '
           f'{SURE_DIRECTION:g} deg\n'
@@ -158,11 +160,12 @@ def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
 
 
 def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
-    table = compact_table('', 'pairs', 'OK', 'none', 'right', 'failed', 'sure', 'NEES',
+    table = compact_table('', 'pairs', 'OK', 'untold', 'none', 'right', 'failed', 'sure', 'NEES',
                           *(f'{100 * level:g}%' for level in LEVELS), title=title)
     for row in rows:
         table.add_row(row.scene, *map(str, (
-            row.pairs, row.told, row.given_up, row.needlessly, row.failed, row.wrong_and_sure)),
+            row.pairs, row.told, row.untold, row.given_up, row.needlessly, row.failed,
+            row.wrong_and_sure)),
             f'{row.median:.2f}', *(f'{100 * share:.3g}' for share, _, _ in row.inside))
     return table
 

@@ -1,0 +1,45 @@
+"""Plots of an evaluation show errors as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from djet_ros.core.types import Status
+from djet_ros.lab import plots
+from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.style import figure
+from matplotlib.figure import Figure
+import numpy as np
+import pytest
+
+
+def record(pair: int, error: float) -> PairRecord:
+    return PairRecord('road', pair, pair, pair + 1, 'djet', 'best', '', Status.OK.value, 99, 90,
+                      False, error, 10 * error, 20.0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 50.0)
+
+
+def test_errors_far_below_those_of_a_dataset_are_drawn_where_they_are(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Figure] = {}
+    monkeypatch.setattr(plots, 'figure', kept(drawn))
+    errors = [2e-5, 0.0, float('nan'), 0.03]
+    records = [record(pair, error) for pair, error in enumerate(errors)]
+    plots.plot_errors_by_frame(tmp_path / 'errors.png', 'road', plots.grouped(records))
+    above, below = (axes.lines[0].get_ydata()
+                    for axes in drawn['errors.png'].axes[:2])
+    # A logarithmic axis has no zero, and an unknown error no place.
+    assert np.allclose(above, [2e-5, 1e-6, np.nan, 0.03], equal_nan=True, rtol=1e-12)
+    assert np.allclose(below, [2e-4, 1e-6, np.nan, 0.3], equal_nan=True, rtol=1e-12)
+
+
+def kept(drawn: dict[str, Figure]) -> Any:
+    """Give what draws as ever, and keeps the figures by the names of their files."""
+    @contextmanager
+    def keeping(path: Path, width: float, height: float) -> Iterator[Figure]:
+        with figure(path, width, height) as empty:
+            drawn[path.name] = empty
+            yield empty
+    return keeping
