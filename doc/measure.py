@@ -170,12 +170,13 @@ def begun(output: Path, settings: dict[str, Any], *, keep: bool = False) -> dict
 
     keep: give finished ones too; DjetError, so that nothing is lost, where they are of others.
     """
-    new = {'complete': False, 'settings': settings, 'versions': versions(),
+    libraries = versions()
+    new = {'complete': False, 'settings': settings, 'versions': libraries,
            'cores': os.cpu_count(), 'parts': {}}
     if not output.exists():
         return new
     earlier: dict[str, Any] = json.loads(output.read_text())
-    same = {**settings, **new['versions']}
+    same = {**settings, **libraries}
     before = {**earlier['settings'], **earlier['versions']}
     other = [name for name in same if before.get(name) != same[name]]
     if keep and other:
@@ -295,7 +296,7 @@ def against(records: Sequence[PairRecord], other: str, preset: str) -> dict[str,
     found: dict[str, Any] = {'other': other, 'preset': preset}
     for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
         errors = np.array([[getattr(ours[key], name), getattr(theirs[key], name)]
-                           for key in ours.keys() & theirs.keys()]).reshape(-1, 2)
+                           for key in ours if key in theirs]).reshape(-1, 2)
         both = [spread(column) for column in errors[np.isfinite(errors).all(axis=1)].T]
         found[what] = {kind: [one[kind] for one in both] for kind in ('mean', 'median')}
         found[what]['told'] = both[0]['told']
