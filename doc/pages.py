@@ -192,7 +192,8 @@ def comparison(part: Any) -> str:
             values += [worst_seed(one, what)] if worst else []
             figures += [number(value, digits) for value in values]
         rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
-                     told(one), *figures, str(one['failed']), str(one['sure']), f'{one["ms"]:.0f}'))
+                     told(one), *figures, str(one['failed']), str(one['sure']),
+                     f'{one["ms"]:.0f}'))
     return f'{head}.\n\n{table(header, rows)}'
 
 

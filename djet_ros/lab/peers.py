@@ -1,4 +1,5 @@
-"""Relative pose by other libraries, as their manuals show it, on the matches that ours get.
+"""
+Relative pose by other libraries, as their manuals show it, on the matches that ours get.
 
 Where a default would hold one of them back, it is set, and stands here.
 """

@@ -45,17 +45,17 @@ class Table:
 
 # Columns of figures: their titles, their fields, and the decimals that mean something.
 _FIGURES = (
-    ('rot. told', 'rotation_told', 0), ('rot. mean', 'rotation_mean_deg', 3), ('rot. median', 'rotation_median_deg', 3),
-    ('rot. p95', 'rotation_p95_deg', 3), ('tr. told', 'translation_told', 0),
-    ('tr. mean', 'translation_mean_deg', 2),
+    ('rot. told', 'rotation_told', 0), ('rot. mean', 'rotation_mean_deg', 3),
+    ('rot. median', 'rotation_median_deg', 3), ('rot. p95', 'rotation_p95_deg', 3),
+    ('tr. told', 'translation_told', 0), ('tr. mean', 'translation_mean_deg', 2),
     ('tr. median', 'translation_median_deg', 2), ('tr. p95', 'translation_p95_deg', 2),
     ('Hamming', 'hamming_mean', 2), ('failed', 'failures', 0), ('ms', 'ms_per_pair', 0))
 _TITLES = tuple(title for title, _, _ in _FIGURES)
 _DRIFT = (
     ('tr., %', 'translation_percent', 3), ('rot., deg per 100 m', 'rotation_deg_per_100m', 3),
     ('segments', 'segments', 0), ('longest, m', 'longest', 0))
-# Of these the least in a section is stressed, if no other method told more pairs: who gives up what
-# is hard has a smaller mean for it.
+# Of these the least in a section is stressed, if no other method told more pairs (what says how
+# many): who gives up what is hard has a smaller mean for it.
 _STRESSED: dict[str, str | None] = {
     'hamming_mean': 'rotation_told', **dict.fromkeys(name for _, name, _ in _DRIFT[:2])} | {
     f'{what}_{kind}_deg': f'{what}_told' for what in ('rotation', 'translation')
