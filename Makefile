@@ -43,7 +43,8 @@ fuzz: $(VENV)/.installed-fuzz
 audit: $(AUDIT)/.installed
 	$(AUDIT)/bin/python .ci/audit.py
 
-# the figures of doc/results.md and the README's table; a broken run is taken up where it ended
+# the figures of doc/results.md and the README's table; a broken run is taken up where it ended;
+# ONLY adds parts to what the same settings and code gave
 results: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/measure.py --frames $(FRAMES) --seeds $(SEEDS) \
 		$(if $(REAL_FRAMES),--real-frames $(REAL_FRAMES)) $(if $(ONLY),--only '$(ONLY)')

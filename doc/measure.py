@@ -2,8 +2,8 @@
 Measures what doc/results.md and the README's table show, and writes it as JSON.
 
 Rendered scenes are taken with several seeds; real frames are those of $DJET_DATA, if it is set. A
-run that was broken off is taken up where it ended; one of other settings, or of other code, begins
-anew.
+run that was broken off is taken up where it ended; one of other settings, code or libraries begins
+anew. With --only what is there already stays, and is refused where it is of others.
 
     python doc/measure.py --frames 21 --seeds 0,1,2,3,4 --workers 2
 """
@@ -16,8 +16,6 @@ from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import astuple, dataclass
 from functools import partial
-import hashlib
-from importlib.metadata import PackageNotFoundError, version
 import json
 import os
 from pathlib import Path
@@ -34,11 +32,13 @@ from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods, PARTS, ratios_to_base
 from djet_ros.lab.bench import bench
-from djet_ros.lab.closure import closures, summary
+from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.coverage import normalised_square
 from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.methods import default_methods, make_methods, Method
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
+from djet_ros.lab.provenance import digest_of_the_code
+from djet_ros.lab.provenance import versions as versions_of
 from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
@@ -58,8 +58,10 @@ ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / 'doc' / 'results.json'
 LIBRARIES = ('numpy', 'scipy', 'opencv-python-headless', 'poselib')
 
-# The paper's own parameters are compared between its two methods only.
-PAPER_METHODS = ('djet', 'rpe')
+# The columns of the paper's Table 1.
+PAPER_METHODS = ('djet', 'rpe', 'pjet', 'five_point')
+# Whom D-JET is held against on the pairs that both told, with which preset.
+AGAINST = (('rpe', 'best'), ('rpe', 'paper'), ('pjet', 'best'))
 CLOSED = ('djet', 'pjet', 'rpe')
 CLOSURE_FRAMES = 150
 ABLATED = ('road', 'indoor', 'handheld', 'forest')
@@ -112,9 +114,13 @@ class Outcome:
 
 def main() -> int:
     args = arguments()
-    settings = {'frames': args.frames, 'seeds': list(args.seeds),
-                'real_frames': args.real_frames, 'code': digest_of_the_code()}
-    results = begun(args.output, settings)
+    settings = {'frames': args.frames, 'seeds': list(args.seeds), 'real_frames': args.real_frames,
+                'code': digest_of_the_code([Path(__file__)])}
+    try:
+        results = begun(args.output, settings, keep=bool(args.only))
+    except DjetError as error:
+        print(f'measure.py: {error}', file=sys.stderr)
+        return 2
     failed = False
     with local_workers(args.workers) as pool:
         running = {pool.submit(work): name for name, work in missing(results, args)}
@@ -158,33 +164,30 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def digest_of_the_code() -> str:
-    """Tell one state of the package, and of this file, from another."""
-    digest = hashlib.sha256(Path(__file__).read_bytes())
-    folder = Path(djet_ros.__file__).parent
-    for path in sorted(folder.rglob('*.py')):
-        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
+def begun(output: Path, settings: dict[str, Any], *, keep: bool = False) -> dict[str, Any]:
+    """
+    Give the unfinished results of an earlier run with these settings, or empty ones.
 
-
-def begun(output: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Give the unfinished results of an earlier run with these settings, or empty ones."""
-    if output.exists():
-        earlier: dict[str, Any] = json.loads(output.read_text('utf-8'))
-        if not earlier['complete'] and earlier['settings'] == settings:
-            return earlier
-    return {'complete': False, 'settings': settings, 'versions': versions(),
-            'cores': os.cpu_count(), 'parts': {}}
+    keep: give finished ones too; DjetError, so that nothing is lost, where they are of others.
+    """
+    libraries = versions()
+    new = {'complete': False, 'settings': settings, 'versions': libraries,
+           'cores': os.cpu_count(), 'parts': {}}
+    if not output.exists():
+        return new
+    earlier: dict[str, Any] = json.loads(output.read_text('utf-8'))
+    same = {**settings, **libraries}
+    before = {**earlier['settings'], **earlier['versions']}
+    other = [name for name in same if before.get(name) != same[name]]
+    if keep and other:
+        raise DjetError(f'{output} holds results of other settings ({", ".join(other)}); measure '
+                        'all, or name another file by --output')
+    return new if other or (earlier['complete'] and not keep) else earlier
 
 
 def versions() -> dict[str, str]:
-    found = {'djet_ros': djet_ros.__version__, 'python': platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = 'not installed'
-    return found
+    return {'djet_ros': djet_ros.__version__, 'python': platform.python_version(),
+            **versions_of(LIBRARIES)}
 
 
 def write(output: Path, results: dict[str, Any]) -> None:
@@ -244,11 +247,10 @@ def measured(job: Job) -> dict[str, Any]:
         methods = [*make_methods(default_methods(), ['best'], {}),
                    *make_methods(['djet'], ['fast'], {}),
                    *make_methods(PAPER_METHODS, ['paper'], {})]
-        sequence, frames = opened(datasets[0]), min(job.frames or CLOSURE_FRAMES, CLOSURE_FRAMES)
-        found = {'seeds': list(job.seeds), 'methods': by_method(datasets, methods),
-                 'odometry': odometry(datasets),
-                 'closure': {method: known_figures(summary(triangles)) for method, triangles
-                             in closures(sequence, CLOSED, frames).items()}}
+        records = estimated(datasets, methods)
+        found = {'seeds': list(job.seeds), 'methods': by_method(datasets, methods, records),
+                 'against': [against(records, *other) for other in AGAINST],
+                 'odometry': odometry(datasets), 'closure': closed(datasets)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
@@ -259,11 +261,26 @@ def opened_for(job: Job, place: Path) -> list[Dataset]:
     return open_datasets(folders, Selection(end=job.frames), place)
 
 
-def by_method(datasets: Sequence[Dataset], methods: Sequence[Method], *,
-              compared: bool = False) -> list[dict[str, Any]]:
-    """Estimate all pairs, each by itself, and sum up by method; compared: with the first, too."""
-    records = [record for dataset in datasets
-               for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
+def ratios(records: Sequence[PairRecord], base: Sequence[PairRecord]) -> dict[str, Any]:
+    """Give errors over those of others on the same pairs, each with its interval."""
+    return {'ratio': {what: {kind: [rounded(value) for value in astuple(one)]
+                             for kind, one in by_kind.items()}
+                      for what, by_kind in ratios_to_base(records, base).items()}}
+
+
+def estimated(datasets: Sequence[Dataset], methods: Sequence[Method]) -> list[PairRecord]:
+    """Estimate all pairs, each by itself."""
+    return [record for dataset in datasets
+            for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
+
+
+def by_method(datasets: Sequence[Dataset], methods: Sequence[Method],
+              records: Sequence[PairRecord], *, compared: bool = False) -> list[dict[str, Any]]:
+    """
+    Sum up the records of all pairs by method; hamming: in bits, over the inliers of pairs.
+
+    compared: with the first method, too.
+    """
     found: list[dict[str, Any]] = []
     base: list[PairRecord] = []
     for method in methods:
@@ -274,16 +291,39 @@ def by_method(datasets: Sequence[Dataset], methods: Sequence[Method], *,
                             record.translation_error_deg, record.failed) for record in own]
         found.append({'method': method.name, 'preset': method.preset, 'change': method.change,
                       **summed(outcomes),
+                      'hamming': spread([record.hamming_mean for record in own])['mean'],
                       'ms': rounded(np.median([record.milliseconds for record in own])),
                       **drifts(datasets, own), **(ratios(own, base) if compared else {})})
     return found
 
 
-def ratios(records: Sequence[PairRecord], base: Sequence[PairRecord]) -> dict[str, Any]:
-    """Give errors over those of others on the same pairs, each with its interval."""
-    return {'ratio': {what: {kind: [rounded(value) for value in astuple(one)]
-                             for kind, one in by_kind.items()}
-                      for what, by_kind in ratios_to_base(records, base).items()}}
+def against(records: Sequence[PairRecord], other: str, preset: str) -> dict[str, Any]:
+    """
+    Hold D-JET against another method on the pairs that both told: who gives up a pair gains none.
+
+    Figures are [D-JET's, the other's].
+    """
+    ours, theirs = ({(one.sequence, one.pair): one for one in records
+                     if (one.method, one.preset) == (method, preset)}
+                    for method in ('djet', other))
+    found: dict[str, Any] = {'other': other, 'preset': preset}
+    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
+        errors = np.array([[getattr(ours[key], name), getattr(theirs[key], name)]
+                           for key in ours if key in theirs]).reshape(-1, 2)
+        both = [spread(column) for column in errors[np.isfinite(errors).all(axis=1)].T]
+        found[what] = {kind: [one[kind] for one in both] for kind in ('mean', 'median')}
+        found[what]['told'] = both[0]['told']
+    return found
+
+
+def closed(datasets: Sequence[Dataset]) -> dict[str, Any]:
+    """Sum up the triangles of the first frames of all sequences by method."""
+    triangles: dict[str, list[Triangle | None]] = {method: [] for method in CLOSED}
+    for dataset in datasets:
+        frames = min(dataset.pairs + 1, CLOSURE_FRAMES)
+        for method, some in closures(opened(dataset), CLOSED, frames).items():
+            triangles[method] += some
+    return {method: known_figures(summary(some)) for method, some in triangles.items()}
 
 
 def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[str, Any]:
@@ -341,8 +381,9 @@ def drive(folder: Path) -> dict[str, Any]:
     started = perf_counter()
     with TemporaryDirectory() as name:
         datasets = open_datasets([folder], Selection(), Path(name))
+        chained = make_methods(CHAINED, ['best'], {})
         found = {'frames': datasets[0].pairs + 1, 'length': rounded(length(folder)),
-                 'chained': by_method(datasets, make_methods(CHAINED, ['best'], {})),
+                 'chained': by_method(datasets, chained, estimated(datasets, chained)),
                  'replays': {how: replayed(folder, values, Path(name) / str(number))
                              for number, (how, values) in enumerate(REPLAYED.items())}}
     return {'seconds': rounded(perf_counter() - started), **found}
@@ -372,7 +413,8 @@ def ablation(seeds: tuple[int, ...]) -> dict[str, Any]:
             Job(scene, seeds, None, ABLATED_FRAMES, 0), Path(name) / scene)]
         methods = ablation_methods(['best'], PARTS, ABLATED_WINDOWS, {})
         found = {'of': list(ABLATED), 'frames': ABLATED_FRAMES, 'seeds': list(seeds),
-                 'variants': by_method(datasets, methods, compared=True)}
+                 'variants': by_method(datasets, methods, estimated(datasets, methods),
+                                       compared=True)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
@@ -414,12 +456,12 @@ def summed(outcomes: Sequence[Outcome]) -> dict[str, Any]:
                         for some in sequences.values()]}
 
 
-def spread(values: Iterable[float]) -> dict[str, float | None]:
-    """Mean, median, 95th percentile and maximum of the values that are known."""
+def spread(values: Iterable[float]) -> dict[str, Any]:
+    """Mean, median, 95th percentile and maximum of the values that are known: so many are told."""
     known = np.array([value for value in values if np.isfinite(value)])
     if not len(known):
-        return dict.fromkeys(('mean', 'median', 'p95', 'max'))
-    return {'mean': rounded(known.mean()), 'median': rounded(np.median(known)),
+        return {'told': 0, **dict.fromkeys(('mean', 'median', 'p95', 'max'))}
+    return {'told': len(known), 'mean': rounded(known.mean()), 'median': rounded(np.median(known)),
             'p95': rounded(np.percentile(known, 95)), 'max': rounded(known.max())}
 
 

@@ -15,8 +15,12 @@ import sys
 import textwrap
 from typing import Any
 
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.lab import peers
 from djet_ros.lab.ablation import ON_PLACES
+from djet_ros.lab.chains import CHAINS
 from djet_ros.lab.methods import TITLES
+from djet_ros.lab.published import TABLE_1
 from djet_ros.lab.scenes import SCENES
 from djet_ros.live.parameters import FIXED, SHARED
 from djet_ros.odometry.images import ENCODINGS
@@ -28,6 +32,8 @@ PAGES = (ROOT / 'README.md', *sorted(DOC.glob('*.md')))
 BLOCK = re.compile(r'(?<=<!-- generated: )([\w -]+)( -->\n).*?(?=<!-- end -->)', re.DOTALL)
 RESULTS = DOC / 'results.json'
 
+PRINTED_HAMMING = ('djet', 'rpe', 'five_point')
+STEPPED = 'tartanair indoor'
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
 # The README's columns, where they were measured.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
@@ -35,6 +41,8 @@ DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
+# Of fewer triangles one in twenty is the largest.
+ENOUGH = 20
 # Scenes in which the camera does not move from its place have no direction to compare.
 NO_WAY = {name for name, entry in SCENES.items() if not entry.parallax}
 
@@ -162,8 +170,9 @@ def summary(results: Any) -> str:
     shown = [name for name in SHOWN if name in methods_of(results)]
     rows = [(name, str(pairs(part)), *(cell(part, method, 'mean') for method in shown))
             for name, part in sequences(results) if name not in NO_WAY]
-    return (paragraph('Mean errors in degrees, rotation / direction of translation, and failed '
-                      f'pairs in brackets. {conditions(results)}')
+    return (paragraph('Mean errors in degrees, rotation / direction of translation, of the pairs '
+                      'that a method told, and failed pairs in brackets. '
+                      f'{conditions(results)}')
             + table(('', 'pairs', *(TITLES[name] for name in shown)), rows))
 
 
@@ -175,12 +184,18 @@ def conditions(results: Any) -> str:
 
 
 def measured_with(results: Any) -> str:
+    settings = results['settings']
+    words = ['make results', f'FRAMES={settings["frames"]}',
+             f'SEEDS={",".join(map(str, settings["seeds"]))}']
+    if settings['real_frames']:
+        words.append(f'REAL_FRAMES={settings["real_frames"]}')
     versions = ', '.join(f'{name} {number}' for name, number in results['versions'].items())
-    real = results['settings']['real_frames']
+    real = settings['real_frames']
     state = '' if results['complete'] else '**This run is not complete.** '
-    return paragraph(f'{state}{conditions(results)} Real sequences are taken '
-                     f'{f"to frame {real}" if real else "as far as they are there"}. '
-                     f'Measured on {results["cores"]} cores with {versions}.')
+    return f'```sh\n{" ".join(words)}\n```\n\n' + paragraph(
+        f'{state}{conditions(results)} Real sequences are taken '
+        f'{f"to frame {real}" if real else "as far as they are there"}. '
+        f'Measured on {results["cores"]} cores with {versions}.')
 
 
 def compared(results: Any) -> str:
@@ -192,7 +207,7 @@ def comparison(part: Any) -> str:
     seeds = len(part['seeds'])
     head = f'{pairs(part)} pairs' + (f' of {seeds} seeds' if seeds > 1 else '')
     worst = ('worst seed',) if seeds > 1 else ()
-    header = ('method', 'preset', 'rotation: mean', 'median', '95 %', *worst,
+    header = ('method', 'preset', 'told', 'rotation: mean', 'median', '95 %', *worst,
               'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'ms')
     rows = []
     for one in part['methods']:
@@ -202,8 +217,14 @@ def comparison(part: Any) -> str:
             values += [worst_seed(one, what)] if worst else []
             figures += [number(value, digits) for value in values]
         rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
-                     *figures, str(one['failed']), str(one['sure']), f'{one["ms"]:.0f}'))
+                     told(one), *figures, str(one['failed']), str(one['sure']),
+                     f'{one["ms"]:.0f}'))
     return f'{head}.\n\n{table(header, rows)}'
+
+
+def told(one: Any) -> str:
+    """Say how many pairs the means of rotation and direction are over."""
+    return ' / '.join(number(one[what].get('told'), 0) for what in DIGITS)
 
 
 def worst_seed(one: Any, what: str) -> float | None:
@@ -216,20 +237,24 @@ def against(other: str, presets: Sequence[str]) -> Callable[[Any], str]:
         rows = [compared_row(name, part, other, preset)
                 for preset in presets for name, part in sequences(results)]
         behind = [f'{row[0]} (`{row[1]}`)' for row in rows if '**' in ''.join(row)]
+        known = all('against' in part for _, part in sequences(results))
         return paragraph(
-            f'D-JET over {TITLES[other]} on the same matches, each with the preset that is named: '
-            'below 1 D-JET is better, above it, in bold, worse. '
+            f'D-JET over {TITLES[other]} on the same matches, each with the preset that is named, '
+            'on the pairs that both told: below 1 D-JET is better, above it, in bold, worse. '
             + (f'It is behind in at least one figure on: {", ".join(behind)}.' if behind
-               else 'It is behind in none.')
-        ) + table(('', 'preset', 'rotation: mean', 'median', 'direction: mean', 'median',
-                   f'failed, D-JET / {TITLES[other]}'), rows)
+               else 'It is behind in none.' if known else '')
+        ) + table(('', 'preset', 'both told', 'rotation: mean', 'median', 'direction: mean',
+                   'median', f'failed, D-JET / {TITLES[other]}'), rows)
     return block
 
 
 def compared_row(name: str, part: Any, other: str, preset: str) -> tuple[str, ...]:
-    ours, theirs = find(part, 'djet', preset), find(part, other, preset)
-    return (name, preset, *(ratio(ours, theirs, what, kind) for what in DIGITS
-                            for kind in ('mean', 'median')), failures(ours, theirs))
+    both = next((one for one in part.get('against', ())
+                 if (one['other'], one['preset']) == (other, preset)), None)
+    figures = ['–'] * 5 if both is None else [
+        told(both), *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
+    return (name, preset, *figures,
+            failures(find(part, 'djet', preset), find(part, other, preset)))
 
 
 def failures(ours: Any, theirs: Any) -> str:
@@ -237,25 +262,85 @@ def failures(ours: Any, theirs: Any) -> str:
     return f'**{text}**' if ours['failed'] > theirs['failed'] else text
 
 
-def ratio(ours: Any, theirs: Any, what: str, kind: str) -> str:
-    both = ours[what][kind], theirs[what][kind]
-    if None in both or max(both) < EQUAL:
+def ratio(ours: float | None, theirs: float | None) -> str:
+    """Divide two errors in degrees, unless there is none or both are as good as none."""
+    if ours is None or theirs is None or max(ours, theirs) < EQUAL:
         return '–'
-    value = max(both[0], EQUAL) / max(both[1], EQUAL)
-    return f'**{value:.2f}**' if value > 1 else f'{value:.2f}'
+    text = f'{ours / theirs:.2f}' if theirs else '∞'
+    return f'**{text}**' if ours > theirs and text != '1.00' else text
+
+
+def table_1(results: Any) -> str:
+    """Lay out the paper's Table 1 beside what its parameters give here."""
+    rows, starts = [], []
+    for name, part in sequences(results):
+        if name not in TABLE_1:
+            continue
+        printed = {row.method: row for row in TABLE_1[name]}
+        here = {method: find(part, method, 'paper') or {} for method in OURS}
+        rows += [(name, f'here, {pairs(part)} pairs',
+                  *(number(one.get('rotation', {}).get('mean')) for one in here.values()),
+                  *(number(one.get('direction', {}).get('mean')) for one in here.values()),
+                  *(number(here[method].get('hamming'), 2) for method in PRINTED_HAMMING)),
+                 (name, 'the paper', *(number(printed[method].rotation_deg) for method in OURS),
+                  *(number(printed[method].translation_deg) for method in OURS),
+                  *(number(printed[method].hamming, 2) for method in PRINTED_HAMMING))]
+        if here['five_point']:
+            starts.append(f'{pair_of(here["five_point"], "mean")} here and '
+                          f'{printed["five_point"].rotation_deg:.3f} / '
+                          f'{printed["five_point"].translation_deg:.3f} there on {name}')
+    said = ("The paper's Table 1, of whole sequences in what it calls degrees, beside the preset "
+            '`paper` here, of their first pairs: mean errors, and mean Hamming distances in bits.')
+    if starts:
+        said += f' The start of all, 5-P, already differs: {", ".join(starts)}.'
+    titles = [TITLES[method] for method in OURS]
+    return paragraph(said) + table(
+        ('', '', f'rotation: {titles[0]}', *titles[1:], f'translation: {titles[0]}', *titles[1:],
+         f'Hamming: {titles[0]}', *(TITLES[method] for method in PRINTED_HAMMING[1:])), rows)
+
+
+def peer_settings(_: Any) -> str:
+    """Say what the peers are set to, where the code says it."""
+    chains = ''.join(paragraph(
+        f'{TITLES[name]}: {first_line(chain.detect)} {first_line(chain.match)}')
+        for name, chain in CHAINS.items())
+    return (paragraph(
+        'The peers are set to what serves them best. PL is PoseLib. Thresholds of their searches '
+        f'are {EstimatorConfig.ransac_threshold:g} px, as for our start. RANSAC and MAGSAC++ are '
+        f'`findEssentialMat` with a confidence of {peers.CONFIDENCE:g}, and `recoverPose` with '
+        f'`distanceThresh={peers.FARTHEST:g}`: by default points beyond 50 baselines have no '
+        'vote, and after a step of a hand-held camera none is nearer. PoseLib is its LO-RANSAC '
+        f'and refinement with a Cauchy loss that bends at {peers.LOSS_SCALE:g} px instead of its '
+        'default, half the threshold, which leaves larger errors; that holds alone and with '
+        'SIFT and KLT. `djet_ros/lab/chains.py` tells what was tried.')
+        + chains)
+
+
+def first_line(function: Callable[..., Any]) -> str:
+    return str(function.__doc__).strip().split('\n')[0]
+
+
+def beyond(results: Any) -> str:
+    """Say of how many poses of stepped edges the covariance is too small."""
+    part = results['parts'].get(STEPPED)
+    if part is None:
+        return ''
+    one = part['odometry']['surprise']
+    return (f'  Beyond the bound of 99.9 % lie {one["beyond"]} of {one["pairs"]} pairs of '
+            f'{known_as(STEPPED)}.\n')
 
 
 def odometry(results: Any) -> str:
     rows = []
     for name, part in sequences(results):
         one = part['odometry']
-        rows.append((name, str(one['pairs']),
+        rows.append((name, str(one['pairs']), told(one),
                      *(number(one[what][kind], DIGITS[what])
                        for what in ('rotation', 'direction')
                        for kind in ('mean', 'median', 'max')),
                      str(one['failed']), str(one['sure'])))
-    return table(('', 'pairs', 'rotation: mean', 'median', 'largest', 'direction: mean', 'median',
-                  'largest', 'failed', 'of these `OK`'), rows)
+    return table(('', 'pairs', 'told', 'rotation: mean', 'median', 'largest', 'direction: mean',
+                  'median', 'largest', 'failed', 'of these `OK`'), rows)
 
 
 def drift(results: Any) -> str:
@@ -302,7 +387,8 @@ def closure(results: Any) -> str:
         for method, one in part['closure'].items():
             if not one['triangles']:
                 continue
-            rows.append((name, TITLES[method], number(one['median_deg']), number(one['p95_deg']),
+            rows.append((name, TITLES[method], number(one['median_deg']),
+                         number(one['p95_deg'] if one['triangles'] >= ENOUGH else None),
                          number(one['claimed_median_deg']),
                          number(one['normalised_square_mean'], 1),
                          number(one['error_median_deg']),
@@ -457,7 +543,8 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'shared parameters': shared, 'encodings': encodings, 'reports': reports,
     'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
-    'measured with': measured_with, 'compared': compared,
+    'measured with': measured_with, 'compared': compared, 'table 1': table_1,
+    'peers': peer_settings, 'beyond': beyond,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
     'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'joined': joined, 'speed': speed,

@@ -18,6 +18,7 @@ from djet_ros.lab import methods as field
 from djet_ros.lab.chains import CHAINS, corners, mutual_neighbours, root_sift, tracked
 from djet_ros.lab.methods import make_methods, Method
 from djet_ros.lab.pairs import evaluate_chunk, PairChunk, PairRecord
+from djet_ros.lab.peers import ESTIMATORS
 from djet_ros.lab.scenes import render_pair, render_sequence, ScenePair
 from djet_ros.lab.scenes.texture import fractal
 from djet_ros.lab.sequences import open_datasets, Selection
@@ -26,6 +27,7 @@ from djet_ros.lab.tables import timings_csv
 import numpy as np
 from numpy.typing import NDArray
 import pytest
+from two_view import FORWARD, two_views
 
 # A mark: a skip while modules are imported would lose others too, where a plugin imports them.
 pytestmark = pytest.mark.skipif(find_spec('poselib') is None,
@@ -140,6 +142,17 @@ def test_the_same_images_give_the_same_pose_to_the_last_bit(name: str, street: S
     one, other = by_chain(name, street), by_chain(name, street)
     for value, again in zip(asdict(one).values(), asdict(other).values()):
         np.testing.assert_array_equal(value, again)
+
+
+# Peers on given matches
+
+@pytest.mark.parametrize('name', ['opencv_ransac', 'usac_magsac'])
+def test_points_of_many_baselines_away_tell_opencvs_poses_apart(name: str) -> None:
+    # As a hand moves a camera by a centimetre, through a room of some metres.
+    given = two_views(np.random.default_rng(0), t=FORWARD, near=60.0, far=300.0)
+    R, t, _ = ESTIMATORS[name](given.K, given.x, given.y, 1.0)
+    assert rotation_angle(R, given.R) < 1e-3
+    assert direction_angle(t, given.t) < 0.1
 
 
 # In an evaluation

@@ -460,6 +460,16 @@ def test_stepping_keypoints_towards_their_optimum_lowers_their_descriptor_distan
     assert distances[2] < 0.95 * distances[0]
 
 
+def test_the_paper_trusts_epipolar_lines_however_near_to_the_epipole(pair):
+    previous, current, _ = pair
+    printed = preset('paper', max_iterations=1)
+    assert printed.epipole_blur == 0
+    (as_printed, x), (blurred, _) = ((found.R, found.x) for found in (
+        TwoViewEstimator(config).estimate(previous, current)
+        for config in (printed, replace(printed, epipole_blur=5.0))))
+    assert len(x) and not np.array_equal(as_printed, blurred)
+
+
 def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_foreseen():
     scene = make_scene('road', size=(620, 188))
     estimator = TwoViewEstimator()

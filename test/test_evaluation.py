@@ -19,6 +19,8 @@ from time import monotonic, sleep
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.types import Status
+from djet_ros.errors import DjetError
+from djet_ros.lab.ablation import ablation_methods
 from djet_ros.lab.chains import CHAINS
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import estimated_trajectory, true_trajectory
@@ -26,7 +28,9 @@ from djet_ros.lab.methods import default_methods, Method, TITLES
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
+from djet_ros.lab.store import RecordStore
 from djet_ros.lab.summary import table_rows
+from djet_ros.lab.tables import results_table
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
@@ -35,9 +39,10 @@ import numpy as np
 import pytest
 
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
-COLUMNS = ['sequence', 'method', 'preset', 'pairs', 'failures', 'rotation_mean_deg',
-           'rotation_median_deg', 'rotation_p95_deg', 'translation_mean_deg',
-           'translation_median_deg', 'translation_p95_deg', 'hamming_mean', 'ms_per_pair']
+COLUMNS = ['sequence', 'method', 'preset', 'pairs', 'failures', 'rotation_told',
+           'rotation_mean_deg', 'rotation_median_deg', 'rotation_p95_deg', 'translation_told',
+           'translation_mean_deg', 'translation_median_deg', 'translation_p95_deg',
+           'hamming_mean', 'ms_per_pair']
 FRAMES = 8
 # Enough work for a chunk to be interrupted.
 RUN = ('--methods', 'djet,rpe', '--presets', 'paper')
@@ -138,7 +143,7 @@ def test_kitti_sequences_have_the_papers_figures_beside_them(kitti, tmp_path):
     answer = djet('evaluate', kitti / 'sequences' / '06', '--end', '3', '--methods', 'djet,rpe',
                   '--presets', 'best', '--output', tmp_path)
     assert answer.returncode == 0, answer.stderr
-    assert '| *06* | *the paper* | *RP-E* | *0.049* |' in (tmp_path / 'table1.md').read_text()
+    assert '| *06* | *the paper* | *RP-E* |  | *0.049* |' in (tmp_path / 'table1.md').read_text()
     # The file for programs holds what was measured, and nothing else.
     assert {row['preset'] for row in rows(tmp_path / 'table1.csv')} == {'best'}
 
@@ -225,12 +230,24 @@ def test_rows_are_over_known_errors_and_count_the_failures():
     row, = table_rows([record(0, rotation_error_deg=0.1, translation_error_deg=2.0),
                        record(1, rotation_error_deg=0.3, translation_error_deg=4.0),
                        record(2, **nothing)])
-    assert (row.pairs, row.failures) == (3, 1)
+    assert (row.pairs, row.failures, row.rotation_told, row.translation_told) == (3, 1, 2, 2)
     assert row.rotation_mean_deg == pytest.approx(0.2)
     assert row.translation_p95_deg == pytest.approx(3.9)
     assert row.hamming_mean == 20
     only, = table_rows([record(0, **nothing)])
     assert math.isnan(only.rotation_mean_deg)
+
+
+@pytest.mark.parametrize(('given_up', 'stressed'), [(False, ['D-JET']), (True, [])])
+def test_who_gives_up_what_is_hard_is_not_stressed_for_its_smaller_mean(given_up, stressed):
+    lost = {'rotation_error_deg': math.nan, 'failed': True} if given_up else {}
+    table = results_table('', table_rows([
+        record(0, rotation_error_deg=0.1), record(1, **{'rotation_error_deg': 0.2, **lost}),
+        record(0, method='poselib', rotation_error_deg=0.2),
+        record(1, method='poselib', rotation_error_deg=0.3)]), {})
+    mean = table.header.index('rot. mean')
+    assert [line.cells[2] for line in table.lines if mean in line.bold] == stressed
+    assert [line.cells[mean - 1] for line in table.lines] == ['1' if given_up else '2', '2']
 
 
 @pytest.mark.parametrize(('rotation', 'translation', 'way', 'failed'), [
@@ -430,6 +447,21 @@ def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     assert {row['method'] for row in rows(tmp_path / 'table1.csv')} == {'rpe'}
 
 
+@pytest.mark.parametrize('other', ['code', 'libraries'])
+def test_results_of_other_code_or_libraries_are_not_mixed(other, tmp_path):
+    with RecordStore(tmp_path, PairRecord, {'methods': ['djet']}) as store:
+        store.add('road:0+1', [record(0)])
+    with RecordStore(tmp_path, PairRecord, {'methods': ['djet']}) as store:
+        assert store.chunks == {'road:0+1': [record(0)]}
+    first, *rest = (tmp_path / 'records.jsonl').read_text().splitlines(keepends=True)
+    settings = json.loads(first)
+    assert {'numpy', 'opencv', 'poselib', 'scipy'} == set(settings['libraries'])
+    earlier = json.dumps({**settings, other: 'of yesterday'}) + '\n'
+    (tmp_path / 'records.jsonl').write_text(earlier + ''.join(rest))
+    with pytest.raises(DjetError, match=f'other settings .{other}.; choose another folder'):
+        RecordStore(tmp_path, PairRecord, {'methods': ['djet']})
+
+
 @pytest.mark.slow
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
@@ -550,6 +582,18 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     # and the paper's Table 2.
     assert '| *VAROS* | *D-JET* | *15×15* | *0.127* | *0.258* | *22.31* |' in text
     assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
+
+
+def test_a_variant_is_the_same_in_company_as_alone(road, tmp_path):
+    source, = open_datasets([road], Selection(), tmp_path)
+    variants = [method for method in ablation_methods(['best'], ['patch', 'grading', 'tests'], (),
+                                                      {}) if method.name == 'djet']
+    together = evaluate_chunk(PairChunk(source, 0, 2), variants)
+    alone = [record for method in variants
+             for record in evaluate_chunk(PairChunk(source, 0, 2), [method])]
+    assert len({one.rotation for one in alone}) == len(alone) == 2 * len(variants)
+    assert ({(one.change, one.pair): one.rotation for one in together}
+            == {(one.change, one.pair): one.rotation for one in alone})
 
 
 def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):

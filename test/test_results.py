@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 import json
+import math
 import os
 from pathlib import Path
 import subprocess
@@ -12,7 +14,9 @@ from types import ModuleType
 from typing import Any
 
 from djet_ros.core.types import Status
+from djet_ros.errors import DjetError
 from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import open_datasets, Selection
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
@@ -62,6 +66,8 @@ def test_every_method_is_measured_on_every_pair(part):
     for one in part['methods']:
         assert one['pairs'] == 2
         assert one['sure'] <= one['failed'] <= one['pairs']
+        assert one['rotation']['told'] <= one['pairs']
+        assert one['hamming'] > 0
         assert one['ms'] > 0
         assert len(one['by_seed']) == 1
 
@@ -75,13 +81,84 @@ def test_standing_still_is_no_failure_and_has_no_direction(part):
 
 
 @pytest.mark.slow
-def test_what_was_measured_is_taken_over_and_other_settings_begin_anew(output, tmp_path):
+def test_what_was_measured_is_taken_over_and_not_mixed_with_other_settings(output, tmp_path):
     begun = tmp_path / 'results.json'
     begun.write_text(output.read_text())
     assert measure(begun) == []
     assert begun.read_text() == output.read_text()
-    assert measure(begun, '--frames', '4') == [SCENE]
-    assert json.loads(begun.read_text())['settings']['frames'] == 4
+    with pytest.raises(AssertionError, match=r'holds results of other settings \(frames\)'):
+        measure(begun, '--frames', '4')
+    assert begun.read_text() == output.read_text()
+
+
+def test_one_part_is_added_to_all_that_is_measured_and_all_anew_begins_empty(tmp_path):
+    module, path = script('measure'), tmp_path / 'results.json'
+    settings = {'frames': 7, 'seeds': [0], 'real_frames': None, 'code': 'abc'}
+    whole = {**module.begun(path, settings), 'complete': True, 'parts': {'road': {}, 'loop': {}}}
+    path.write_text(json.dumps(whole))
+    assert module.begun(path, settings, keep=True) == whole
+    assert module.begun(path, settings)['parts'] == {}
+    with pytest.raises(DjetError, match=r'other settings \(code\)') as said:
+        module.begun(path, {**settings, 'code': 'of yesterday'}, keep=True)
+    assert '\n' not in str(said.value)
+    path.write_text(json.dumps({**whole, 'complete': False}))
+    assert list(module.begun(path, settings)['parts']) == ['road', 'loop']
+    assert module.begun(path, {**settings, 'frames': 8})['parts'] == {}
+
+
+def test_ratios_are_of_pairs_that_both_told():
+    errors = {'djet': (0.0002, 0.0004, 9.0), 'rpe': (0.0010, 0.0030, math.nan)}
+    records = [replace(record(i, Rotation.identity(), np.array([0, 0, 1.0])), method=method,
+                       rotation_error_deg=error, translation_error_deg=math.nan)
+               for method, own in errors.items() for i, error in enumerate(own)]
+    found = script('measure').against(records, 'rpe', 'best')
+    assert found['rotation'] == {'told': 2, 'mean': [0.0003, 0.002], 'median': [0.0003, 0.002]}
+    assert found['direction']['mean'] == [None, None]
+    pages = script('pages')
+    part = {'methods': [{'method': method, 'preset': 'best', 'failed': 0} for method in errors],
+            'against': [found]}
+    # Neither is cut off at what counts as no error.
+    assert pages.compared_row('road', part, 'rpe', 'best') == (
+        'road', 'best', '2 / 0', '0.15', '0.15', '–', '–', '0 / 0')
+    del part['against']
+    assert pages.compared_row('road', part, 'rpe', 'best')[2:7] == ('–',) * 5
+
+
+@pytest.mark.parametrize(('ours', 'theirs', 'text'), [
+    (0.002, 0.001, '**2.00**'), (0.0101, 0.01, '**1.01**'), (0.010001, 0.01, '1.00'),
+    (0.0002, 0.0009, '–'), (None, None, '–'), (0.5, 0.0, '**∞**')])
+def test_a_ratio_is_bold_where_it_is_seen_to_be_above_one(ours, theirs, text):
+    assert script('pages').ratio(ours, theirs) == text
+
+
+def test_the_paper_stands_beside_what_its_parameters_give():
+    def own(method: str) -> dict[str, Any]:
+        return {'method': method, 'preset': 'paper', 'pairs': 60, 'hamming': 21.0,
+                'rotation': {'mean': 0.0917}, 'direction': {'mean': 1.25}}
+    page = script('pages').table_1({'parts': {'kitti 00': {
+        'methods': [own(method) for method in ('djet', 'rpe', 'five_point')]}}})
+    assert ('| KITTI 00 | here, 60 pairs | 0.092 | 0.092 | – | 0.092 | 1.250 | 1.250 | – | 1.250 '
+            '| 21.00 | 21.00 | 21.00 |') in page
+    assert ('| KITTI 00 | the paper | 0.094 | 0.074 | 0.096 | 0.119 | 0.075 | 0.070 | 6.749 '
+            '| 0.044 | 19.42 | 20.46 | 20.98 |') in page
+    assert '0.0917 / 1.250 here and 0.119 / 0.044 there' in ' '.join(page.split())
+
+
+def test_few_triangles_have_no_95_percent():
+    def page(triangles: int) -> str:
+        figures = dict.fromkeys(('median_deg', 'claimed_median_deg', 'normalised_square_mean',
+                                 'error_median_deg'), 0.5)
+        return script('pages').closure({'parts': {'road': {'methods': [], 'closure': {'djet': {
+            **figures, 'triangles': triangles, 'without': 0, 'p95_deg': 0.75}}}}})
+    assert '| 0.500 | – |' in page(19)
+    assert '| 0.500 | 0.750 |' in page(20)
+
+
+def test_triangles_are_of_all_seeds(tmp_path):
+    datasets = open_datasets([render_sequence('road', tmp_path / str(seed), 3, seed, (480, 160))
+                              for seed in (0, 1)], Selection(), tmp_path)
+    for one in script('measure').closed(datasets).values():
+        assert one['triangles'] + one['without'] == 2
 
 
 def test_pairs_that_each_turn_too_far_drift_by_that_over_a_long_way(small_kitti, tmp_path):

@@ -73,6 +73,11 @@ class EstimatorConfig:
         True, 'leave out matches whose surface has its minimum outside the sampled window')
     weigh_by_fit: bool = parameter(
         True, 'take the noise of a match from what is left of its residual at its best place')
+    # 5, about a window, was chosen: nearer, a match that fits by chance would hold the epipole and
+    # make it look far surer than it is.
+    epipole_blur: float = parameter(
+        5.0, 'distance from the epipole, in pixels, within which the direction of an epipolar '
+        'line is taken for noise; 0 trusts all lines, as printed', minimum=0.0, maximum=100.0)
     join_matches: bool = parameter(
         True, 'count where gray levels have each match beside what its surface tells, each as '
         'exact as it shows itself to be; not for rpe, which is where matches were found alone')
@@ -109,7 +114,7 @@ _PAPER: dict[str, Any] = {
     'window': 7, 'window_sigma': 0.0,
     'grading': 0.0, 'binary_tests': 256, 'patch_scale': 1.0, 'warp_reference': False,
     'indefinite': 'drop', 'cull_outside': False,
-    'weigh_by_fit': False, 'join_matches': False, 'loss': 'none',
+    'weigh_by_fit': False, 'epipole_blur': 0.0, 'join_matches': False, 'loss': 'none',
     'step': 'share', 'step_share': 0.3, 'max_iterations': 20, 'epsilon': 1e-4,
 }
 

@@ -22,6 +22,7 @@ from typing import NamedTuple, Protocol
 
 from djet_ros.core.cells import cells_of
 from djet_ros.core.covariance import LARGE_CELLS, SHIFT
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
 from djet_ros.core.jet import (
     core_scale,
@@ -34,7 +35,6 @@ from djet_ros.core.jet import (
 )
 from djet_ros.core.paraboloid import times
 from djet_ros.core.starts import thinned
-from djet_ros.core.tracking import TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 
@@ -277,7 +277,8 @@ def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Arra
     spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
     width = (spread[0] + spread[2]) / 2
     rays_x, rays_y = (np.vstack([one.T, np.ones(len(one))]) for one in (x, y))
-    return JetProblem(rays_x, rays_y, spread, TRACK_TUNING.epipole_blur**2 * width**2), by_pixel
+    blur = EstimatorConfig.epipole_blur**2 * width**2
+    return JetProblem(rays_x, rays_y, spread, blur), by_pixel
 
 
 def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:

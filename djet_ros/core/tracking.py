@@ -51,9 +51,6 @@ from numpy.typing import NDArray
 class TrackTuning:
     """Constants of the optimisation, each with where it comes from ("chosen" was not searched)."""
 
-    # pixels; chosen, about a window: so near to the epipole the direction of a line is noise, and
-    # a match that fits by chance would hold the epipole and make it look far surer than it is
-    epipole_blur: float = 5.0
     # bends of the loss; chosen: beyond, a match has next to no weight anyway
     by_itself: float = 2.0
     # chosen: a body spread over less than this share of the area of the world's matches is not
@@ -241,7 +238,7 @@ class _Algorithm:
                    ahead: Ahead | None, steps: int) -> _Optimised:
         """Find the pose in the right basin of some."""
         config, places = self._config, self._surface.x[voting]
-        problem = jet_problem(self._K, places, paraboloids.of(voting), TRACK_TUNING.epipole_blur,
+        problem = jet_problem(self._K, places, paraboloids.of(voting), config.epipole_blur,
                               config.weigh_by_fit)
         if len(poses) > 1:
             basin = right_basin(problem, places, poses, config, self._pair.before,

@@ -12,7 +12,7 @@ import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.hamming import match_distances, smooth
-from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.core.types import Array, Features, RelativePose, Status, View
 from djet_ros.lab import peers
 from djet_ros.lab.chains import CHAINS, Points
 from djet_ros.lab.methods import Method
@@ -126,23 +126,39 @@ def estimate(method: Method, given: Given) -> RelativePose:
 
 
 class _Image:
-    """An image and its features, found once for each setting of the detector."""
+    """
+    An image, its features, and its views.
+
+    Each is made once for all methods whose settings decide the same about it.
+    """
 
     def __init__(self, gray: NDArray[np.uint8], K: Array) -> None:
         self._gray, self.K = gray, K
+        self._features: dict[Any, tuple[Features, float]] = {}
         self._views: dict[Any, tuple[View, float]] = {}
         self._points: dict[str, tuple[Points, float]] = {}
 
     def view(self, method: Method) -> tuple[View, float]:
         """Give the view with its features, and the seconds that they took."""
         config = method.config
-        key = (config.detector, config.max_features, config.fast_threshold,
-               config.corner_contrast)
+        detected = (config.detector, config.max_features, config.fast_threshold,
+                    config.corner_contrast)
+        # A view holds, beside its features, the image as the tests of surfaces see it.
+        key = (*detected, config.patch_scale, config.grading > 0)
         if key not in self._views:
+            features, seconds = self._found(detected, TwoViewEstimator(config))
             start = perf_counter()
-            view = TwoViewEstimator(config).view(self._gray, self.K)
-            self._views[key] = view, perf_counter() - start
+            view = TwoViewEstimator(config).view(self._gray, self.K, features)
+            self._views[key] = view, seconds + perf_counter() - start
         return self._views[key]
+
+    def _found(self, detected: Any, estimator: TwoViewEstimator) -> tuple[Features, float]:
+        """Give the features of these settings of the detector, and their seconds."""
+        if detected not in self._features:
+            start = perf_counter()
+            features = estimator.features(self._gray)
+            self._features[detected] = features, perf_counter() - start
+        return self._features[detected]
 
     def points(self, method: str) -> tuple[Points, float]:
         """Give the points of a chain of that name, and the seconds that they took."""

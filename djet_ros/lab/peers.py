@@ -1,4 +1,8 @@
-"""Relative pose by other libraries, as their manuals show it, on the matches that ours get."""
+"""
+Relative pose by other libraries, as their manuals show it, on the matches that ours get.
+
+Where a default would hold one of them back, it is set, and stands here.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,14 @@ from numpy.typing import NDArray
 # R (3, 3), t (3,) and the inliers (N,) bool, or None where nothing was found.
 Found = tuple[Array, Array, NDArray[np.bool_]] | None
 
+# Of OpenCV's searches; that of all its examples.
+CONFIDENCE = 0.999
+# Baselines beyond which a point has no vote between the four poses of an essential matrix. By
+# default 50, beyond which all points are where a hand moves a camera a millimetre or two.
+FARTHEST = 1e6
+# Pixels where PoseLib's refinement bends its loss, instead of its own 0.5: see ``chains``.
+LOSS_SCALE = 0.25
+
 
 def opencv_ransac(K: Array, x: Array, y: Array, threshold: float) -> Found:
     """Find the pose by findEssentialMat with plain RANSAC, and recoverPose."""
@@ -27,11 +39,11 @@ def usac_magsac(K: Array, x: Array, y: Array, threshold: float) -> Found:
 
 
 def poselib(K: Array, x: Array, y: Array, threshold: float,
-            loss_scale: float | None = None) -> Found:
+            loss_scale: float = LOSS_SCALE) -> Found:
     """
-    Find the pose by PoseLib's LO-RANSAC with its non-linear refinement, at its defaults.
+    Find the pose by PoseLib's LO-RANSAC with its non-linear refinement.
 
-    loss_scale: of the Cauchy loss of that refinement in pixels; by default half the threshold.
+    loss_scale: of the Cauchy loss of that refinement in pixels. All else is at its defaults.
     """
     import poselib as library
 
@@ -40,7 +52,7 @@ def poselib(K: Array, x: Array, y: Array, threshold: float,
               'params': [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
     pose, info = library.estimate_relative_pose(
         x, y, camera, camera, {'max_epipolar_error': threshold},
-        {} if loss_scale is None else {'loss_scale': loss_scale})
+        {'loss_scale': loss_scale})
     return np.asarray(pose.R), np.asarray(pose.t), np.asarray(info['inliers'], dtype=bool)
 
 
@@ -77,9 +89,10 @@ def as_relative_pose(found: Found, K: Array, x: Array, y: Array) -> RelativePose
 
 
 def _opencv(method: int, K: Array, x: Array, y: Array, threshold: float) -> Found:
-    E, mask = cv2.findEssentialMat(x, y, K, method=method, prob=0.999, threshold=threshold)
+    E, mask = cv2.findEssentialMat(x, y, K, method=method, prob=CONFIDENCE,
+                                   threshold=threshold)
     if E is None or E.shape != (3, 3):
         return None
     inliers = mask.ravel() > 0
-    _, R, t, _ = cv2.recoverPose(E, x, y, K, mask=mask.copy())
+    _, R, t, _, _ = cv2.recoverPose(E, x, y, K, distanceThresh=FARTHEST, mask=mask.copy())
     return np.asarray(R, np.float64), np.asarray(t, np.float64).ravel(), inliers

@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar
 import cv2
 from djet_ros import __version__
 from djet_ros.errors import DjetError
+from djet_ros.lab.provenance import digest_of_the_code, versions
 from djet_ros.recordings.closing import Closing
 import numpy as np
 
@@ -31,9 +32,9 @@ class RecordStore(Closing, Generic[R]):
     """
     The records of a run in ``folder/records.jsonl``: those of an earlier run, and new ones.
 
-    kind: the dataclass of a record; settings: what decides the results beside the versions of
-    this package and of its libraries. Raises DjetError where the file is of a run with other
-    settings, unless overwrite is set.
+    kind: the dataclass of a record; settings: what decides the results beside the code of this
+    package and the versions of its libraries. Raises DjetError where the file is of a run with
+    other settings or code, unless overwrite is set.
     """
 
     def __init__(self, folder: Path, kind: Callable[..., R], settings: Mapping[str, Any], *,
@@ -41,7 +42,7 @@ class RecordStore(Closing, Generic[R]):
         self.path = folder / FILE_NAME
         self.chunks: dict[str, list[R]] = {}
         self._kind = kind
-        settings = _with_versions(settings)
+        settings = _with_code(settings)
         if self.path.exists() and not overwrite:
             # What is cut off is the last line that a killed run has left unfinished.
             os.truncate(self.path, self._read(settings))
@@ -84,9 +85,11 @@ class RecordStore(Closing, Generic[R]):
                              for name, value in told.items()})
 
 
-def _with_versions(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {'djet_ros': __version__,
-            'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__}, **settings}
+def _with_code(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {'djet_ros': __version__, 'code': digest_of_the_code(),
+            # OpenCV and NumPy as they are loaded: several packages bring the former.
+            'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__,
+                          **versions(('scipy', 'poselib'))}, **settings}
 
 
 def _parsed(path: Path, number: int, line: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+import math
 
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.pairs import PairRecord
@@ -17,8 +18,8 @@ class TableRow:
     """
     One method on one sequence: errors in degrees, Hamming distances in bits.
 
-    Means, medians and 95th percentiles are over the pairs whose error is known; failures (see
-    pairs.FAILURE) are counted over all pairs. NaN where nothing is known.
+    Means, medians and 95th percentiles are over the pairs whose error is known, which `told`
+    counts; failures (see pairs.FAILURE) are counted over all pairs. NaN where nothing is known.
     """
 
     sequence: str
@@ -27,9 +28,11 @@ class TableRow:
     change: str
     pairs: int
     failures: int
+    rotation_told: int
     rotation_mean_deg: float
     rotation_median_deg: float
     rotation_p95_deg: float
+    translation_told: int
     translation_mean_deg: float
     translation_median_deg: float
     translation_p95_deg: float
@@ -72,9 +75,15 @@ def _row(records: Sequence[PairRecord]) -> TableRow:
     return TableRow(
         first.sequence, first.method, first.preset, first.change, len(records),
         sum(record.failed for record in records),
+        _told(records, 'rotation_error_deg'),
         rotation['mean'], rotation['median'], rotation['p95'],
+        _told(records, 'translation_error_deg'),
         translation['mean'], translation['median'], translation['p95'],
         hamming['mean'], ms['mean'])
+
+
+def _told(records: Iterable[PairRecord], name: str) -> int:
+    return sum(math.isfinite(getattr(record, name)) for record in records)
 
 
 def drift_row(sequence: str, method: str, preset: str, truth: StampedTrajectory,

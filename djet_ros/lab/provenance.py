@@ -1,0 +1,40 @@
+"""Which code and which libraries made results: what tells one run's figures from another's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import djet_ros
+
+
+def digest_of_the_code(more: Iterable[Path] = ()) -> str:
+    """Tell one state of the package, and of more files, from another."""
+    digest = hashlib.sha256(_package())
+    for path in more:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+@cache
+def _package() -> bytes:
+    """Digest the package, as it is when the program first asks."""
+    digest, folder = hashlib.sha256(), Path(djet_ros.__file__).parent
+    for path in sorted(folder.rglob('*.py')):
+        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    return digest.digest()
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Give the installed versions of distributions by their names."""
+    return {name: _version(name) for name in packages}
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return 'not installed'
