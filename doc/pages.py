@@ -431,26 +431,26 @@ def verdict(part: Any) -> str:
         return 'Which of these differences the pairs tell from chance was not measured yet.'
     said: dict[str, list[str]] = {}
     for one in changed:
-        said.setdefault(told(one['ratio']), []).append(one['change'])
+        said.setdefault(judged(one['ratio']), []).append(one['change'])
     return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD
                                    if word in said)
 
 
-TOLD = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
+JUDGED = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
         'Better in one, and not told apart in the other', 'Better in one, worse in the other',
         'Not told from `best`, whose intervals hold 1')
 
 
-def told(ratio: Any) -> str:
-    """Tell by the intervals of both ratios which of TOLD holds."""
+def judged(ratio: Any) -> str:
+    """Tell by the intervals of both ratios which of JUDGED holds."""
     known = [by_kind['mean'] for by_kind in ratio.values() if None not in by_kind['mean']]
     worse, better = (sum(least > 1 for _, least, _ in known),
                      sum(most < 1 for _, _, most in known))
     if worse and better:
-        return TOLD[4]
+        return JUDGED[4]
     if worse or better:
-        return TOLD[(0 if worse else 2) + (worse + better < len(ratio))]
-    return TOLD[5]
+        return JUDGED[(0 if worse else 2) + (worse + better < len(ratio))]
+    return JUDGED[5]
 
 
 def joined(results: Any) -> str:
