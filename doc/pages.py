@@ -432,13 +432,14 @@ def verdict(part: Any) -> str:
     said: dict[str, list[str]] = {}
     for one in changed:
         said.setdefault(judged(one['ratio']), []).append(one['change'])
-    return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.' for word in TOLD
-                                   if word in said)
+    return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.'
+                                   for word in JUDGED if word in said)
 
 
-JUDGED = ('Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
-        'Better in one, and not told apart in the other', 'Better in one, worse in the other',
-        'Not told from `best`, whose intervals hold 1')
+JUDGED = (
+    'Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
+    'Better in one, and not told apart in the other', 'Better in one, worse in the other',
+    'Not told from `best`, whose intervals hold 1')
 
 
 def judged(ratio: Any) -> str:
