@@ -19,10 +19,10 @@ from djet_ros.errors import DjetError
 
 def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
     """Raise DjetError where something is in the way, or the name has none of the suffixes."""
-    if suffixes and path.suffix.lower() not in suffixes:
-        raise DjetError(f"--output is '{path}'; its name must end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise DjetError(f'{path} is a folder; give the name of a file')
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise DjetError(f"--output is '{path}'; its name must end in {' or '.join(suffixes)}")
     _check_unused(path, overwrite)
 
 
