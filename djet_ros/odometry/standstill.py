@@ -5,6 +5,7 @@ from __future__ import annotations
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 # Side of a cell of the image in pixels, and share of the matches, and of the cells that have some,
 # that are where they were if the camera stands in front of traffic; chosen: and if it has stood
@@ -14,8 +15,9 @@ _CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
 # Times the displacement of what stands still up to which something hardly moves.
 _HARDLY = 3
 
-# chosen: share of the displacement up to which a camera stands, from which on it creeps.
-_CREEPS = 0.1
+# chosen: share of the displacement up to which a camera stands, from which on it creeps; and how
+# improbable it is that noise makes it seem so.
+_CREEPS, _BY_CHANCE = 0.1, 1e-3
 
 # chosen: so many features that stood before tell that they still do; false matches of a thousand
 # features end within a third of a pixel of where they began less than once in a hundred pairs.
@@ -67,7 +69,7 @@ class Standstill:
         """
         y = _refined(relative)
         still = _displacements(relative.x, y) < most
-        return _drift(relative.x[still], y[still]) > _CREEPS * most
+        return _drifted(relative.x[still], y[still], _CREEPS * most)
 
     def told(self, relative: RelativePose, most: float, at_rest: bool) -> bool:
         """
@@ -131,20 +133,22 @@ def _refined(relative: RelativePose) -> Array:
     return relative.y_opt if refined else relative.y
 
 
-def _drift(x: Array, y: Array) -> float:
+def _drifted(x: Array, y: Array, least: float) -> bool:
     """
-    Tell how far pixels moved together from x to y (N, 2), as a root mean square without noise.
+    Tell whether pixels moved together from x to y (N, 2) by more, as a root mean square.
 
-    Together: by an affine map, whose six parameters take their share of the noise.
+    Together: by an affine map. Its six parameters take their share of the noise, so an F-test asks
+    for more than that; few pixels tell nothing.
     """
-    if len(x) <= 6:
-        return 0.0
+    freedom = 2 * len(x) - 6
+    if freedom <= 0:
+        return False
     around = x - x.mean(0)
     design = np.column_stack([around / max(np.abs(around).max(), 1.0), np.ones(len(x))])
     fit = design @ np.linalg.lstsq(design, y - x, rcond=None)[0]
-    # Two residuals of each, less the parameters.
-    noise = float(((y - x - fit)**2).sum()) / (2 * len(x) - 6)
-    return float(np.sqrt(max(float((fit**2).sum()) - 6 * noise, 0.0) / len(x)))
+    together, noise = float((fit**2).sum()), float(((y - x - fit)**2).sum()) / freedom
+    return bool(together - 6 * noise > len(x) * least**2
+                and fdtrc(6, freedom, together / max(6 * noise, 1e-12)) < _BY_CHANCE)
 
 
 def _still_and_hardly(relative: RelativePose, most: float
