@@ -41,6 +41,8 @@ DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
+# A ratio beyond this says no more than that.
+MOST = 100
 # Of fewer triangles one in twenty is the largest.
 ENOUGH = 20
 # Scenes in which the camera does not move from its place have no direction to compare.
@@ -266,7 +268,8 @@ def ratio(ours: float | None, theirs: float | None) -> str:
     """Divide two errors in degrees, unless there is none or both are as good as none."""
     if ours is None or theirs is None or max(ours, theirs) < EQUAL:
         return '–'
-    text = f'{ours / theirs:.2f}' if theirs else '∞'
+    # Who says of a camera that stands that it does errs by nothing, to which nothing compares.
+    text = f'{ours / theirs:.2f}' if ours < MOST * theirs else f'> {MOST}'
     return f'**{text}**' if ours > theirs and text != '1.00' else text
 
 
