@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 
 from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
 from djet_ros.core.jet import (
@@ -14,8 +13,6 @@ from djet_ros.core.jet import (
     minimise,
     moved,
     robust_scale,
-    Solution,
-    with_places,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from hypothesis import given, settings, strategies as st
@@ -295,101 +292,3 @@ def test_matches_that_determine_nothing_leave_the_pose_finite():
         problem = jet_problem(K, x, circles(y + 3))
         found = minimise(problem, one.R, one.t, Loss())
         assert np.isfinite(found.R).all() and np.linalg.norm(found.t) == pytest.approx(1)
-
-
-def ellipses(rng, places, sigma):
-    """Surfaces that are good to sigma pixels, along some way to a third of that; and their S."""
-    turn = Rotation.from_rotvec(rng.uniform(0, np.pi, (len(places), 1)) * [0, 0, 1])
-    axes = turn.as_matrix()[:, :2, :2]
-    S = axes @ (sigma**2 * np.diag([1, 1 / 9])) @ axes.transpose(0, 2, 1)
-    off = np.einsum('nij,nj->ni', np.linalg.cholesky(S), rng.normal(size=places.shape))
-    return Paraboloids(places + off, np.linalg.inv(S), np.zeros_like(places),
-                       np.zeros(len(places)), np.ones(len(places), bool)), S
-
-
-def at(problem, R, t):
-    """Take a pose as the solution of a problem."""
-    return Solution(R, t, epipolar_residuals(problem, R, t))
-
-
-def test_two_measurements_of_a_place_are_joined_as_gaussians_are():
-    rng = np.random.default_rng(20)
-    views = two_views(rng, 400)
-    x, y, R, t = views.x, views.y, views.R, views.t
-    surfaces, S = ellipses(rng, y, 0.3)
-    # The shape of the second is half way from a circle to that of the first.
-    S = S / np.median(np.trace(S, axis1=1, axis2=2) / 2)
-    T = (np.eye(2) + S) / 2
-    found = y + 0.2 * (np.linalg.cholesky(T) @ rng.normal(size=(*y.shape, 1)))[..., 0]
-    found[::40] += 30  # these were found elsewhere
-    alone = jet_problem(K, x, surfaces)
-    joined = with_places(alone, at(alone, R, t), K, found)
-    # How exact each is, in pixels: from its distances to the true lines.
-    lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
-    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    S, T = (shape * core_scale(((at_places - y) * normals).sum(1) / np.sqrt(
-        np.einsum('ni,nij,nj->n', normals, shape, normals)))**2
-        for shape, at_places in ((S, surfaces.centres), (T, found)))
-    precision = np.linalg.inv(S) + np.linalg.inv(T)
-    expected = np.linalg.solve(precision, (np.linalg.solve(S, surfaces.centres[..., None])
-                                           + np.linalg.solve(T, found[..., None])))
-    joined_at = (joined.rays_y.T @ K.T)[:, :2]
-    together = np.linalg.norm(joined_at - expected[..., 0], axis=1) < 1e-6
-    kept = np.linalg.norm(joined_at - surfaces.centres, axis=1) < 1e-6
-    assert (together ^ kept).all()
-    assert together.mean() > 0.8 and kept[::40].all()
-    # Covariances, but for their common unit, and for how much the noise seems to differ.
-    C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
-    apart = surfaces.centres - found
-    squared = (apart * np.linalg.solve(S + T, apart[..., None])[..., 0])
-    ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.inv(precision), C))[together]
-    assert np.ptp(ratio, axis=1).max() < 1e-6 * ratio.max()
-    by_distance = ratio[np.argsort(squared.sum(1)[together]), 0]
-    assert (np.diff(by_distance) > -1e-9 * ratio.max()).all()
-    assert by_distance[-1] < 2 * by_distance[0]
-
-
-@pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
-def test_a_pose_of_surfaces_and_matches_is_no_less_exact_than_that_of_either(sigma):
-    errors = []
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        views = two_views(rng, 150)
-        x, y, R, t = views.x, views.y, views.R, views.t
-        surfaces, _ = ellipses(rng, y, 0.3)
-        found = y + rng.normal(0, sigma, y.shape)
-        problems = [jet_problem(K, x, surfaces), jet_problem(K, x, circles(found))]
-        solutions = [minimise(problem, R, t, Loss()) for problem in problems]
-        poses = [solution.pose for solution in solutions]
-        joined = with_places(problems[0], solutions[0], K, found)
-        poses.append(minimise(joined, R, t, Loss()).pose)
-        errors.append([rotation_angle(R, pose.R) for pose in poses])
-    surface, match, both = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert both < 1.05 * min(surface, match)
-
-
-def test_places_that_agree_count_for_more_where_matches_differ_in_noise():
-    rng = np.random.default_rng(22)
-    views = two_views(rng, 400)
-    x, y, R, t = views.x, views.y, views.R, views.t
-    noise = rng.choice([0.3, 1.0, 2.0], 400)  # of what is seen around a place, however
-    surfaces, _ = ellipses(rng, np.zeros_like(y), 0.2)
-    placed = replace(surfaces, centres=y + noise[:, None] * surfaces.centres)
-    found = y + noise[:, None] * rng.normal(0, 0.2, y.shape)
-    alone = jet_problem(K, x, placed)
-    joined = with_places(alone, at(alone, R, t), K, found)
-    grown = np.median(joined.spread[::2], axis=0) / np.median(alone.spread[::2], axis=0)
-    assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
-
-
-def test_where_a_surface_has_no_minimum_or_nothing_was_found_right_surfaces_count_alone():
-    rng = np.random.default_rng(21)
-    views = two_views(rng, 60)
-    x, y, R, t = views.x, views.y, views.R, views.t
-    problem = jet_problem(K, x, random_surfaces(rng, y, 'indefinite'))
-    joined = with_places(problem, at(problem, R, t), K, y)
-    saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
-    saddles |= problem.spread[0] <= 0
-    assert saddles.sum() > 10
-    assert np.array_equal(joined.rays_y[:, saddles], problem.rays_y[:, saddles])
-    assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()

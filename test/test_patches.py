@@ -51,7 +51,7 @@ def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
     there, here = image(np.eye(2), np.zeros(2)), image(warp, shift)
     true = seen(warp, shift, points)
     near = true + np.random.default_rng(2).uniform(-0.3, 0.3, true.shape)
-    found = place_exactly(there, here, points, near, as_seen(warp, len(points)))
+    found = place_exactly(there, here, points, near, as_seen(warp, len(points))).places
     off = np.linalg.norm(found - true, axis=1)
     assert np.median(off) < 0.02
     assert np.quantile(off, 0.95) < 0.06
@@ -62,26 +62,57 @@ def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None
     warp = WARPS['a road']
     there, here = image(np.eye(2), np.zeros(2)), image(warp, np.zeros(2))
     true = seen(warp, np.zeros(2), points)
-    as_a_whole = place_exactly(there, here, points, true, as_seen(np.eye(2), len(points)))
+    as_a_whole = place_exactly(there, here, points, true, as_seen(np.eye(2), len(points))).places
     assert np.median(np.linalg.norm(as_a_whole - true, axis=1)) > 0.1
 
 
 def test_haze_moves_nothing(points: np.ndarray) -> None:
     there = image(np.eye(2), np.zeros(2))
     hazy = (there * 0.8 + 40).astype(np.uint8)
-    found = place_exactly(there, hazy, points, points, as_seen(np.eye(2), len(points)))
+    found = place_exactly(there, hazy, points, points, as_seen(np.eye(2), len(points))).places
     assert np.median(np.linalg.norm(found - points, axis=1)) < 0.02
 
 
 def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None:
     there, here = image(np.eye(2), np.zeros(2)), image(np.eye(2), np.array([4.0, 0.0]))
     eye = as_seen(np.eye(2), len(points))
-    found = place_exactly(there, here, points, points, eye)
+    found = place_exactly(there, here, points, points, eye).places
     assert (np.abs(found - points).max(1) < 1).all()
     border = points * 0 + [3.0, 150.0]
-    assert (place_exactly(there, here, border, border, eye) == border).all()
+    assert (place_exactly(there, here, border, border, eye).places == border).all()
     flat = np.full_like(there, 90)
-    assert (place_exactly(flat, flat, points, points, eye) == points).all()
+    assert (place_exactly(flat, flat, points, points, eye).places == points).all()
+
+
+def test_errors_are_to_covariances_as_elsewhere_in_the_image(points: np.ndarray) -> None:
+    """Where there is more noise, and along which way a patch has slopes, they tell themselves."""
+    # Noise grows from left to right; beyond x = 200 the pattern varies from left to right alone.
+    there = image(np.eye(2), np.zeros(2)).astype(float)
+    there[:, 200:] = there[120, 200:] + 0.2 * (there[:, 200:] - there[120, 200:])
+    here = there + np.random.default_rng(3).normal(size=there.shape) * np.linspace(1, 6, SIZE[0])
+    there, here = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (there, here))
+    found, covariances = place_exactly(there, here, points, points,
+                                       as_seen(np.eye(2), len(points)))
+    told = (found != points).any(1) & (np.abs(points[:, 0] - 200) > 10)
+    assert told.mean() > 0.9
+    off, sigma = (found - points)[told], np.sqrt(covariances[told][:, [0, 1], [0, 1]])
+    across = points[told, 0] - 200
+    parts = [np.median(np.abs(off[part] / sigma[part]), axis=0) / 0.6745
+             for part in (across < -60, (across > -60) & (across < 0), across > 0)]
+    # Larger than they say, for what lies between pixels is smoothed.
+    assert np.min(parts) > 0.9 and np.max(parts) < 2
+    # Sizes themselves differ by far more.
+    sizes = [np.median(np.abs(off[part, 1])) for part in (across < -60, across > 0)]
+    assert sizes[1] > 4 * sizes[0]
+
+
+def test_a_patch_without_any_slope_tells_nothing(points: np.ndarray) -> None:
+    flat = np.full(SIZE[::-1], 90, np.uint8)
+    there = image(np.eye(2), np.zeros(2))
+    eye = as_seen(np.eye(2), len(points))
+    told, untold = (place_exactly(one, one, points, points, eye).covariances[:, 0, 0]
+                    for one in (there, flat))
+    assert untold.min() > 1e3 * told.max()
 
 
 def test_threads_change_nothing(points: np.ndarray) -> None:
@@ -93,6 +124,6 @@ def test_threads_change_nothing(points: np.ndarray) -> None:
     results = []
     for threads in (1, 2):
         cv2.setNumThreads(threads)
-        results.append(place_exactly(there, here, many, true, warp))
+        results.append(place_exactly(there, here, many, true, warp).places)
     cv2.setNumThreads(before)
     assert (results[0] == results[1]).all()

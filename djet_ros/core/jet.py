@@ -13,7 +13,7 @@ R is moved on SO(3) from the left, t on the unit sphere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from djet_ros.core.geometry import (
     GENERATORS,
@@ -23,7 +23,7 @@ from djet_ros.core.geometry import (
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import median, medians, middles, Paraboloids, quantile
+from djet_ros.core.paraboloid import median, medians, middles, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -46,17 +46,6 @@ _NORMAL = 1.4826
 
 # What is left over at a minimum is noise itself: a match has at least this share of the usual.
 _LEAST_LEFT = 0.25
-
-# Squared Mahalanobis distance, over two degrees of freedom, that one of ten exceeds.
-_ONE_PLACE = 4.6
-
-# chosen: share of the noise of a place that was found which is like that of the surface there, as
-# both go by the same texture; the rest is alike everywhere.
-_BY_TEXTURE = 0.5
-
-# chosen: how much matches differ in noise, over what the places of each tell of it. What is wrong
-# with both shows in no difference.
-_SHARED = 2.0
 
 
 @dataclass(frozen=True)
@@ -161,92 +150,18 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
         spread *= _left_over(paraboloids, minima)
     widths = np.abs(spread[0] + spread[2]) / 2
     spread /= max(median(widths), 1e-12) if len(S) else 1.0
-    G = inverse_of(K)[:2, :2]
-    # The entries of G S G^T.
-    (a, b), (c, d) = G
-    spread = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
-                       [c * c, 2 * c * d, d * d]]) @ spread
+    spread = spread_of_rays(K, spread)
     # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
-    blur = epipole_blur**2 * np.linalg.det(G) * np.abs(spread[0] + spread[2]) / 2
+    pixel = np.linalg.det(inverse_of(K)[:2, :2])
+    blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, minima).T.copy(), spread, blur)
 
 
-def with_places(problem: JetProblem, solution: Solution, K: Array, y: Array) -> JetProblem:
-    """
-    Join what residual surfaces tell of places with where these were found, pixels y (N, 2).
-
-    The sum of two residuals of the paper: that of the surface, and the re-projection error. Both
-    measure one place, with covariances S and T, the latter half way from a circle to the shape of
-    S; how exact each is, it shows by its distances from the epipolar lines of the solution, which
-    is that of the surfaces alone. Of two Gaussians that is the place
-
-        y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
-
-    Where both are farther apart than nine of ten that are right, the match began at a wrong place,
-    and the surface counts alone; so it does where it has no minimum.
-
-    How far both are apart tells the noise of the match itself too: at the edge of what is near,
-    they see different things. See `_noise_of_each`.
-    """
-    G = inverse_of(K)[:2, :2]
-    pixel = G @ G.T
-    width = np.trace(pixel) / 2
-    circle = pixel[[0, 0, 1], [0, 1, 1]][:, None]
-    found = replace(problem, rays_y=rays(K, y).T.copy(), blur=np.zeros(len(y)),
-                    spread=circle + _BY_TEXTURE * (problem.spread - circle))
-    off = epipolar_residuals(found, solution.R, solution.t).r
-    # In square pixels, as the entries 11, 12, 22.
-    S, T = (core_scale(r)**2 / width * measured.spread
-            for measured, r in ((problem, solution.residuals.r), (found, off)))
-    apart = (problem.rays_y - found.rays_y)[:2] / np.sqrt(width)
-    inverse = _inverse(S + T)
-    way = _times(inverse, apart)
-    has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
-    squared = (apart * way).sum(0)
-    joined = has_minimum & (squared < _ONE_PLACE)
-    rays_y = problem.rays_y.copy()
-    rays_y[:2] -= np.sqrt(width) * joined * _times(S, way)
-    S = S - joined * np.stack([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
-                               _form(S[1:], inverse, S[1:])])
-    if joined.any():
-        S[:, joined] *= _noise_of_each(squared[has_minimum], squared[joined])
-    widths = np.abs(S[0] + S[2]) / 2
-    spread = S * (width / max(median(widths), 1e-12))
-    blur = problem.blur * (np.abs(spread[0] + spread[2])
-                           / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
-    return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
-
-
-def _inverse(S: Array) -> Array:
-    """Entries 11, 12, 22 (3, N) of the inverses of symmetric matrices, given by theirs."""
-    area = S[0] * S[2] - S[1]**2
-    # Exact matches have no area at all.
-    return np.stack([S[2], -S[1], S[0]]) / np.where(area != 0, area, 1e-300)
-
-
-def _times(S: Array, v: Array) -> Array:
-    """Products (2, N) of symmetric matrices, by their entries (3, N), and vectors (2, N)."""
-    return np.asarray(S[:2] * v[0] + S[1:] * v[1])
-
-
-def _form(u: Array, S: Array, v: Array) -> Array:
-    """Values u^T S v (N,) of vectors (2, N) and matrices by their entries (3, N)."""
-    return np.asarray((u * _times(S, v)).sum(0))
-
-
-def _noise_of_each(all_squared: Array, squared: Array) -> Array:
-    """
-    Give the noise (M,), over the usual, of matches whose two places are d^2 (M,) apart.
-
-    all_squared: (N,) of all matches, over the covariance that is usual. Where the noise differs
-    from match to match like an inverse gamma of nu degrees of freedom, errors are those of a
-    Student distribution: a share p of all d^2 is below nu ((1 - p)^(-2 / nu) - 1), so that the
-    upper quartile over the median is 2^(2 / nu) + 1, and the noise of one is expected to be
-    (nu + d^2) / (nu + 2). Where all are alike, the ratio is two.
-    """
-    middle, upper = median(all_squared), quantile(all_squared, 0.75)
-    unlike = np.log2(max(upper / max(middle, 1e-300) - 1, 1.0)) * _SHARED  # 2 / nu
-    return np.asarray((1 + unlike / 2 * squared) / (1 + unlike))
+def spread_of_rays(K: Array, spread: Array) -> Array:
+    """Give covariances of rays by those of their pixels, both by entries 11, 12, 22 (3, N)."""
+    (a, b), (c, d) = inverse_of(K)[:2, :2]
+    return np.asarray(np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
+                                [c * c, 2 * c * d, d * d]]) @ spread)
 
 
 def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:

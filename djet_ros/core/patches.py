@@ -32,19 +32,39 @@ _SIDE = 2 * _RADIUS + 3
 _SQUARE = np.concatenate([np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1) - (_RADIUS + 1),
                           np.ones((1, _SIDE**2))]).astype(np.float32)
 
-# Steps, and pixels that they come to at most: farther off is something else.
-_STEPS, _FARTHEST = 2, 1
+# Steps, which cost little after the first, and pixels that they come to at most: farther off is
+# something else.
+_STEPS, _FARTHEST = 4, 1
 
 # Square gray levels; where a patch has no more slope than this, nothing tells where it is.
 _LEAST_SLOPE = 1e-3
 
-# Patches per pass: bounds the memory that they take (3 MB).
+# Square gray levels: two images are rounded to whole ones.
+_LEAST_NOISE = 2 / 12
+
+# What is fitted to a patch: its place, brightness and contrast.
+_FITTED = 4
+
+# Patches per pass: bounds the memory that they take (4 MB).
 _BLOCK = 1024
 
 
-def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> Array:
+class Placed(NamedTuple):
     """
-    Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2), (N, 2).
+    Where N patches are: places (N, 2), and the covariances (N, 2, 2) of these in square pixels.
+
+    By what is left over of each patch and by its slopes, as in any least squares. They tell how
+    matches differ, and little of their common size: what a patch does not look like differs in
+    whole regions, so that errors are up to three times as large, alike in all of a pair.
+    """
+
+    places: Array
+    covariances: Array
+
+
+def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> Placed:
+    """
+    Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2).
 
     there: (H, W), as float32 it need not be converted; here: (H, W) uint8;
     warp: (N, 3, 2) how they are seen there, see `geometry.patch_warp`; so small a patch needs but
@@ -53,14 +73,16 @@ def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> 
     Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
     them. What would go far, or lies at the border, stays at y.
     """
-    places, floating = y.copy(), there.astype(np.float32, copy=False)
+    places, covariances = y.copy(), np.empty((len(y), 2, 2))
+    floating = there.astype(np.float32, copy=False)
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        places[block] = expect(floating, x[block], warp[block]).place(here, y[block])
+        places[block], covariances[block] = expect(floating, x[block], warp[block]).place(
+            here, y[block])
 
     each(refine, range(0, len(y), _BLOCK))
-    return places
+    return Placed(places, covariances)
 
 
 class Expected(NamedTuple):
@@ -68,38 +90,72 @@ class Expected(NamedTuple):
     N patches of P pixels as they are expected: what tells where they are.
 
     slopes: (2, P, N) float32 along x and y, but for what a brighter patch or one of more contrast
-    would look like; inverse: (N, 2, 2) of the sums of their products.
+    would look like; inverses: (N, 2, 2) of the sums of their products; gray: (P, N) float32 their
+    gray levels about the mean; contrasts: (N,) the sums of the squares of these.
     """
 
     slopes: Gray
-    inverse: Array
+    inverses: Array
+    gray: Gray
+    contrasts: Array
 
     @classmethod
     def together(cls, parts: Sequence[Expected]) -> Expected:
         """Put patches of several images together."""
-        return cls(np.concatenate([one.slopes for one in parts], axis=2),
-                   np.concatenate([one.inverse for one in parts]))
+        slopes, inverse, gray, contrasts = zip(*parts, strict=True)
+        return cls(np.concatenate(slopes, axis=2), np.concatenate(inverse),
+                   np.concatenate(gray, axis=1), np.concatenate(contrasts))
 
-    def place(self, here: Image, y: Array) -> Array:
-        """Give where they are (N, 2) in an image, next to y (N, 2), see ``place_exactly``."""
+    def place(self, here: Image, y: Array) -> Placed:
+        """Give where they are in an image, next to y (N, 2), see ``place_exactly``."""
         margin = _RADIUS + 1 + _FARTHEST
         inside = within(y, here.shape, margin)
         # Those at the border are looked for elsewhere, to no end.
         began = np.where(inside[:, None], y, margin)
-        places, whole = began, np.floor(began)
-        products = _products(self.slopes, here, whole)
+        seen, places = _Seen(self, here, began), began
         for _ in range(_STEPS):
-            # Few cross over to other pixels.
-            across = np.flatnonzero((np.floor(places) != whole).any(1))
-            if len(across):
-                whole[across] = np.floor(places[across])
-                # Points last in memory too, which indexing does not give.
-                slopes = self.slopes.take(across, axis=2)
-                products[..., across] = _products(slopes, here, whole[across])
-            step = -times(self.inverse, _between(products, places - whole).T)
+            step = -times(self.inverses, seen.along_slopes(places).T)
             places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
         near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
-        return np.where(near[:, None], places, y)
+        noise = seen.noise(np.where(near[:, None], places, began))
+        return Placed(np.where(near[:, None], places, y), noise[:, None, None] * self.inverses)
+
+
+class _Seen:
+    """What is seen of an image around places that move a little, beside what is expected."""
+
+    def __init__(self, expected: Expected, image: Image, places: Array) -> None:
+        self._expected, self._image, self._whole = expected, image, np.floor(places)
+        self._patches = _around(image, self._whole)
+        self._products = _products(expected.slopes, self._patches)
+
+    def along_slopes(self, places: Array) -> Array:
+        """Sum up products (2, N) of slopes and patches around places (N, 2)."""
+        return _between(self._products, self._parts(places))
+
+    def noise(self, places: Array) -> Array:
+        """Variances (N,) of a pixel: what is left of patches around places (N, 2), once fitted."""
+        _, _, gray, contrasts = self._expected
+        parts = self._parts(places)
+        patches = _between(_at_four(self._patches), parts.astype(np.float32))
+        patches -= patches.mean((0, 1))
+        patches = patches.reshape(gray.shape)
+        left = (np.einsum('pn,pn->n', patches, patches)
+                - np.einsum('pn,pn->n', patches, gray)**2 / contrasts)
+        return np.asarray(np.maximum(left / (len(gray) - _FITTED), _LEAST_NOISE))
+
+    def _parts(self, places: Array) -> Array:
+        """Give how far places (N, 2) are from whole pixels, the patches around which are known."""
+        # Few cross over to other pixels.
+        across = np.flatnonzero((np.floor(places) != self._whole).any(1))
+        if len(across):
+            self._whole[across] = np.floor(places[across])
+            patches = _around(self._image, self._whole[across])
+            self._patches[..., across] = patches
+            # Points last in memory too, which indexing does not give.
+            slopes = self._expected.slopes.take(across, axis=2)
+            self._products[..., across] = _products(slopes, patches)
+        return places - self._whole
 
 
 def expect(image: Gray, points: Array, warp: Array) -> Expected:
@@ -122,25 +178,33 @@ def expect(image: Gray, points: Array, warp: Array) -> Expected:
     xx, xy, yy = (np.einsum('pn,pn->n', slopes[one], slopes[other]).astype(float)
                   for one, other in ((0, 0), (0, 1), (1, 1)))
     G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
-    return Expected(slopes, inverses(G))
+    return Expected(slopes, inverses(G), gray, contrast)
 
 
-def _products(slopes: Gray, image: Image, whole: Array) -> Gray:
+def _around(image: Image, whole: Array) -> Gray:
+    """Patches (S + 1, S + 1, N) of an image around pixels (N, 2), and the next row and column."""
+    return gather_patches(image, whole.astype(np.int64), _RADIUS + 1)[1:, 1:].astype(np.float32)
+
+
+def _at_four(patches: Gray) -> Gray:
+    """Patches (2, 2, S, S, N) at four pixels, rows first, of those that hold them."""
+    side = len(patches) - 1
+    four = sliding_window_view(patches, (side, side), axis=(0, 1))
+    return np.moveaxis(four, 2, 4)
+
+
+def _products(slopes: Gray, patches: Gray) -> Gray:
     """
-    Sum up products (2, 2, 2, N) of slopes (2, P, N) and the patches of an image at four pixels.
+    Sum up products (2, 2, 2, N) of slopes (2, P, N) and of patches at four pixels, rows first.
 
-    whole: (N, 2) the first of two pixels each way, rows first. What lies between pixels is as
-    linear in them as the image is.
+    What lies between pixels is as linear in them as the image is.
     """
-    side = 2 * _RADIUS + 1
-    # One row and column more than is wanted, on the far side.
-    patches = gather_patches(image, whole.astype(np.int64), _RADIUS + 1)[1:, 1:]
-    four = sliding_window_view(patches.astype(np.float32), (side, side), axis=(0, 1))
-    return np.asarray(np.einsum('kyxn,ijnyx->ijkn', slopes.reshape(2, side, side, -1), four))
+    four = _at_four(patches)
+    return np.asarray(np.einsum('kyxn,ijyxn->ijkn', slopes.reshape(2, *four.shape[2:]), four))
 
 
 def _between(products: Gray, part: Array) -> Array:
-    """Interpolate (2, 2, 2, N) at pixels, rows first, by parts (N, 2) of the way; (2, N)."""
+    """Interpolate (2, 2, ..., N) at pixels, rows first, by parts (N, 2) of the way; (..., N)."""
     x, y = part.T
     rows = products[0] + y * (products[1] - products[0])
     return np.asarray(rows[0] + x * (rows[1] - rows[0]))

@@ -34,7 +34,7 @@ from djet_ros.core.paraboloid import (
     project_to_positive,
     times,
 )
-from djet_ros.core.patches import place_exactly, within
+from djet_ros.core.patches import place_exactly, Placed, within
 from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -83,11 +83,11 @@ class ResidualSurface(Protocol):
         """
         ...
 
-    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """
-        Places (M, 2) of chosen matches (N,) as found by another means than the surface, next to y.
+        Places of chosen matches (N,) as found by another means than the surface, next to y.
 
-        To be asked for matches that have a surface, see ``around``.
+        To be asked for matches that have a surface; warp: see ``around``.
         """
         ...
 
@@ -99,8 +99,10 @@ class _OfImages:
         self.x = x
         self._there, self._here = previous.gray_levels, current.gray
 
-    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
-        """Places (M, 2) by gray levels."""
+    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
+        """Places by gray levels, as they are seen through the warp; just y without one."""
+        if warp is None:
+            return _as_matched(y, chosen)
         return place_exactly(self._there, self._here, *(
             values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
@@ -322,9 +324,14 @@ class ReprojectionSurface:
         return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
                            np.zeros(n), np.ones(n, bool))
 
-    def placed(self, y: Array, warp: Array, chosen: NDArray[np.bool_]) -> Array:
+    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """There is no other means."""
-        return y[chosen]
+        return _as_matched(y, chosen)
+
+
+def _as_matched(y: Array, chosen: NDArray[np.bool_]) -> Placed:
+    """Take places as they were matched, all alike."""
+    return Placed(y[chosen], np.tile(np.eye(2), (int(chosen.sum()), 1, 1)))
 
 
 def contrast_of(here: Array, there: Array) -> float:

@@ -34,10 +34,11 @@ from djet_ros.core.jet import (
     minimise,
     Residuals,
     Solution,
-    with_places,
 )
+from djet_ros.core.joining import with_places
 from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
+from djet_ros.core.patches import Placed
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
 from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.starts import Known
@@ -262,10 +263,10 @@ class _Algorithm:
         self.noise = _scale(found.solution.residuals.r)
         placed = pair.y.copy()
         if self._config.join_matches and self._config.method != 'rpe':
-            # Step 2 once more: where matches are found is a measurement of its own.
-            if self._warp is not None:
-                placed[voting] = self._surface.placed(pair.y, self._warp, voting)
-            found = _joined(found, self._K, placed[voting], self._config)
+            # Step 2 once more: where gray levels have matches is a measurement of its own.
+            exactly = self._surface.placed(pair.y, self._warp, voting)
+            placed[voting] = exactly.places
+            found = _joined(found, self._K, exactly, self._config)
         if self.first.rivals:
             # Judge again between the basins, on all that is known.
             solution, rivals = judged(found.problem, found.places, found.solution,
@@ -282,10 +283,10 @@ class _Algorithm:
             self._warp, self._plausible = _warps(pose, self._K, self._surface.x, optimum)
 
 
-def _joined(found: _Optimised, K: Array, y: Array, config: EstimatorConfig) -> _Optimised:
-    """Optimise the pose by surfaces and by where matches were found, y (M, 2), together."""
+def _joined(found: _Optimised, K: Array, placed: Placed, config: EstimatorConfig) -> _Optimised:
+    """Optimise the pose by surfaces and by where gray levels have matches, together."""
     solution = found.solution
-    problem = with_places(found.problem, solution, K, y)
+    problem = with_places(found.problem, solution, K, placed)
     agreeing = np.abs(solution.residuals.r) < found.loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t)
     loss = replace(found.loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))

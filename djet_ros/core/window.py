@@ -405,7 +405,7 @@ class Window:
         expected = Expected.together([
             expect(self._views[anchor].gray_levels, found[some], warps[some])
             for anchor in np.unique(anchors) for some in (anchors == anchor,)])
-        apart = expected.place(self._views[-1].gray, minima) - minima
+        apart = expected.place(self._views[-1].gray, minima).places - minima
         agree = (apart**2).sum(1) < self._tuning.agree**2
         return np.asarray(minima + np.where(agree[:, None], apart / 2, 0.0))
 

@@ -1,0 +1,182 @@
+"""Places by surfaces and by gray levels: joined as two measurements of one thing are."""
+
+from __future__ import annotations
+
+
+from djet_ros.core.geometry import fundamental, rotation_angle
+from djet_ros.core.jet import (
+    core_scale,
+    epipolar_residuals,
+    jet_problem,
+    JetProblem,
+    Loss,
+    minimise,
+    Solution,
+)
+from djet_ros.core.joining import with_places
+from djet_ros.core.paraboloid import Paraboloids
+from djet_ros.core.patches import Placed
+from djet_ros.core.surfaces import ReprojectionSurface
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from two_view import K, two_views
+
+# By what a surface counts as less exact than it is, because gray levels see the same pixels.
+TOGETHER = 2.0
+
+
+def ellipses(rng: np.random.Generator, places: np.ndarray, sigma: float
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Places that are off by sigma pixels, some way by a third of that; their covariances."""
+    turn = Rotation.from_rotvec(rng.uniform(0, np.pi, (len(places), 1)) * [0, 0, 1])
+    axes = turn.as_matrix()[:, :2, :2]
+    S = axes @ (sigma**2 * np.diag([1, 1 / 9])) @ axes.transpose(0, 2, 1)
+    off = np.einsum('nij,nj->ni', np.linalg.cholesky(S), rng.normal(size=places.shape))
+    return places + off, S
+
+
+def surfaces(centres: np.ndarray, S: np.ndarray) -> Paraboloids:
+    return Paraboloids(centres, np.linalg.inv(S), np.zeros_like(centres), np.zeros(len(centres)),
+                       np.ones(len(centres), bool))
+
+
+def alike(places: np.ndarray) -> Placed:
+    return Placed(places, np.tile(np.eye(2), (len(places), 1, 1)))
+
+
+def at(problem: JetProblem, R: np.ndarray, t: np.ndarray) -> Solution:
+    """Take a pose as the solution of a problem."""
+    return Solution(R, t, epipolar_residuals(problem, R, t))
+
+
+def test_two_measurements_of_a_place_are_joined_as_gaussians_are() -> None:
+    rng = np.random.default_rng(20)
+    views = two_views(rng, 400)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    y_star, S = ellipses(rng, y, 0.3)
+    found, T = ellipses(rng, y, 0.2)
+    alone = jet_problem(K, x, surfaces(y_star, S))
+    # Nothing but the shapes and the ratios of covariances is told.
+    joined = with_places(alone, at(alone, R, t), K, Placed(found, 7 * T))
+    # How exact each is, in pixels: from its distances to the true lines.
+    lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
+    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    S, T = (shape * core_scale(((at_places - y) * normals).sum(1) / np.sqrt(
+        np.einsum('ni,nij,nj->n', normals, shape, normals)))**2
+        for shape, at_places in ((S, y_star), (T, found)))
+    S *= TOGETHER
+    precision = np.linalg.inv(S) + np.linalg.inv(T)
+    expected = np.linalg.solve(precision, (np.linalg.solve(S, y_star[..., None])
+                                           + np.linalg.solve(T, found[..., None])))
+    joined_at = (joined.rays_y.T @ K.T)[:, :2]
+    assert np.abs(joined_at - expected[..., 0]).max() < 1e-6
+    # Covariances, but for their common unit, and for how much the noise seems to differ.
+    C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
+    apart = y_star - found
+    squared = (apart * np.linalg.solve(S + T, apart[..., None])[..., 0]).sum(1)
+    ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.inv(precision), C))
+    assert np.ptp(ratio, axis=1).max() < 1e-6 * ratio.max()
+    by_distance = ratio[np.argsort(squared), 0]
+    assert (np.diff(by_distance) > -1e-9 * ratio.max()).all()
+    assert np.median(by_distance) < 1.5 * by_distance[0]
+
+
+@pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
+def test_a_pose_of_surfaces_and_places_is_about_as_exact_as_that_of_the_better(sigma: float
+                                                                               ) -> None:
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        views = two_views(rng, 150)
+        x, y, R, t = views.x, views.y, views.R, views.t
+        y_star, S = ellipses(rng, y, 0.3)
+        found = y + rng.normal(0, sigma, y.shape)
+        problems = [jet_problem(K, x, surfaces(y_star, S)),
+                    jet_problem(K, x, ReprojectionSurface(x, found).around(found))]
+        solutions = [minimise(problem, R, t, Loss()) for problem in problems]
+        poses = [solution.pose for solution in solutions]
+        joined = with_places(problems[0], solutions[0], K, alike(found))
+        poses.append(minimise(joined, R, t, Loss()).pose)
+        errors.append([rotation_angle(R, pose.R) for pose in poses])
+    surface, place, both = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert both < 1.1 * min(surface, place)
+
+
+def test_sharp_places_count_for_more() -> None:
+    """Where one half of the matches is ten times as exact, the pose is that of this half."""
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        views = two_views(rng, 200)
+        x, y, R, t = views.x, views.y, views.R, views.t
+        sigma = np.where(np.arange(200) % 2, 0.05, 0.5)
+        y_star, S = ellipses(rng, y, 0.5)
+        found = y + sigma[:, None] * rng.normal(size=y.shape)
+        alone = jet_problem(K, x, surfaces(y_star, S))
+        start = minimise(alone, R, t, Loss())
+        told = Placed(found, sigma[:, None, None]**2 * np.eye(2))
+        poses = [minimise(with_places(alone, start, K, placed), R, t, Loss()).pose
+                 for placed in (told, alike(found))]
+        errors.append([rotation_angle(R, pose.R) for pose in poses])
+    weighed, unweighed = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert weighed < 0.5 * unweighed
+
+
+def test_places_that_agree_count_for_more_where_matches_differ_in_noise() -> None:
+    rng = np.random.default_rng(22)
+    views = two_views(rng, 400)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    noise = rng.choice([0.3, 1.0, 2.0], 400)  # of what is seen around a place, however
+    off, S = ellipses(rng, np.zeros_like(y), 0.2)
+    found = y + noise[:, None] * rng.normal(0, 0.2, y.shape)
+    alone = jet_problem(K, x, surfaces(y + noise[:, None] * off, S))
+    joined = with_places(alone, at(alone, R, t), K, alike(found))
+    grown = np.median(joined.spread[::2], axis=0) / np.median(alone.spread[::2], axis=0)
+    assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
+
+
+def test_what_was_found_elsewhere_moves_the_pose_little() -> None:
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        views = two_views(rng, 400)
+        x, y, R, t = views.x, views.y, views.R, views.t
+        y_star, S = ellipses(rng, y, 0.2)
+        found = y + rng.normal(0, 0.2, y.shape)
+        elsewhere = np.where(np.arange(400) % 10, 0, 3)[:, None] * rng.normal(size=y.shape)
+        alone = jet_problem(K, x, surfaces(y_star, S))
+        start = minimise(alone, R, t, Loss('geman_mcclure', 0.6))
+        poses = []
+        for places in (found, found + elsewhere):
+            joined = with_places(alone, start, K, alike(places))
+            scale = 3 * core_scale(epipolar_residuals(joined, start.R, start.t).r)
+            poses.append(minimise(joined, start.R, start.t, Loss('geman_mcclure', scale)).pose)
+        errors.append([rotation_angle(R, pose.R) for pose in poses])
+    right, some_wrong = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert some_wrong < 1.3 * right
+
+
+def test_where_a_surface_has_no_minimum_it_stays_as_it_is() -> None:
+    rng = np.random.default_rng(21)
+    views = two_views(rng, 60)
+    x, y, R, t = views.x, views.y, views.R, views.t
+    y_star, S = ellipses(rng, y, 0.3)
+    S[::3] *= -1
+    S[1::3, 0, 0] *= -1
+    problem = jet_problem(K, x, surfaces(y_star, S))
+    joined = with_places(problem, at(problem, R, t), K, alike(y))
+    saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
+    saddles |= problem.spread[0] <= 0
+    assert saddles.sum() > 10
+    assert np.array_equal(joined.rays_y[:, saddles], problem.rays_y[:, saddles])
+    assert not np.array_equal(joined.rays_y[:, ~saddles], problem.rays_y[:, ~saddles])
+    assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()
+
+
+def test_exact_matches_stay_exact() -> None:
+    views = two_views(np.random.default_rng(24), 60)
+    problem = jet_problem(K, views.x, surfaces(views.y, np.tile(np.eye(2), (60, 1, 1))))
+    joined = with_places(problem, at(problem, views.R, views.t), K, alike(views.y))
+    assert np.isfinite(joined.spread).all()
+    assert np.abs(epipolar_residuals(joined, views.R, views.t).r).max() < 1e-9
