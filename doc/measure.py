@@ -42,6 +42,7 @@ from djet_ros.lab.provenance import versions as versions_of
 from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
+from djet_ros.lab.summary import common_errors
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 from djet_ros.recordings.kitti import KittiSequence
@@ -303,14 +304,11 @@ def against(records: Sequence[PairRecord], other: str, preset: str) -> dict[str,
 
     Figures are [D-JET's, the other's].
     """
-    ours, theirs = ({(one.sequence, one.pair): one for one in records
-                     if (one.method, one.preset) == (method, preset)}
+    ours, theirs = ([one for one in records if (one.method, one.preset) == (method, preset)]
                     for method in ('djet', other))
     found: dict[str, Any] = {'other': other, 'preset': preset}
-    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
-        errors = np.array([[getattr(ours[key], name), getattr(theirs[key], name)]
-                           for key in ours if key in theirs]).reshape(-1, 2)
-        both = [spread(column) for column in errors[np.isfinite(errors).all(axis=1)].T]
+    for what, errors in common_errors(ours, theirs).items():
+        both = [spread(column) for column in errors.T]
         found[what] = {kind: [one[kind] for one in both] for kind in ('mean', 'median')}
         found[what]['told'] = both[0]['told']
     return found

@@ -327,7 +327,7 @@ def row_of(name: str, found: Array) -> list[str]:
             f'{ratio.max():.2f}', f'{length.sum() / true.sum():.3f}', f'{error:.2f}']
 
 
-# Processes on a graph
+# Covariances
 
 
 def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -366,6 +366,9 @@ def covered(folder: Path, name: str = '') -> list[list[str]]:
 
 def known(value: float, form: str) -> str:
     return f'{value:{form}}' if np.isfinite(value) else '–'
+
+
+# Processes on a graph
 
 
 def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:

@@ -51,6 +51,12 @@ def test_stamps_that_go_back_start_anew():
     assert taken(limit, early) == taken(RateLimit(10), early)
 
 
+def test_who_begins_an_image_later_takes_others_for_good():
+    """So a pose graph keeps all images: by a limit of its own none may be the odometry's."""
+    stamps = camera(60)
+    assert set(taken(RateLimit(20), stamps)).isdisjoint(taken(RateLimit(20), stamps[1:]))
+
+
 def test_after_a_pause_of_hours_no_more_come_than_before():
     limit = RateLimit(10)
     first = len(taken(limit, camera(60, 5)))

@@ -187,6 +187,29 @@ def test_a_recording_that_does_not_tell_the_mounting_says_so_in_a_line(tmp_path,
         line, = [text for text in done.stderr.splitlines() if 'error' in text]
         assert line.startswith(f"djet: error: odometry.base_frame is 'base_link', and no "
                                f"/tf_static in {source} tells where 'camera' is on it")
+        assert not (tmp_path / f'of_{source.name}').exists()
+
+
+def test_a_sequence_with_an_imu_tells_the_odometry_of_the_imu(tmp_path):
+    folder = render_sequence('road', tmp_path, 4, size=(480, 160))
+    words = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
+    assert "tells where 'camera' is on it" in djet(*words, expect=2).stderr
+    djet(*words, '--imu', 'true')
+    with Bag(tmp_path / 'out' / 'bag') as result:
+        told = [one.message for one in result.messages({'/vo_node/odometry'})]
+    assert [message.child_frame_id for message in told] == ['imu'] * 4
+
+
+def test_results_stay_where_the_mounting_that_is_asked_for_is_not_told(tmp_path):
+    path, results = record(tmp_path / 'bag', on_a_robot()), tmp_path / 'results'
+    results.mkdir()
+    for name in ('summary.json', 'config.yaml'):
+        (results / name).write_text('of an hour')
+    done = djet('replay', path, '--output', results, '--overwrite', '--base-frame', 'arm',
+                expect=2)
+    assert "odometry.base_frame is 'arm'" in done.stderr
+    assert {one.name: one.read_text() for one in results.iterdir()} == {
+        'summary.json': 'of an hour', 'config.yaml': 'of an hour'}
 
 
 # What is written

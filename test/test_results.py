@@ -18,6 +18,7 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import open_datasets, Selection
+from djet_ros.lab.summary import common_errors
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
@@ -104,6 +105,19 @@ def test_one_part_is_added_to_all_that_is_measured_and_all_anew_begins_empty(tmp
     path.write_text(json.dumps({**whole, 'complete': False}))
     assert list(module.begun(path, settings)['parts']) == ['road', 'loop']
     assert module.begun(path, {**settings, 'frames': 8})['parts'] == {}
+
+
+def test_errors_in_common_are_of_pairs_that_both_told_in_the_order_of_the_first():
+    first, second = ([replace(record(i, Rotation.identity(), np.array([0, 0, 1.0])),
+                              rotation_error_deg=rotation, translation_error_deg=direction)
+                      for i, rotation, direction in rows] for rows in (
+        [(3, 0.3, 3.0), (1, 0.1, math.nan), (2, 0.2, 2.0), (9, 0.9, 9.0)],
+        [(1, 1.1, 11.0), (2, 1.2, 12.0), (3, 1.3, math.inf), (4, 1.4, 14.0)]))
+    found = common_errors(first, second)
+    assert found['rotation'].tolist() == [[0.3, 1.3], [0.1, 1.1], [0.2, 1.2]]
+    assert found['direction'].tolist() == [[2.0, 12.0]]
+    other = [replace(one, sequence='another') for one in second]
+    assert [errors.shape for errors in common_errors(first, other).values()] == [(0, 2), (0, 2)]
 
 
 def test_ratios_are_of_pairs_that_both_told():

@@ -117,9 +117,8 @@ def check_topics(args: argparse.Namespace, wanted: Collection[str]) -> None:
 
 def _wanted_beside(config: OdometryConfig) -> list[str]:
     """Name what the odometry goes by beside the images."""
-    guess = config.guess or config.scale == 'guess'
     wanted = {'speed': config.scale == 'speed', 'imu': config.imu, 'mask': config.mask,
-              'guess': guess and not config.guess_frame, 'tf': guess and config.guess_frame}
+              'guess': config.guess_by_topic, 'tf': config.guess_by_tf}
     return [what for what, is_wanted in wanted.items() if is_wanted]
 
 

@@ -119,6 +119,20 @@ class OdometryConfig:
                              "'x y z w' of length 1, or nothing")
         return tuple(value / length for value in values)
 
+    @property
+    def guess_by_topic(self) -> bool:
+        """Whether another odometry is gone by that comes on a topic."""
+        return self._goes_by_guess and not self.guess_frame
+
+    @property
+    def guess_by_tf(self) -> bool:
+        """Whether another odometry is gone by that is made of what tf tells of guess_frame."""
+        return self._goes_by_guess and bool(self.guess_frame)
+
+    @property
+    def _goes_by_guess(self) -> bool:
+        return self.guess or self.scale == 'guess'
+
     def gray_limits(self) -> tuple[int, int]:
         """Give the two values of gray_range."""
         words = self.gray_range.replace(',', ' ').split()

@@ -11,6 +11,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.methods import check_names, configured, Method
 from djet_ros.lab.pairs import PairRecord
+from djet_ros.lab.summary import common_errors
 import numpy as np
 
 # Parameters that re-projection error has as well: a change of these is tried on both.
@@ -127,7 +128,7 @@ class Ratio:
         return self.least > 1 or self.most < 1
 
 
-def ratio_of(errors: Sequence[float], base: Sequence[float],
+def ratio_of(errors: Sequence[float] | Array, base: Sequence[float] | Array,
              statistic: Callable[..., Array] = np.mean) -> Ratio:
     """
     Mean or median of errors over that of base, pair by pair the same ones; of pairs both know.
@@ -152,14 +153,9 @@ def ratio_of(errors: Sequence[float], base: Sequence[float],
 def ratios_to_base(records: Sequence[PairRecord], base: Sequence[PairRecord]
                    ) -> dict[str, dict[str, Ratio]]:
     """Errors over those of base on the same pairs: 'rotation', 'direction'; 'mean', 'median'."""
-    at = {(record.sequence, record.pair): record for record in base}
-    paired = [(record, at[record.sequence, record.pair]) for record in records]
-    found: dict[str, dict[str, Ratio]] = {}
-    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
-        own, others = zip(*((getattr(one, name), getattr(other, name)) for one, other in paired))
-        found[what] = {kind: ratio_of(own, others, statistic)
-                       for kind, statistic in (('mean', np.mean), ('median', np.median))}
-    return found
+    return {what: {kind: ratio_of(errors[:, 0], errors[:, 1], statistic)
+                   for kind, statistic in (('mean', np.mean), ('median', np.median))}
+            for what, errors in common_errors(records, base).items()}
 
 
 def _changed(method: Method, change: Change) -> Method:

@@ -33,7 +33,7 @@ _RATIO = 0.85
 _APART, _QUALITY = 8, 0.01
 _WINDOW, _LEVELS = 11, 5
 _THERE_AND_BACK = 1.0
-_THRESHOLD, _LOSS_SCALE = 1.0, 0.25
+_THRESHOLD = 1.0
 # Fewer matches than the 5-point method needs for one hypothesis and a vote.
 _MIN_MATCHES = 8
 
@@ -59,7 +59,7 @@ class Chain:
         x, y = self.match(previous, current)
         if len(x) < _MIN_MATCHES:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
-        return as_relative_pose(poselib(K, x, y, _THRESHOLD, _LOSS_SCALE), K, x, y)
+        return as_relative_pose(poselib(K, x, y, _THRESHOLD), K, x, y)
 
 
 def root_sift(gray: Image) -> Points:

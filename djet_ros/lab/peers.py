@@ -24,7 +24,7 @@ CONFIDENCE = 0.999
 # Baselines beyond which a point has no vote between the four poses of an essential matrix. By
 # default 50, beyond which all points are where a hand moves a camera a millimetre or two.
 FARTHEST = 1e6
-# Pixels where PoseLib's refinement bends its loss, instead of its own 0.5: see ``chains``.
+# Pixels where PoseLib's refinement bends its Cauchy loss, instead of its own 0.5: see ``chains``.
 LOSS_SCALE = 0.25
 
 
@@ -38,21 +38,15 @@ def usac_magsac(K: Array, x: Array, y: Array, threshold: float) -> Found:
     return _opencv(cv2.USAC_MAGSAC, K, x, y, threshold)
 
 
-def poselib(K: Array, x: Array, y: Array, threshold: float,
-            loss_scale: float = LOSS_SCALE) -> Found:
-    """
-    Find the pose by PoseLib's LO-RANSAC with its non-linear refinement.
-
-    loss_scale: of the Cauchy loss of that refinement in pixels. All else is at its defaults.
-    """
+def poselib(K: Array, x: Array, y: Array, threshold: float) -> Found:
+    """Find the pose by PoseLib's LO-RANSAC, refined; all but LOSS_SCALE is at its defaults."""
     import poselib as library
 
     # The image size is part of a camera there, but not of this estimate.
     camera = {'model': 'PINHOLE', 'width': int(2 * K[0, 2]), 'height': int(2 * K[1, 2]),
               'params': [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
     pose, info = library.estimate_relative_pose(
-        x, y, camera, camera, {'max_epipolar_error': threshold},
-        {'loss_scale': loss_scale})
+        x, y, camera, camera, {'max_epipolar_error': threshold}, {'loss_scale': LOSS_SCALE})
     return np.asarray(pose.R), np.asarray(pose.t), np.asarray(info['inliers'], dtype=bool)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 import math
 
+from djet_ros.core.types import Array
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.replay.drift import drift
@@ -84,6 +85,23 @@ def _row(records: Sequence[PairRecord]) -> TableRow:
 
 def _told(records: Iterable[PairRecord], name: str) -> int:
     return sum(math.isfinite(getattr(record, name)) for record in records)
+
+
+def common_errors(records: Sequence[PairRecord], others: Sequence[PairRecord]) -> dict[str, Array]:
+    """
+    Give the errors (N, 2) of records and others, in degrees, on the pairs that both told.
+
+    Of 'rotation' and 'direction', each in the order of records.
+    """
+    at = {(other.sequence, other.pair): other for other in others}
+    paired = [(record, at[record.sequence, record.pair]) for record in records
+              if (record.sequence, record.pair) in at]
+    found = {}
+    for what, name in (('rotation', 'rotation_error_deg'), ('direction', 'translation_error_deg')):
+        errors = np.array([[getattr(one, name) for one in both] for both in paired],
+                          float).reshape(-1, 2)
+        found[what] = errors[np.isfinite(errors).all(axis=1)]
+    return found
 
 
 def drift_row(sequence: str, method: str, preset: str, truth: StampedTrajectory,

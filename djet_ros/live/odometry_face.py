@@ -7,7 +7,7 @@ from dataclasses import replace
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.parameters import wants_topic_of_guess, why_frames
+from djet_ros.live.parameters import why_frames
 from djet_ros.live.session import Session
 from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
@@ -59,7 +59,7 @@ class OdometryFace(Face):
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,
-                  'guess': wants_topic_of_guess(odometry)}
+                  'guess': odometry.guess_by_topic}
         if why_frames(odometry) and not self._follows_frames:
             self._follows_frames = True
             self._middleware.follow_frames()
@@ -69,8 +69,7 @@ class OdometryFace(Face):
                         getattr(self.session, what),
                         replace(input_profile(config.ros),
                                 depth=_MASKS_DEPTH if what == 'mask' else _DEPTH))
-        guess = odometry.guess or odometry.scale == 'guess'
-        if guess and odometry.guess_frame and not self._hears_tf:
+        if odometry.guess_by_tf and not self._hears_tf:
             self._hears_tf = True
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))

@@ -26,18 +26,13 @@ ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')
                      for item in section(Config(), part))
 
 
-def wants_topic_of_guess(config: OdometryConfig) -> bool:
-    """Tell whether another odometry is to be heard, and not to be made of tf."""
-    return (config.guess or config.scale == 'guess') and not config.guess_frame
-
-
 def why_frames(config: OdometryConfig) -> str:
     """Say what asks tf how something is mounted; nothing where nothing does."""
     if config.base_frame:
         return f'odometry.base_frame is {config.base_frame}'
     if config.imu and config.imu_quaternion() is None:
         return 'odometry.imu is true without an odometry.imu_rotation'
-    if wants_topic_of_guess(config):
+    if config.guess_by_topic:
         return 'odometry.guess is true' if config.guess else 'odometry.scale is guess'
     return ''
 

@@ -241,7 +241,7 @@ class LiveSlam:
         return outgoing
 
     def _frame(self, stamp: int) -> Frame | None:
-        """Frame of the image with a stamp, which waits no longer, nor do those before it."""
+        """Frame of the image with a stamp, which waits no longer; None where none is to be had."""
         message = self._images.pop(stamp, None)
         if message is None or self._camera is None:
             return None

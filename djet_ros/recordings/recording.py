@@ -127,6 +127,11 @@ class SequenceRecording(Recording):
                 yield BagMessage(self.image_topic, stamp, MAKE.picture(
                     stamp, CAMERA_FRAME, sequence.raw(index)))
 
+    def static_frames(self) -> Iterator[Any]:
+        """Yield how the IMU is turned against the camera, where it is wanted."""
+        if self._imu is not None:
+            yield _imu_frame(int(self._sequence.stamps_ns[0]), self._imu).message
+
     def close(self) -> None:
         """Nothing is held open."""
 

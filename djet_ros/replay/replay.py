@@ -101,7 +101,7 @@ class Replay:
     """
 
     def __init__(self, recording: Recording, config: Config, name: str) -> None:
-        """Prepare the run; DjetError where the scale needs what the recording does not have."""
+        """Prepare the run; DjetError where a parameter needs what the recording does not have."""
         self._recording = recording
         self._config = config
         self._name = name
@@ -116,6 +116,8 @@ class Replay:
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
         self._log = _Log()
+        if config.odometry.base_frame and (frame := _frame_of_images(recording)) is not None:
+            self._mount(frame)
 
     def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
         """Run to the end, calling progress after each image; an interrupt is passed on."""
@@ -408,6 +410,16 @@ def _static_frames(recording: Recording) -> StaticFrames:
         for message in recording.static_frames():
             frames.add(message)
     return frames
+
+
+def _frame_of_images(recording: Recording) -> str | None:
+    """Name the frame of the first image; None where there is damage before it."""
+    # As above.
+    with suppress(DjetError):
+        for message in recording.messages({recording.image_topic}):
+            if message.topic == recording.image_topic:
+                return str(message.message.header.frame_id)
+    return None
 
 
 def _scale(recording: Recording, config: Config) -> ScaleSource:
