@@ -17,7 +17,7 @@ from typing import Any
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.lab import peers
-from djet_ros.lab.ablation import ON_PLACES
+from djet_ros.lab.ablation import ON_PLACES, WEIGHED
 from djet_ros.lab.chains import CHAINS
 from djet_ros.lab.methods import TITLES
 from djet_ros.lab.published import TABLE_1
@@ -460,9 +460,10 @@ def judged(ratio: Any) -> str:
 def joined(results: Any) -> str:
     """Hold surfaces and gray levels together against each of them alone."""
     part = results['parts'].get('ablation')
-    ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', ''))
+    ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', WEIGHED),
+            ('rpe', ''))
     found = {(one['method'], one['change']): one for one in part['variants']} if part else {}
-    if ('rpe', ON_PLACES) not in found:
+    if ('rpe', WEIGHED) not in found:
         return 'Surfaces and gray levels were not yet measured each by itself.\n'
     return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, see "What makes the '
                       'difference":') + table(VARIANTS, (variant(found[way]) for way in ways)))

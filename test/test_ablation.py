@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.lab.ablation import ablation_methods, ON_PLACES, PARTS, Ratio, ratio_of
+from djet_ros.lab.ablation import ablation_methods, ON_PLACES, PARTS, Ratio, ratio_of, WEIGHED
 from djet_ros.lab.pairs import evaluate_chunk, PairChunk
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
@@ -42,14 +42,19 @@ def test_reprojection_error_stands_beside_on_the_places_by_gray_levels(road):
     methods = ablation_methods(['best'], ['joining'], (), {})
     assert [(method.name, method.change) for method in methods] == [
         ('djet', ''), ('rpe', ''), ('five_point', ''), ('djet', 'surfaces alone'),
-        ('rpe', ON_PLACES)]
+        ('rpe', ON_PLACES), ('rpe', WEIGHED)]
     estimator, rpe = TwoViewEstimator(), TwoViewEstimator(methods[1].config)
     views = [estimator.view(opened(road).image(i), opened(road).K) for i in (0, 1)]
     djet = estimator.estimate_matched(*views, *estimator.match(*views))
-    on_places = rpe.estimate_matched(*views, djet.x[djet.voting], djet.placed[djet.voting])
-    record = evaluate_chunk(PairChunk(road, 0, 1), methods)[-1]
-    assert record.inliers == on_places.inliers.sum()
-    assert record.rotation == tuple(Rotation.from_matrix(on_places.R.T).as_rotvec().tolist())
+    places = djet.x[djet.voting], djet.placed[djet.voting]
+    on_places = rpe.estimate_matched(*views, *places)
+    weighed = rpe.estimate_matched(
+        *views, *places, covariances=djet.placed_covariances[djet.voting])
+    records = evaluate_chunk(PairChunk(road, 0, 1), methods)[-2:]
+    for record, expected in zip(records, (on_places, weighed), strict=True):
+        assert record.inliers == expected.inliers.sum()
+        assert record.rotation == tuple(Rotation.from_matrix(expected.R.T).as_rotvec().tolist())
+    assert records[0].rotation != records[1].rotation
     # The paper's preset joins nothing: there are no such places.
     assert not any(method.on_places for method in ablation_methods(['paper'], PARTS, (), {}))
 
@@ -73,6 +78,7 @@ def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
         variant('slow', [0.9, 0.8, 0.95], [0.9, 0.7, 1.1]),
         variant('wide', [1.2, 0.9, 1.5], [0.9, 0.8, 1.2]),
         variant(ON_PLACES, [1.2, 0.9, 1.5], [1.1, 0.8, 1.4], 'rpe'),
+        variant(WEIGHED, [1.1, 0.9, 1.3], [1.1, 0.8, 1.4], 'rpe'),
         variant('', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0], 'rpe')]}
     said = page.verdict(part)
     assert said == (
@@ -85,7 +91,7 @@ def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
     for one in part['variants']:
         del one['ratio']  # as earlier versions measured it
     assert 'not measured yet' in page.verdict(part)
-    assert page.ablation({'parts': {'ablation': part}}).count('| – | – | – | – |') == 8
+    assert page.ablation({'parts': {'ablation': part}}).count('| – | – | – | – |') == 9
 
 
 def pages() -> ModuleType:

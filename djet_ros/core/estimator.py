@@ -103,14 +103,16 @@ class TwoViewEstimator:
         return match_widely(previous, current, None, Known(), self.config.search_radius)
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
-                         prior: RelativePose | None = None, observe: Observer | None = None
-                         ) -> RelativePose:
+                         prior: RelativePose | None = None, observe: Observer | None = None,
+                         covariances: Array | None = None) -> RelativePose:
         """
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
-        prior: as for ``estimate``; observe: is shown each round of Algorithm 1.
+        prior: as for ``estimate``; observe: is shown each round of Algorithm 1; covariances:
+        (N, 2, 2) of y up to a common factor, by which re-projection errors count.
         """
-        return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), observe=observe))
+        return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), observe=observe,
+                                       covariances=covariances))
 
     def estimate_pair(self, pair: Pair) -> RelativePose:
         """Estimate from matches, with all that is known; see ``Pair``."""
@@ -153,7 +155,8 @@ class TwoViewEstimator:
             if found is None:
                 return None
             start, agree = found
-            pair = replace(pair, x=pair.x[agree], y=pair.y[agree], ahead=None, bits=None)
+            pair = replace(pair, x=pair.x[agree], y=pair.y[agree], ahead=None, bits=None,
+                           covariances=_of(pair.covariances, agree))
             return pair, [start], self._sampled(pair)
         if pair.ahead is not None:
             with _timed(pair.timings, 'jet'):
@@ -186,7 +189,7 @@ class TwoViewEstimator:
             return DescriptorSurface(pair.previous, pair.current, pair.x, self.config)
         if self.config.method == 'pjet':
             return PhotometricSurface(pair.previous, pair.current, pair.x, self.config)
-        return ReprojectionSurface(pair.x, pair.y)
+        return ReprojectionSurface(pair.x, pair.y, pair.covariances)
 
     def _track(self, pair: Pair, surface: ResidualSurface, starts: list[Pose]) -> Track | None:
         """Run Algorithm 1 from some starts; from those around the motion ahead without any."""
@@ -204,6 +207,10 @@ class TwoViewEstimator:
         with _timed(pair.timings, 'result'):
             result = verdict(pair, track, self.config)
         return replace(result, timings=pair.timings)
+
+
+def _of(values: Array | None, chosen: NDArray[np.bool_]) -> Array | None:
+    return None if values is None else values[chosen]
 
 
 def _failed(status: Status, pair: Pair) -> RelativePose:

@@ -39,7 +39,9 @@ class Pair:
     motion before this one; known: what others than the images tell; ahead: a motion from which the
     matches were followed, so that its basin will do as a start where none other comes near, its t
     may be zeros; bits: (N,) in which descriptors at x and y differ, where that is known already;
-    observe: is shown each round of Algorithm 1; timings: gets the seconds of each stage.
+    covariances: (N, 2, 2) of y, up to a common factor, which re-projection errors count by, all
+    alike where they are not told; observe: is shown each round of Algorithm 1; timings: gets the
+    seconds of each stage.
     """
 
     previous: View
@@ -50,5 +52,6 @@ class Pair:
     known: Known = field(default_factory=Known)
     ahead: Pose | None = None
     bits: Array | None = None
+    covariances: Array | None = None
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)

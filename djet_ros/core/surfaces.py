@@ -34,7 +34,7 @@ from djet_ros.core.paraboloid import (
     project_to_positive,
     times,
 )
-from djet_ros.core.patches import place_exactly, Placed, within
+from djet_ros.core.patches import as_matched, place_exactly, Placed, within
 from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -102,7 +102,7 @@ class _OfImages:
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """Places by gray levels, as they are seen through the warp; just y without one."""
         if warp is None:
-            return _as_matched(y, chosen)
+            return as_matched(y[chosen])
         return place_exactly(self._there, self._here, *(
             values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
@@ -312,26 +312,26 @@ class PhotometricSurface(_OfImages):
 
 
 class ReprojectionSurface:
-    """Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E)."""
+    """
+    Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E).
 
-    def __init__(self, x: Array, y: Array) -> None:
+    Where covariances (N, 2, 2) of y are told, A' is their inverses.
+    """
+
+    def __init__(self, x: Array, y: Array, covariances: Array | None = None) -> None:
         self.x = x
         self._y = y
+        self._A = (np.repeat(np.eye(2)[None], len(y), axis=0) if covariances is None
+                   else inverses(covariances))
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
-        """Give the same circular paraboloid wherever the keypoint has moved."""
+        """Give the same paraboloid wherever the keypoint has moved."""
         n = len(y)
-        return Paraboloids(self._y, np.repeat(np.eye(2)[None], n, axis=0), np.zeros((n, 2)),
-                           np.zeros(n), np.ones(n, bool))
+        return Paraboloids(self._y, self._A, np.zeros((n, 2)), np.zeros(n), np.ones(n, bool))
 
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """There is no other means."""
-        return _as_matched(y, chosen)
-
-
-def _as_matched(y: Array, chosen: NDArray[np.bool_]) -> Placed:
-    """Take places as they were matched, all alike."""
-    return Placed(y[chosen], np.tile(np.eye(2), (int(chosen.sum()), 1, 1)))
+        return as_matched(y[chosen])
 
 
 def contrast_of(here: Array, there: Array) -> float:

@@ -38,7 +38,7 @@ from djet_ros.core.jet import (
 from djet_ros.core.joining import with_places
 from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.patches import Placed
+from djet_ros.core.patches import as_matched, Placed
 from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
 from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.starts import Known
@@ -78,7 +78,7 @@ class Track:
     Where Algorithm 1 ended.
 
     pose; loss: the robust loss in force; residuals: those of the voting matches at the pose;
-    voting: (N,) bool, matches that took part; placed: (N, 2) where gray levels have y, through the
+    voting: (N,) bool, matches that took part; placed: where gray levels have y (N, 2), through the
     last warp, or y itself where that was not asked; minima: (N, 2) the surfaces' own minima y*,
     joined with these for matches that voted; y_opt: (N, 2) the final step onto the epipolar line;
     losses: (N,) last known surface values; rivals: other motions that explain the voting matches;
@@ -90,7 +90,7 @@ class Track:
     residuals: Residuals
     voting: NDArray[np.bool_]
     minima: Array
-    placed: Array
+    placed: Placed
     y_opt: Array
     losses: Array
     indefinite: int
@@ -256,16 +256,16 @@ class _Algorithm:
             self._ours[voting] = np.abs(solution.residuals.r) < TRACK_TUNING.by_itself * loss.scale
         return _Optimised(voting, places, problem, loss, solution, converged, basin.rivals)
 
-    def _concluded(self, found: _Optimised) -> tuple[_Optimised, Array, tuple[Rival, ...]]:
+    def _concluded(self, found: _Optimised) -> tuple[_Optimised, Placed, tuple[Rival, ...]]:
         """Take in at the end where matches are found, and hold the pose against its rivals."""
         pair, voting = self._pair, found.voting
         rivals: tuple[Rival, ...] = ()
         self.noise = _scale(found.solution.residuals.r)
-        placed = pair.y.copy()
+        placed = as_matched(pair.y)
         if self._config.join_matches and self._config.method != 'rpe':
             # Step 2 once more: where gray levels have matches is a measurement of its own.
             exactly = self._surface.placed(pair.y, self._warp, voting)
-            placed[voting] = exactly.places
+            placed.places[voting], placed.covariances[voting] = exactly
             found = _joined(found, self._K, exactly, self._config)
         if self.first.rivals:
             # Judge again between the basins, on all that is known.
@@ -300,7 +300,7 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     voting = paraboloids.usable
     residuals = epipolar_residuals(jet_problem(K, surface.x, paraboloids), pose.R, pose.t)
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), y, optimum,
+    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), as_matched(y), optimum,
                  paraboloids.values(optimum), 0, 0)
 
 

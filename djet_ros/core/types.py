@@ -126,6 +126,8 @@ class RelativePose:
     the place of y after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,)
     bool, those that took part in the pose, whether they agree with it or not; placed: (N, 2)
     where gray levels have y, seen through the pose and the depths, or y itself;
+    placed_covariances: (N, 2, 2) of these in square pixels, up to a common factor (see
+    `core.patches`), all alike where gray levels were not asked;
     residuals: (N,) signed distances in pixels of y to its epipolar line;
     hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
     losses: (N,) each match's loss on its surface, the last known one where it was culled;
@@ -142,6 +144,7 @@ class RelativePose:
     x: Array = field(default_factory=lambda: np.empty((0, 2)))
     y: Array = field(default_factory=lambda: np.empty((0, 2)))
     placed: Array = field(default_factory=lambda: np.empty((0, 2)))
+    placed_covariances: Array = field(default_factory=lambda: np.empty((0, 2, 2)))
     y_opt: Array = field(default_factory=lambda: np.empty((0, 2)))
     inliers: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
     voting: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))

@@ -72,7 +72,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
             status, covariances = _judged(Pose(R, t), covariances, track, pair.before)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
-        status, R, t, *covariances, x=x, y=pair.y, placed=track.placed,
+        status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,
+        placed_covariances=track.placed.covariances,
         y_opt=track.y_opt, inliers=inliers, voting=track.voting,
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),

@@ -25,6 +25,7 @@ _UNHURRIED: dict[str, Any] = {'max_iterations': _ROUNDS, 'epsilon': 1e-9}
 # Re-projection error where D-JET's gray levels have the matches: all that joining adds but for the
 # surfaces. The places themselves are seen through the warps of D-JET's pose.
 ON_PLACES = 'on places by gray levels'
+WEIGHED = f'{ON_PLACES}, weighed by them'
 
 # Of the bootstrap.
 _DRAWS = 2000
@@ -88,9 +89,9 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
     Let D-JET start with each preset and with each single change of it.
 
     Beside them start RP-E, with the changes that it knows too, and the 5-point method; where
-    joining is changed, RP-E on the places that gray levels give as well (see ON_PLACES).
-    good_start: see Method; presets with the 5-point start take it among several then. Raises
-    DjetError on unknown names and on windows that can't be.
+    joining is changed, RP-E on the places that gray levels give as well, all alike and each as
+    exact as these say. good_start: see Method; presets with the 5-point start take it among
+    several then. Raises DjetError on unknown names and on windows that can't be.
     """
     check_names('preset', presets, PRESETS)
     check_names('part', parts, PARTS)
@@ -110,7 +111,8 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
             if change.values.keys() <= _OF_BOTH:
                 competing.append(_changed(base['rpe'], change))
         if 'joining' in parts and base['djet'].config.join_matches:
-            competing.append(replace(base['rpe'], change=ON_PLACES, on_places=True))
+            competing += [replace(base['rpe'], change=change, on_places=True, weighed=weighed)
+                          for change, weighed in ((ON_PLACES, False), (WEIGHED, True))]
     return competing
 
 

@@ -29,7 +29,8 @@ class Method:
     name: one of TITLES; preset: where the parameters come from; change: what differs from it, in
     words, empty if nothing does; good_start: whether the pose of RP-E, preset best, is given as
     one more start, and only the matches that agree with it; on_places: whether matches begin where
-    D-JET's gray levels have them, seen through the warps of its pose. Peers take their matches and
+    D-JET's gray levels have them, seen through the warps of its pose; weighed: whether these count
+    as exact as gray levels say. Peers take their matches and
     their RANSAC threshold from config, but for those that are whole chains (see chains), which
     take nothing.
     """
@@ -40,6 +41,7 @@ class Method:
     change: str = ''
     good_start: bool = False
     on_places: bool = False
+    weighed: bool = False
 
     def settings(self) -> dict[str, Any]:
         """Everything that decides the results, as plain values."""

@@ -104,7 +104,8 @@ class Given:
     """
     What a method is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
 
-    seconds: what the features of one view and the matches took.
+    seconds: what the features of one view and the matches took; covariances: (N, 2, 2) of y, where
+    the method counts by them.
     """
 
     views: tuple[View, View]
@@ -112,6 +113,7 @@ class Given:
     y: Array
     start: RelativePose | None
     seconds: float
+    covariances: Array | None = None
 
 
 def estimate(method: Method, given: Given) -> RelativePose:
@@ -122,7 +124,8 @@ def estimate(method: Method, given: Given) -> RelativePose:
     if method.name in peers.ESTIMATORS:
         return peers.estimate(method.name, *given.views, given.x, given.y,
                               config.ransac_threshold, config.min_matches)
-    return TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
+    return TwoViewEstimator(config).estimate_matched(
+        *given.views, given.x, given.y, given.start, covariances=given.covariances)
 
 
 class _Image:
@@ -233,7 +236,10 @@ def _with_places(method: Method, given: Given) -> Given:
     config = replace(method.config, method='djet')
     found = TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
     voting = found.voting
-    return replace(given, x=found.x[voting], y=found.placed[voting]) if voting.any() else given
+    if not voting.any():
+        return given
+    return replace(given, x=found.x[voting], y=found.placed[voting],
+                   covariances=found.placed_covariances[voting] if method.weighed else None)
 
 
 def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
