@@ -13,7 +13,7 @@ from djet_ros.core.jet import (
     minimise,
     Solution,
 )
-from djet_ros.core.joining import with_places
+from djet_ros.core.joining import joined_places, with_places
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import Placed
 from djet_ros.core.surfaces import ReprojectionSurface
@@ -172,6 +172,30 @@ def test_where_a_surface_has_no_minimum_it_stays_as_it_is() -> None:
     assert np.array_equal(joined.rays_y[:, saddles], problem.rays_y[:, saddles])
     assert not np.array_equal(joined.rays_y[:, ~saddles], problem.rays_y[:, ~saddles])
     assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()
+
+
+def test_without_a_pose_two_places_tell_by_themselves_how_exact_they_are() -> None:
+    """Covariances are in pixels, whatever unit surfaces come in; the joined place is better."""
+    rng = np.random.default_rng(25)
+    y = rng.uniform(0, 400, (4000, 2))
+    y_star, S = ellipses(rng, y, 0.3)
+    # What both see alike, and what each errs for itself.
+    found, T = ellipses(rng, y, 0.15)
+    alike_off = 0.05 * rng.normal(size=y.shape)
+    y_star, found = y_star + alike_off, found + alike_off
+    # Errors by gray levels are twice as large as they say.
+    places, C = joined_places(y_star, 1000 * S, Placed(found, T / 4))
+    errors = [np.sqrt(np.mean((one - y)**2)) for one in (y_star, found, places)]
+    assert errors[2] < min(errors[:2])
+    squared = ((places - y) * np.linalg.solve(C, (places - y)[..., None])[..., 0]).sum(1)
+    assert 0.5 < np.median(squared) / (2 * np.log(2)) < 2
+
+
+def test_places_that_are_the_same_have_covariances_still() -> None:
+    y, eye = np.full((5, 2), 40.0), np.tile(np.eye(2), (5, 1, 1))
+    places, C = joined_places(y, 3 * eye, Placed(y, 1e-4 * eye))
+    assert np.array_equal(places, y)
+    assert (np.linalg.eigvalsh(C) > 1e-5).all()
 
 
 def test_exact_matches_stay_exact() -> None:

@@ -29,6 +29,9 @@ import numpy as np
 # other, that halves what it adds.
 _TOGETHER = 2.0
 
+# Square of what places by gray levels err, over what they say: it is about twice as much.
+_PLACED = 4.0
+
 # chosen: how much matches differ in noise, over what the places of each tell of it. What is wrong
 # with both shows in no difference.
 _SHARED = 2.0
@@ -49,24 +52,56 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     off = epipolar_residuals(found, solution.R, solution.t).r
     S, T = (core_scale(r)**2 * measured.spread
             for measured, r in ((problem, solution.residuals.r), (found, off)))
-    S *= _TOGETHER
-    apart = (problem.rays_y - found.rays_y)[:2]
-    inverse = _inverse(S + T)
-    way = _times(inverse, apart)
-    joined = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
-    rays_y = problem.rays_y.copy()
-    rays_y[:2] -= joined * _times(S, way)
-    S = S - joined * np.stack([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
-                               _form(S[1:], inverse, S[1:])])
-    if joined.any():
-        S[:, joined] *= _noise_of_each((apart * way).sum(0)[joined])
+    has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
+    rays_y, joined = problem.rays_y.copy(), S.copy()
+    way, joined[:, has_minimum] = join(
+        (found.rays_y - rays_y)[:2, has_minimum], S[:, has_minimum], T[:, has_minimum])
+    rays_y[:2, has_minimum] += way
     # Residuals are in pixels for a match of typical sharpness again.
     G = inverse_of(K)[:2, :2]
     width = np.trace(G @ G.T)
-    spread = S * (width / max(median(np.abs(S[0] + S[2])), 1e-300))
+    spread = joined * (width / max(median(np.abs(joined[0] + joined[2])), 1e-300))
     blur = problem.blur * (np.abs(spread[0] + spread[2])
                            / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
     return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
+
+
+def join(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
+    """
+    Join two measurements of N places: by surfaces, with S (3, N), and by gray levels, with T.
+
+    Covariances are given by their entries 11, 12, 22; apart: (2, N) from the former to the latter.
+    Gives the way (2, N) from the former to the place, and its covariance; the noise of each is
+    told by how far both are apart.
+    """
+    if not S.size:
+        return apart, S
+    S = _TOGETHER * S
+    inverse = _inverse(S + T)
+    way = _times(inverse, apart)
+    left = S - np.stack([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
+                         _form(S[1:], inverse, S[1:])])
+    return _times(S, way), left * _noise_of_each((apart * way).sum(0))
+
+
+def joined_places(minima: Array, spread: Array, placed: Placed) -> tuple[Array, Array]:
+    """
+    Join minima (N, 2) of surfaces with places by gray levels, where no pose tells how exact.
+
+    spread: (N, 2, 2) covariances of the minima up to a common factor. How far both are apart tells
+    that: what gray levels err for themselves, and what both err alike, come to about the same.
+    Minima are not taken for more exact than gray levels. Gives the places (N, 2) and their
+    covariances (N, 2, 2) in square pixels.
+    """
+    S, T = (covariances[:, [0, 0, 1], [0, 1, 1]].T for covariances in (
+        spread, _PLACED * placed.covariances))
+    apart = (placed.places - minima).T
+    if len(minima):
+        squared = (apart * _times(_inverse(S), apart)).sum(0)
+        S = S * max(median(squared) / (2 * np.log(2)),
+                    median(T[0] + T[2]) / median(S[0] + S[2]))
+    way, joined = join(apart, S, T)
+    return minima + way.T, joined[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
 
 
 def _inverse(S: Array) -> Array:

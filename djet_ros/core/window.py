@@ -41,9 +41,10 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.jet import Loss
+from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import expect, Expected
+from djet_ros.core.patches import expect, Expected, Placed
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
@@ -94,8 +95,6 @@ class WindowTuning:
     known: float = 0.15
     # pixels; chosen: what right matches are off, where surfaces are fitted to them
     off: float = 0.1
-    # pixels; chosen: what surfaces and gray levels are apart that tell the same place
-    agree: float = 0.5
     # chosen: inverse depth, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length
@@ -365,7 +364,8 @@ class Window:
             close, here.tested.shape, CLOSE // 2)
         mine = mine[good]
         mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
-        self._take(mine, fits, self._exactly(mine, warps[mine], fits.minima()))
+        if len(mine):
+            self._take(mine, fits, self._placed(mine, warps[mine], fits.minima()))
 
     def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
                 ) -> tuple[NDArray[np.int64], Paraboloids]:
@@ -392,28 +392,20 @@ class Window:
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 
-    def _exactly(self, mine: NDArray[np.int64], warps: Array, minima: Array) -> Array:
-        """
-        Join the minima (M, 2) of surfaces with where gray levels have landmarks (M,).
-
-        Both are about as exact as one another. What they do not agree on is left to the surface.
-        Landmarks come ordered by their anchors.
-        """
-        if not len(mine):
-            return minima
+    def _placed(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
+        """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
         anchors, found = self._landmarks.anchors[mine], self._landmarks.found[mine]
         expected = Expected.together([
             expect(self._views[anchor].gray_levels, found[some], warps[some])
             for anchor in np.unique(anchors) for some in (anchors == anchor,)])
-        apart = expected.place(self._views[-1].gray, minima).places - minima
-        agree = (apart**2).sum(1) < self._tuning.agree**2
-        return np.asarray(minima + np.where(agree[:, None], apart / 2, 0.0))
+        return expected.place(self._views[-1].gray, places)
 
-    def _take(self, mine: NDArray[np.int64], fits: Paraboloids, places: Array) -> None:
-        """Take places (M, 2) as observations, and the curvatures of paraboloids as weights."""
+    def _take(self, mine: NDArray[np.int64], fits: Paraboloids, placed: Placed) -> None:
+        """Take as observations where surfaces and gray levels have landmarks (M,) together."""
+        minima = fits.minima()
         # As in any least squares, what the best fit leaves over tells the noise.
-        left = np.maximum(fits.values(fits.minima()), 1e-3)
-        spread = fits.inverses * left[:, None, None]
+        left = np.maximum(fits.values(minima), 1e-3)
+        places, spread = joined_places(minima, fits.inverses * left[:, None, None], placed)
         self._landmarks.minima[mine, -1] = places
         self._landmarks.roots[mine, -1] = np.linalg.cholesky(
             np.linalg.inv(spread)).transpose(0, 2, 1)
