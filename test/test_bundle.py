@@ -9,6 +9,7 @@ from djet_ros.core.bundle import (
     Landmarks,
     noise_scale,
     observe,
+    PosePrior,
     Poses,
     projected,
 )
@@ -161,3 +162,14 @@ def test_noise_is_told_whatever_landmarks_make_up_for(frames):
         reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, frames)
         landmarks = landmarks.moved(reduced.change(np.zeros(6 * frames)))
     assert noise_scale(observe(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)
+
+
+def test_the_slope_of_a_prior_is_that_of_its_cost():
+    rng = np.random.default_rng(7)
+    half = rng.normal(size=(12, 12))
+    since = Poses(rotation_exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
+    prior = PosePrior(half @ half.T, rng.normal(size=12), since)
+    poses = since.moved(1e-4 * rng.normal(size=12))
+    told = [(prior.cost(poses.moved(step)) - prior.cost(poses.moved(-step))) / 2e-6
+            for step in 1e-6 * np.eye(12)]
+    assert told == pytest.approx(prior.gradient(poses), abs=1e-2)

@@ -346,6 +346,18 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
     assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
+    """It turns by 15 degrees a frame, so that landmarks are gone after a few."""
+    scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
+    poses = scene.trajectory(36)
+    told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
+            for i, pose in enumerate(poses)][1:]
+    lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
+    ratios = lengths / ways
+    assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.5)
+
+
 @pytest.mark.parametrize('frames_per_second', [10, 30])
 @pytest.mark.parametrize('size', [0.1, 0.025])
 def test_a_slow_camera_is_metric_however_fast_its_frames_come(cards, size, frames_per_second):

@@ -93,6 +93,11 @@ class PosePrior:
         """Hold a first pose where it is."""
         return cls(np.eye(6) * _HELD, np.zeros(6), pose)
 
+    def cost(self, poses: Poses) -> float:
+        """Tell what some poses cost."""
+        step = poses.step_from(self.since)
+        return float(step @ (self.H @ step / 2 + self.g))
+
     def gradient(self, poses: Poses) -> Array:
         """Slope (6 F,) of that at some poses."""
         return np.asarray(self.g + self.H @ poses.step_from(self.since))

@@ -42,6 +42,10 @@ _LEAST_SLOPE = 1e-3
 # Square gray levels: two images are rounded to whole ones.
 _LEAST_NOISE = 2 / 12
 
+# Pixels; chosen: what interpolation between pixels and the shape of a warp err, however sharp a
+# patch is. Landmarks, which are looked at many times, would be taken for far surer than they are.
+_LEAST_ERROR = 0.01
+
 # What is fitted to a patch: its place, brightness and contrast.
 _FITTED = 4
 
@@ -123,7 +127,8 @@ class Expected(NamedTuple):
             places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
         near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
         noise = seen.noise(np.where(near[:, None], places, began))
-        return Placed(np.where(near[:, None], places, y), noise[:, None, None] * self.inverses)
+        return Placed(np.where(near[:, None], places, y),
+                      noise[:, None, None] * self.inverses + _LEAST_ERROR**2 * np.eye(2))
 
 
 class _Seen:

@@ -78,9 +78,8 @@ class WindowTuning:
     classes: float = 2.0
     # chosen: Gauss-Newton steps for each frame; four come to the same
     steps: int = 2
-    # chosen: factor on the noise that a step must not reach, and how often it is halved: where
-    # the camera hardly moved, depths are told so badly that a full one may lead anywhere
-    astray: float = 1.5
+    # chosen: how often a step that would cost more is halved: where the camera hardly moved, or
+    # turned by much, depths are told so badly that a full one may lead anywhere
     halvings: int = 6
     # robust standard deviations beyond which an observation is false, and where the loss bends
     outlier: float = 4.0
@@ -419,23 +418,32 @@ class Window:
             reduced = self._reduced(observed)
             H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            observed = self._moved(step, reduced.change(step))
+            observed = self._moved(observed, step, reduced.change(step))
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
         return H
 
-    def _moved(self, step: Array, change: Array) -> Observed:
-        """Go a step of the poses and its change of the landmarks, or as little as does no harm."""
+    def _moved(self, observed: Observed, step: Array, change: Array) -> Observed:
+        """Go a step of the poses and its change of the landmarks, or as much as costs no more."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
+        cost = self._cost(observed, scale)
         for _ in range(self._tuning.halvings + 1):
             self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
-            observed = self._observed()
-            if self._scale < self._tuning.astray * scale:
-                break
+            moved = self._observed()
+            if self._cost(moved, scale) <= cost:
+                return moved
             step, change = step / 2, change / 2
-        return observed
+        self._poses, self._landmarks = poses, landmarks
+        return self._observed()
+
+    def _cost(self, observed: Observed, scale: float) -> float:
+        """Tell what observations of a noise, robustly, and the prior cost together."""
+        losses, _ = Loss('geman_mcclure', self._tuning.bend * scale)(
+            (observed.residuals**2).sum(1))
+        squares = losses.sum() + (observed.off**2).sum()
+        return float(squares / (2 * scale**2) + self._prior.cost(self._poses))
 
     def _equalise(self) -> None:
         """Scale the roots in the newest frame so that a typical one is of a pixel."""
