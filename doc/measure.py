@@ -43,7 +43,6 @@ from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
 from djet_ros.lab.summary import common_errors
-from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.outputs import write_whole
@@ -359,7 +358,7 @@ def tracked(dataset: Dataset) -> Iterator[Outcome]:
     assert sequence.poses is not None  # datasets without poses are refused
     stamps = sequence.stamps_ns
     for index in dataset.frames:
-        result = tracker.process(Frame(sequence.image(index), sequence.K, int(stamps[index])))
+        result = tracker.process(sequence.frame(index))
         if result.previous_stamp_ns is None or result.relative is None:
             continue
         previous = sequence.poses[np.searchsorted(stamps, result.previous_stamp_ns)]

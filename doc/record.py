@@ -40,7 +40,6 @@ from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import open_datasets, opened, Selection
 from djet_ros.live.graph_face import GraphFace
 from djet_ros.live.middleware import Profile
-from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.visual_odometry import VisualOdometry
 from djet_ros.posegraph.backend import optimise
@@ -303,8 +302,7 @@ def lengths(folder: Path, frames: int | None) -> Array:
     assert sequence.poses is not None
     odometry = VisualOdometry(odometry=OdometryConfig(scale='camera_height', camera_height=HEIGHT))
     for index in dataset.frames:
-        result = odometry.process(Frame(sequence.image(index), sequence.K,
-                                        int(sequence.stamps_ns[index])))
+        result = odometry.process(sequence.frame(index))
         way = result.motion[:3, 3]
         length = float(np.linalg.norm(way))
         if not length or not result.scale_known or result.previous_stamp_ns is None:

@@ -41,14 +41,15 @@ Matcher = Callable[[NDArray[np.uint8], NDArray[np.uint8]],
 def by_chain(name: str, pair: ScenePair) -> RelativePose:
     """Estimate a rendered pair."""
     chain = CHAINS[name]
-    return chain.estimate(chain.detect(pair.previous), chain.detect(pair.current), pair.K)
+    return chain.estimate(*(chain.detect(gray, None) for gray in (pair.previous, pair.current)),
+                          pair.K)
 
 
 def matched(name: str, previous: NDArray[np.uint8], current: NDArray[np.uint8]
             ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Match two images."""
     chain = CHAINS[name]
-    return chain.match(chain.detect(previous), chain.detect(current))
+    return chain.match(chain.detect(previous, None), chain.detect(current, None))
 
 
 @pytest.fixture(scope='module')
@@ -130,7 +131,7 @@ def test_a_corner_that_does_not_come_back_is_dropped(street: ScenePair) -> None:
 def test_an_image_without_points_is_told_and_nothing_raises(
         name: str, gray: NDArray[np.uint8]) -> None:
     chain = CHAINS[name]
-    found = chain.estimate(chain.detect(gray), chain.detect(gray), np.diag([100.0, 100, 1]))
+    found = chain.estimate(*[chain.detect(gray, None)] * 2, np.diag([100.0, 100, 1]))
     assert found.status is not Status.OK or found.inliers.any()
     blank = chain.estimate(chain.detect(np.zeros_like(gray)), chain.detect(gray), np.eye(3))
     assert blank.status is Status.TOO_FEW_MATCHES

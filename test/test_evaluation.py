@@ -17,7 +17,9 @@ import sys
 from time import monotonic, sleep
 
 import cv2
+from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig, preset
+from djet_ros.core.masks import blocked
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods
@@ -27,11 +29,13 @@ from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.methods import default_methods, Method, TITLES
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
 from djet_ros.lab.scenes import render_sequence
-from djet_ros.lab.sequences import Dataset, open_datasets, Selection
+from djet_ros.lab.sequences import Dataset, open_datasets, readable_frames, Selection
 from djet_ros.lab.store import RecordStore
 from djet_ros.lab.summary import table_rows
 from djet_ros.lab.tables import results_table
+from djet_ros.odometry.camera import Camera
 from djet_ros.recordings.bag_writers import write_kitti_bag
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.drift import drift
@@ -286,6 +290,24 @@ def torn_truth(road: Path, folder: Path) -> Path:
 
 
 # Sources
+
+def test_no_method_has_features_where_the_lens_shows_nothing(road, tmp_path):
+    """Neither in files nor in what is taken out of a bag."""
+    D, rendered = [0.3, 0.1, 0.0, 0.0, 0.0], KittiSequence(road, end=3)
+    files = FrameSequence('lens', ImageFiles(rendered.frame_paths), rendered.K,
+                          rendered.stamps_ns, None, D)
+    write_kitti_bag(files, tmp_path / 'bag')
+    bag = readable_frames(tmp_path / 'bag', tmp_path)
+    unseen = Camera(files.K, np.array(D), files.size).unseen(files.size[::-1])
+    assert unseen is not None and unseen.mean() > 0.1
+    for frame in (files.frame(1), bag.frame(1)):
+        assert np.array_equal(frame.left_out, unseen)
+        views = (frame.view(TwoViewEstimator()).features.points,
+                 *(chain.detect(frame.gray, blocked(unseen)).places for chain in CHAINS.values()))
+        for points in views:
+            x, y = points.round().astype(int).T
+            assert len(points) > 50 and not unseen[y, x].any()
+
 
 @pytest.mark.slow
 def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path):

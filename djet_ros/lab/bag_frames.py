@@ -28,6 +28,12 @@ class ExtractedSequence(FrameSequence):
             poses: Array = index['poses']
             super().__init__(folder.name, images, index['K'], index['stamps_ns'],
                              poses if len(poses) else None)
+            unseen = index['unseen']
+        self._left_out: NDArray[np.bool_] | None = unseen if unseen.size else None
+
+    def _unseen(self) -> NDArray[np.bool_] | None:
+        """Give what the images in the bag did not show, before they were rectified."""
+        return self._left_out
 
 
 def is_extracted(folder: Path) -> bool:
@@ -59,7 +65,9 @@ def extract(recording: BagRecording, folder: Path) -> Path:
         raise DjetError(f'{recording.bag.path} has no image after its first CameraInfo')
     stamps_ns = np.array(stamps, np.int64)
     poses = truth.at(stamps_ns) if len(truth) else np.empty((0, 4, 4))
-    np.savez(folder / _INDEX, K=camera.K, stamps_ns=stamps_ns, poses=poses)
+    unseen = camera.unseen(image.shape)
+    np.savez(folder / _INDEX, K=camera.K, stamps_ns=stamps_ns, poses=poses,
+             unseen=np.empty((0, 0), bool) if unseen is None else unseen)
     return folder
 
 

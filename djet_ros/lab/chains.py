@@ -21,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
+from djet_ros.core.masks import Mask
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.peers import as_relative_pose, poselib
 import numpy as np
@@ -51,7 +52,7 @@ class Points:
 class Chain:
     """How points are found in an image, and matches x, y (N, 2) in pixels between two of them."""
 
-    detect: Callable[[Image], Points]
+    detect: Callable[[Image, Mask | None], Points]
     match: Callable[[Points, Points], tuple[Array, Array]]
 
     def estimate(self, previous: Points, current: Points, K: Array) -> RelativePose:
@@ -62,14 +63,16 @@ class Chain:
         return as_relative_pose(poselib(K, x, y, _THRESHOLD), K, x, y)
 
 
-def root_sift(gray: Image) -> Points:
+def root_sift(gray: Image, mask: Mask | None = None) -> Points:
     """
     Find the 2000 strongest SIFT points; descriptors are roots of SIFT's, scaled to a sum of 1.
+
+    mask: (H, W) bool, where no point may be.
 
     R. Arandjelovic, A. Zisserman, "Three things everyone should know to improve object
     retrieval", CVPR 2012: distances of roots compare histograms by Hellinger's kernel.
     """
-    keypoints, descriptors = cv2.SIFT.create(_POINTS).detectAndCompute(gray, None)
+    keypoints, descriptors = cv2.SIFT.create(_POINTS).detectAndCompute(gray, _allowed(mask))
     if descriptors is None:
         return Points(gray, np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.float32(1e-9))
@@ -91,9 +94,9 @@ def mutual_neighbours(previous: Points, current: Points) -> tuple[Array, Array]:
             current.places[nearest[kept]].astype(np.float64))
 
 
-def corners(gray: Image) -> Points:
-    """Find up to 2000 corners by Shi and Tomasi that are at least 8 pixels apart."""
-    found = cv2.goodFeaturesToTrack(gray, _POINTS, _QUALITY, _APART)
+def corners(gray: Image, mask: Mask | None = None) -> Points:
+    """Find up to 2000 corners by Shi and Tomasi at least 8 pixels apart, outside a mask (H, W)."""
+    found = cv2.goodFeaturesToTrack(gray, _POINTS, _QUALITY, _APART, mask=_allowed(mask))
     places = np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
     return Points(gray, places, np.empty((len(places), 0), np.float32))
 
@@ -114,6 +117,11 @@ def _flow(before: Image, after: Image, places: NDArray[np.float32]
     found, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, places[:, None], np.empty(0),
                                               winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS)
     return np.asarray(found, np.float32).reshape(-1, 2), seen.ravel() > 0
+
+
+def _allowed(mask: Mask | None) -> Image | None:
+    """Say as OpenCV does where points may be."""
+    return None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
 
 
 CHAINS: dict[str, Chain] = {'sift_poselib': Chain(root_sift, mutual_neighbours),

@@ -58,10 +58,10 @@ def closures(sequence: FrameSequence, methods: Sequence[str], frames: int,
     found: dict[str, list[Triangle | None]] = {name: [] for name in methods}
     # All methods see the same features: detection has no parameter of theirs.
     detector = estimators[methods[0]]
-    a, b = (detector.view(sequence.image(i), sequence.K) for i in (0, 1))
+    a, b = (sequence.frame(i).view(detector) for i in (0, 1))
     before = {name: one.estimate(a, b) for name, one in estimators.items()}
     for first in range(frames - 2):
-        c = detector.view(sequence.image(first + 2), sequence.K)
+        c = sequence.frame(first + 2).view(detector)
         for name, one in estimators.items():
             after = one.estimate(b, c, before[name])
             across = one.estimate(a, c, before[name])

@@ -21,7 +21,6 @@ from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.lab.sequences import Dataset, opened, plain_name
-from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 from djet_ros.replay.pair_errors import angles_off
 import numpy as np
@@ -130,8 +129,8 @@ def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
     estimator = TwoViewEstimator(config)
     previous = None
     for pair in range(chunk.first, chunk.first + chunk.count):
-        previous = previous or estimator.view(sequence.image(frames[pair]), sequence.K)
-        current = estimator.view(sequence.image(frames[pair + 1]), sequence.K)
+        previous = previous or sequence.frame(frames[pair]).view(estimator)
+        current = sequence.frame(frames[pair + 1]).view(estimator)
         pose = estimator.estimate(previous, current)
         yield from _covered(chunk, ALONE, frames[pair], frames[pair + 1], pose)
         previous = current
@@ -142,7 +141,7 @@ def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
     odometry, stamps = VisualOdometry(config), sequence.stamps_ns
     for number in range(max(chunk.first - _LEAD, 0), chunk.first + chunk.count + 1):
         current = frames[number]
-        result = odometry.process(Frame(sequence.image(current), sequence.K, int(stamps[current])))
+        result = odometry.process(sequence.frame(current))
         if number > chunk.first and result.relative and result.previous_stamp_ns is not None:
             previous = int(np.searchsorted(stamps, result.previous_stamp_ns))
             yield from _covered(chunk, IN_A_ROW, previous, current, result.relative)

@@ -12,11 +12,13 @@ import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.hamming import match_distances, smooth
+from djet_ros.core.masks import blocked
 from djet_ros.core.types import Array, Features, RelativePose, Status, View
 from djet_ros.lab import peers
 from djet_ros.lab.chains import CHAINS, Points
 from djet_ros.lab.methods import Method
 from djet_ros.lab.sequences import Dataset, opened
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import camera_motion
 from djet_ros.replay.pair_errors import has_direction, motion_errors
 import numpy as np
@@ -88,8 +90,8 @@ def evaluate_chunk(chunk: PairChunk, methods: Sequence[Method]) -> list[PairReco
     records: list[PairRecord] = []
     current: _Image | None = None
     for pair in range(chunk.first, chunk.first + chunk.count):
-        previous = current or _Image(sequence.image(frames[pair]), sequence.K)
-        current = _Image(sequence.image(frames[pair + 1]), sequence.K)
+        previous = current or _Image(sequence.frame(frames[pair]))
+        current = _Image(sequence.frame(frames[pair + 1]))
         true_motion = (np.linalg.inv(sequence.poses[frames[pair]])
                        @ sequence.poses[frames[pair + 1]])
         if np.isfinite(true_motion).all():
@@ -135,8 +137,10 @@ class _Image:
     Each is made once for all methods whose settings decide the same about it.
     """
 
-    def __init__(self, gray: NDArray[np.uint8], K: Array) -> None:
-        self._gray, self.K = gray, K
+    def __init__(self, frame: Frame) -> None:
+        self._gray, self.K, self._left_out = frame.gray, frame.K, frame.left_out
+        # The same for all methods: where none may have a feature.
+        self._mask = None if frame.left_out is None else blocked(frame.left_out)
         self._features: dict[Any, tuple[Features, float]] = {}
         self._views: dict[Any, tuple[View, float]] = {}
         self._points: dict[str, tuple[Points, float]] = {}
@@ -151,7 +155,7 @@ class _Image:
         if key not in self._views:
             features, seconds = self._found(detected, TwoViewEstimator(config))
             start = perf_counter()
-            view = TwoViewEstimator(config).view(self._gray, self.K, features)
+            view = TwoViewEstimator(config).view(self._gray, self.K, features, self._left_out)
             self._views[key] = view, seconds + perf_counter() - start
         return self._views[key]
 
@@ -159,7 +163,7 @@ class _Image:
         """Give the features of these settings of the detector, and their seconds."""
         if detected not in self._features:
             start = perf_counter()
-            features = estimator.features(self._gray)
+            features = estimator.features(self._gray, self._mask)
             self._features[detected] = features, perf_counter() - start
         return self._features[detected]
 
@@ -167,7 +171,7 @@ class _Image:
         """Give the points of a chain of that name, and the seconds that they took."""
         if method not in self._points:
             start = perf_counter()
-            points = CHAINS[method].detect(self._gray)
+            points = CHAINS[method].detect(self._gray, self._mask)
             self._points[method] = points, perf_counter() - start
         return self._points[method]
 

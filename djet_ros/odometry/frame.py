@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from djet_ros.core.types import Array, Status
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.types import Array, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,10 @@ class Frame:
     stamp_ns: int
     frame_id: str = 'camera'
     left_out: NDArray[np.bool_] | None = None
+
+    def view(self, estimator: TwoViewEstimator) -> View:
+        """Prepare it for an estimator, without what is left out."""
+        return estimator.view(self.gray, self.K, left_out=self.left_out)
 
 
 def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:

@@ -218,7 +218,7 @@ class VisualOdometry:
         return result
 
     def _seen(self, frame: Frame) -> View:
-        return self._estimator.view(frame.gray, frame.K, left_out=frame.left_out)
+        return frame.view(self._estimator)
 
     def _waits(self, relative: RelativePose) -> bool:
         """Tell whether the reference stays until a pair with it tells the way."""

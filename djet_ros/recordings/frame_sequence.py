@@ -10,6 +10,7 @@ from typing import Any
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, check_lens
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, narrowed
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
 from djet_ros.recordings.imu import ImuTrack
@@ -64,6 +65,15 @@ class FrameSequence:
     def image(self, index: int) -> NDArray[np.uint8]:
         """Gray pixels (H, W) of a frame without its distortion."""
         return self._camera.undistort(self._images.gray(index))
+
+    def frame(self, index: int) -> Frame:
+        """Give a frame as an odometry takes it, from which is left out what no image shows."""
+        return Frame(self.image(index), self.K, int(self.stamps_ns[index]),
+                     left_out=self._unseen())
+
+    def _unseen(self) -> NDArray[np.bool_] | None:
+        """(H, W) bool, pixels without distortion that the files do not show, or None."""
+        return self._camera.unseen(self.size[::-1])
 
 
 def from_first(poses: Array) -> Array | None:
