@@ -1,5 +1,5 @@
 """
-Corners of several sizes, well spread over the image, each with a descriptor.
+Corners of three sizes, well spread over the image, each with a descriptor.
 
 A corner is a place around which gradients vary in all directions: the smaller eigenvalue of their
 second moments is large (Shi and Tomasi, "Good Features to Track", CVPR 1994). Where it is small
