@@ -434,6 +434,26 @@ def cpu_seconds(process: int) -> float:
 
 
 # Each has work for many seconds in its first chunks.
+UNHEARD = """
+from concurrent.futures import Future
+from signal import pthread_kill, SIGINT
+from threading import get_ident, Timer
+from djet_ros.lab.runner import _as_they_end
+
+Timer(0.5, lambda: pthread_kill(get_ident(), SIGINT)).start()
+try:
+    list(_as_they_end([Future()]))
+except KeyboardInterrupt:
+    print('heard')
+"""
+
+
+def test_ctrl_c_is_heard_whichever_thread_the_system_gives_it_to():
+    answer = subprocess.run([sys.executable, '-c', UNHEARD], capture_output=True, text=True,
+                            timeout=60)
+    assert answer.stdout == 'heard\n', answer.stderr
+
+
 LONG = {'evaluate': ('ROAD',), 'coverage': ('--scenes', 'road', '--frames', '200'),
         'lengths': ()}
 

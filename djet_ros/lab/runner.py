@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed, BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
 from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -20,6 +27,9 @@ from djet_ros.lab.store import in_order, RecordStore
 
 # Few enough that a broken run loses little, enough that features of the first frame don't count.
 PAIRS_PER_CHUNK = 5
+
+# For which Ctrl-C may go unheard.
+_SECONDS_UNHEARD = 1.0
 
 
 class Chunk(Protocol):
@@ -58,7 +68,7 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
     progress(done, total)
     futures = {executor.submit(work, chunk): chunk for chunk in missing}
     try:
-        for future in as_completed(futures):
+        for future in _as_they_end(futures):
             chunk = futures[future]
             store.add(chunk.name, future.result())
             done += chunk.count
@@ -69,6 +79,19 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
     finally:
         _keep_finished(futures, store)
     return in_order(store, (chunk.name for chunk in chunks))
+
+
+def _as_they_end(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
+    """
+    Give futures as they end.
+
+    The system may hand Ctrl-C to any thread, and does not wake the first one for it: it has to
+    wake by itself to hear of it.
+    """
+    left = set(futures)
+    while left:
+        ended, left = wait(left, _SECONDS_UNHEARD, FIRST_COMPLETED)
+        yield from ended
 
 
 def _keep_finished(futures: dict[Future[list[R]], C], store: RecordStore[R]) -> None:
