@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 
 from djet_ros.core.geometry import fundamental, rotation_angle
 from djet_ros.core.jet import (
@@ -17,10 +18,11 @@ from djet_ros.core.joining import joined_places, with_places
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import Placed
 from djet_ros.core.surfaces import ReprojectionSurface
+from djet_ros.core.types import Pose
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_view import K, two_views
+from two_view import K, two_views, TwoViews
 
 # By what a surface counts as less exact than it is, because gray levels see the same pixels.
 TOGETHER = 2.0
@@ -48,6 +50,17 @@ def alike(places: np.ndarray) -> Placed:
 def at(problem: JetProblem, R: np.ndarray, t: np.ndarray) -> Solution:
     """Take a pose as the solution of a problem."""
     return Solution(R, t, epipolar_residuals(problem, R, t))
+
+
+def rotation_errors(poses: Callable[[np.random.Generator, TwoViews], Iterable[Pose]],
+                    seeds: int, count: int) -> np.ndarray:
+    """Root mean square errors (P,) of the rotations of P poses, in rad, over random views."""
+    errors = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        views = two_views(rng, count)
+        errors.append([rotation_angle(views.R, pose.R) for pose in poses(rng, views)])
+    return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
 def test_two_measurements_of_a_place_are_joined_as_gaussians_are() -> None:
@@ -85,41 +98,32 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are() -> None:
 @pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
 def test_a_pose_of_surfaces_and_places_is_about_as_exact_as_that_of_the_better(sigma: float
                                                                                ) -> None:
-    errors = []
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        views = two_views(rng, 150)
-        x, y, R, t = views.x, views.y, views.R, views.t
-        y_star, S = ellipses(rng, y, 0.3)
-        found = y + rng.normal(0, sigma, y.shape)
-        problems = [jet_problem(K, x, surfaces(y_star, S)),
-                    jet_problem(K, x, ReprojectionSurface(x, found).around(found))]
-        solutions = [minimise(problem, R, t, Loss()) for problem in problems]
-        poses = [solution.pose for solution in solutions]
+    def poses(rng: np.random.Generator, views: TwoViews) -> list[Pose]:
+        y_star, S = ellipses(rng, views.y, 0.3)
+        found = views.y + rng.normal(0, sigma, views.y.shape)
+        problems = [jet_problem(K, views.x, surfaces(y_star, S)),
+                    jet_problem(K, views.x, ReprojectionSurface(views.x, found).around(found))]
+        solutions = [minimise(problem, views.R, views.t, Loss()) for problem in problems]
         joined = with_places(problems[0], solutions[0], K, alike(found))
-        poses.append(minimise(joined, R, t, Loss()).pose)
-        errors.append([rotation_angle(R, pose.R) for pose in poses])
-    surface, place, both = np.sqrt(np.mean(np.square(errors), axis=0))
+        return [one.pose for one in (*solutions, minimise(joined, views.R, views.t, Loss()))]
+
+    surface, place, both = rotation_errors(poses, 30, 150)
     assert both < 1.1 * min(surface, place)
 
 
 def test_sharp_places_count_for_more() -> None:
     """Where one half of the matches is ten times as exact, the pose is that of this half."""
-    errors = []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        views = two_views(rng, 200)
-        x, y, R, t = views.x, views.y, views.R, views.t
+    def poses(rng: np.random.Generator, views: TwoViews) -> list[Pose]:
         sigma = np.where(np.arange(200) % 2, 0.05, 0.5)
-        y_star, S = ellipses(rng, y, 0.5)
-        found = y + sigma[:, None] * rng.normal(size=y.shape)
-        alone = jet_problem(K, x, surfaces(y_star, S))
-        start = minimise(alone, R, t, Loss())
+        y_star, S = ellipses(rng, views.y, 0.5)
+        found = views.y + sigma[:, None] * rng.normal(size=views.y.shape)
+        alone = jet_problem(K, views.x, surfaces(y_star, S))
+        start = minimise(alone, views.R, views.t, Loss())
         told = Placed(found, sigma[:, None, None]**2 * np.eye(2))
-        poses = [minimise(with_places(alone, start, K, placed), R, t, Loss()).pose
-                 for placed in (told, alike(found))]
-        errors.append([rotation_angle(R, pose.R) for pose in poses])
-    weighed, unweighed = np.sqrt(np.mean(np.square(errors), axis=0))
+        return [minimise(with_places(alone, start, K, placed), views.R, views.t, Loss()).pose
+                for placed in (told, alike(found))]
+
+    weighed, unweighed = rotation_errors(poses, 20, 200)
     assert weighed < 0.5 * unweighed
 
 
@@ -137,23 +141,18 @@ def test_places_that_agree_count_for_more_where_matches_differ_in_noise() -> Non
 
 
 def test_what_was_found_elsewhere_moves_the_pose_little() -> None:
-    errors = []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        views = two_views(rng, 400)
-        x, y, R, t = views.x, views.y, views.R, views.t
-        y_star, S = ellipses(rng, y, 0.2)
-        found = y + rng.normal(0, 0.2, y.shape)
-        elsewhere = np.where(np.arange(400) % 10, 0, 3)[:, None] * rng.normal(size=y.shape)
-        alone = jet_problem(K, x, surfaces(y_star, S))
-        start = minimise(alone, R, t, Loss('geman_mcclure', 0.6))
-        poses = []
+    def poses(rng: np.random.Generator, views: TwoViews) -> Iterator[Pose]:
+        y_star, S = ellipses(rng, views.y, 0.2)
+        found = views.y + rng.normal(0, 0.2, views.y.shape)
+        elsewhere = np.where(np.arange(400) % 10, 0, 3)[:, None] * rng.normal(size=found.shape)
+        alone = jet_problem(K, views.x, surfaces(y_star, S))
+        start = minimise(alone, views.R, views.t, Loss('geman_mcclure', 0.6))
         for places in (found, found + elsewhere):
             joined = with_places(alone, start, K, alike(places))
             scale = 3 * core_scale(epipolar_residuals(joined, start.R, start.t).r)
-            poses.append(minimise(joined, start.R, start.t, Loss('geman_mcclure', scale)).pose)
-        errors.append([rotation_angle(R, pose.R) for pose in poses])
-    right, some_wrong = np.sqrt(np.mean(np.square(errors), axis=0))
+            yield minimise(joined, start.R, start.t, Loss('geman_mcclure', scale)).pose
+
+    right, some_wrong = rotation_errors(poses, 20, 400)
     assert some_wrong < 1.3 * right
 
 

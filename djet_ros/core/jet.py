@@ -144,17 +144,21 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     distance from the epipole, in pixels, within which lines are not trusted; 0 is as printed.
     by_fit: take the variance of a match to be in proportion to what is left at its minimum.
     """
-    minima, S = paraboloids.minima(), paraboloids.inverses
-    spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
-    if by_fit and len(S):
+    minima, spread = paraboloids.minima(), entries(paraboloids.inverses)
+    if by_fit and len(minima):
         spread *= _left_over(paraboloids, minima)
     widths = np.abs(spread[0] + spread[2]) / 2
-    spread /= max(median(widths), 1e-12) if len(S) else 1.0
+    spread /= max(median(widths), 1e-12) if len(minima) else 1.0
     spread = spread_of_rays(K, spread)
     # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
     pixel = np.linalg.det(inverse_of(K)[:2, :2])
     blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
     return JetProblem(rays(K, x).T.copy(), rays(K, minima).T.copy(), spread, blur)
+
+
+def entries(S: Array) -> Array:
+    """Give the entries 11, 12, 22 (3, N) of symmetric matrices (N, 2, 2)."""
+    return np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
 
 
 def spread_of_rays(K: Array, spread: Array) -> Array:

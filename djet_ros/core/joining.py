@@ -14,6 +14,7 @@ from dataclasses import replace
 from djet_ros.core.geometry import inverse_of, rays
 from djet_ros.core.jet import (
     core_scale,
+    entries,
     epipolar_residuals,
     JetProblem,
     Solution,
@@ -46,9 +47,9 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     itself: at the edge of what is near, they see different things. See `_noise_of_each`. What has
     no minimum stays as it is.
     """
-    (a, b), (_, c) = placed.covariances.T
-    found = replace(problem, rays_y=rays(K, placed.places).T.copy(), blur=np.zeros(len(a)),
-                    spread=spread_of_rays(K, np.stack([a, b, c])))
+    found = replace(problem, rays_y=rays(K, placed.places).T.copy(),
+                    spread=spread_of_rays(K, entries(placed.covariances)),
+                    blur=np.zeros(len(placed.places)))
     off = epipolar_residuals(found, solution.R, solution.t).r
     S, T = (core_scale(r)**2 * measured.spread
             for measured, r in ((problem, solution.residuals.r), (found, off)))
@@ -93,8 +94,7 @@ def joined_places(minima: Array, spread: Array, placed: Placed) -> tuple[Array, 
     Minima are not taken for more exact than gray levels. Gives the places (N, 2) and their
     covariances (N, 2, 2) in square pixels.
     """
-    S, T = (covariances[:, [0, 0, 1], [0, 1, 1]].T for covariances in (
-        spread, _PLACED * placed.covariances))
+    S, T = entries(spread), _PLACED * entries(placed.covariances)
     apart = (placed.places - minima).T
     if len(minima):
         squared = (apart * _times(_inverse(S), apart)).sum(0)

@@ -145,13 +145,12 @@ class _Seen:
 
     def noise(self, places: Array) -> Array:
         """Variances (N,) of a pixel: what is left of patches around places (N, 2), once fitted."""
-        _, _, gray, contrasts = self._expected
-        parts = self._parts(places)
+        gray, parts = self._expected.gray, self._parts(places)
         patches = _between(_at_four(self._patches), parts.astype(np.float32))
         patches -= patches.mean((0, 1))
         patches = patches.reshape(gray.shape)
         left = (np.einsum('pn,pn->n', patches, patches)
-                - np.einsum('pn,pn->n', patches, gray)**2 / contrasts)
+                - np.einsum('pn,pn->n', patches, gray)**2 / self._expected.contrasts)
         return np.asarray(np.maximum(left / (len(gray) - _FITTED), _LEAST_NOISE))
 
     def _parts(self, places: Array) -> Array:

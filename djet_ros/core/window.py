@@ -435,15 +435,18 @@ class Window:
             if self._cost(moved, scale) <= cost:
                 return moved
             step, change = step / 2, change / 2
-        self._poses, self._landmarks = poses, landmarks
-        return self._observed()
+        self._poses, self._landmarks, self._scale = poses, landmarks, scale
+        return observed
 
     def _cost(self, observed: Observed, scale: float) -> float:
         """Tell what observations of a noise, robustly, and the prior cost together."""
-        losses, _ = Loss('geman_mcclure', self._tuning.bend * scale)(
-            (observed.residuals**2).sum(1))
+        losses, _ = self._robustly(observed, scale)
         squares = losses.sum() + (observed.off**2).sum()
         return float(squares / (2 * scale**2) + self._prior.cost(self._poses))
+
+    def _robustly(self, observed: Observed, scale: float) -> tuple[Array, Array]:
+        """Losses (M,) of observations of a noise, and their weights."""
+        return Loss('geman_mcclure', self._tuning.bend * scale)((observed.residuals**2).sum(1))
 
     def _equalise(self) -> None:
         """Scale the roots in the newest frame so that a typical one is of a pixel."""
@@ -465,8 +468,7 @@ class Window:
 
     def _reduced(self, observed: Observed) -> Reduced:
         """Weigh observations robustly, and eliminate the depths."""
-        _, weights = Loss('geman_mcclure', self._tuning.bend * self._scale)(
-            (observed.residuals**2).sum(1))
+        _, weights = self._robustly(observed, self._scale)
         weight = self._scale**-2
         return eliminate(observed, weights * weight, weight, len(self._views))
 

@@ -30,9 +30,8 @@ class Method:
     words, empty if nothing does; good_start: whether the pose of RP-E, preset best, is given as
     one more start, and only the matches that agree with it; on_places: whether matches begin where
     D-JET's gray levels have them, seen through the warps of its pose; weighed: whether these count
-    as exact as gray levels say. Peers take their matches and
-    their RANSAC threshold from config, but for those that are whole chains (see chains), which
-    take nothing.
+    as exact as gray levels say. Peers take their matches and their RANSAC threshold from config,
+    but for those that are whole chains (see chains), which take nothing.
     """
 
     name: str

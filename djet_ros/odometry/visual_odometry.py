@@ -137,7 +137,7 @@ class VisualOdometry:
         self._config = odometry
         self._estimator: TwoViewEstimator = TwoViewEstimator(estimator)
         if another:  # it sees other features, and by other tests
-            self._view = self._seen(self._reference)
+            self._view = self._reference.view(self._estimator)
         self._scale = scale
         anew = self._one_scale.configure(estimator, scale, odometry.scale_uncertainty)
         if anew and self._last is not None:
@@ -178,7 +178,7 @@ class VisualOdometry:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
         # Features are found once: now for the current frame, next time for the reference.
         if view is None:
-            view = self._seen(frame)
+            view = frame.view(self._estimator)
         if status is not Status.OK:
             return self._start(frame, view, status, backwards=bool(
                 last and frame.stamp_ns < last.stamp_ns))
@@ -216,9 +216,6 @@ class VisualOdometry:
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
         return result
-
-    def _seen(self, frame: Frame) -> View:
-        return frame.view(self._estimator)
 
     def _waits(self, relative: RelativePose) -> bool:
         """Tell whether the reference stays until a pair with it tells the way."""

@@ -116,7 +116,7 @@ class Replay:
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
         self._log = _Log()
-        if config.odometry.base_frame and (frame := _frame_of_images(recording)) is not None:
+        if not self._tracker.mounted and (frame := _frame_of_images(recording)) is not None:
             self._mount(frame)
 
     def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
