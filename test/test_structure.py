@@ -1,6 +1,7 @@
 """One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
@@ -200,6 +201,22 @@ def test_without_any_parallax_there_is_no_unit_yet(cards):
     assert drive.go(steps()[:2])[0].scale == pytest.approx(1)
 
 
+def test_a_pair_that_hardly_knows_where_the_camera_went_makes_no_unit(cards):
+    """Its depths would be anything, and all that comes after would be held against them."""
+    estimator, scale = TwoViewEstimator(ESTIMATOR), OneScale()
+    scale.configure(ESTIMATOR, Unmeasured(), 0.05)
+    scale.reset()
+    views = [estimator.view(frame.gray, frame.K) for frame in (
+        cards.frame(0.0, pose(x=0.16 * step), noise=step) for step in range(3))]
+    scale.begin(views[0])
+    sure = [estimator.estimate(*pair) for pair in pairwise(views)]
+    wide = np.diag([0.0, 0.0, 0.0, 0.3, 0.3])**2
+    unsure = replace(sure[0], covariance_5=sure[0].covariance_5 + wide)
+    assert not scale.of_step((0, 10**8), views[1], unsure)[1].known
+    assert scale.is_new
+    assert scale.of_step((10**8, 2 * 10**8), views[2], sure[1])[1].value == pytest.approx(1)
+
+
 def test_a_speed_makes_metres_and_landmarks_carry_them_on_where_it_falls_silent(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
@@ -259,9 +276,8 @@ def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards)
         result, = drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03)])
         here = result.pose[:3, :3] @ drive.odometry.landmarks(settled=True).T
         depths.append((here.T + result.pose[:3, 3])[:, 2] * np.hypot(0.32, 0.03))
-    left = [part for part in depths if len(part)]
-    assert 2 <= len(left) < 20  # not with each frame, but with keyframes
-    off = np.abs(np.concatenate(left)[:, None] / DEPTHS - 1).min(1)
+    left = np.concatenate(depths)
+    off = np.abs(left[:, None] / DEPTHS - 1).min(1)
     assert len(off) > 50
     assert np.median(off) < 0.03
 
@@ -346,16 +362,16 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
     assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)
 
 
-@pytest.mark.parametrize('seed', [0, 1])
+@pytest.mark.parametrize('seed', [1, 4, 6])
 def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
-    """It turns by 15 degrees a frame, so that landmarks are gone after a few."""
+    """It turns by 15 degrees a frame: landmarks are gone after a few, at times all at once."""
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
     poses = scene.trajectory(36)
     told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
             for i, pose in enumerate(poses)][1:]
     lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
     ratios = lengths / ways
-    assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.5)
+    assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.1)
 
 
 @pytest.mark.parametrize('frames_per_second', [10, 30])

@@ -9,7 +9,9 @@ landmark say (`core.slants`): were all taken to face the camera, a road's places
 to half a pixel, alike in all.
 `djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
 what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
-al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015).
+al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015). So does
+one between keyframes, with those that it was the last to see: where the camera turns by much, they
+alone may tell how long the steps before and after it are.
 """
 
 from __future__ import annotations
@@ -98,6 +100,10 @@ class WindowTuning:
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length
     few: int = 8
+    # chosen: shares by which the length of a pair may be off that depths around it tell, and one
+    # that nothing tells; landmarks that are measured in both frames are far surer
+    told: float = 0.02
+    guessed: float = 0.5
 
 
 WINDOW_TUNING = WindowTuning()
@@ -105,8 +111,8 @@ WINDOW_TUNING = WindowTuning()
 # Side in pixels of a patch, by which its landmark is told: points nearer than that err alike.
 _PATCH = 26
 
-# Information that holds the first length where it is: the unit of the track.
-_UNIT = 1e8
+# By which share the first length may be off, which is the unit of the track.
+_EXACT = 1e-4
 
 # Information about the rotation of a pair without parallax, which has no covariance: 1 mrad.
 _ROTATION_ALONE = 1e6
@@ -150,6 +156,8 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
+        # What the newest pair saw in its second frame: pixels (N, 2) and inverse depths (N,).
+        self._latest = np.empty((0, 2)), np.empty(0)
         self.settled = np.empty((0, 3))
 
     @property
@@ -171,9 +179,9 @@ class Window:
         """
         # What the pair says, in a length by depths that the window knows.
         first = self.is_new
-        length = guess if first else self._length(relative, guess)
+        length, share = (guess, _EXACT) if first else self._length(relative, guess)
         self._append(view, relative, length)
-        self._add_pair(relative, length, first)
+        self._add_pair(relative, length, share)
         # Landmarks, old and new, are measured in the frame; then all is refined together.
         if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
             self._found(relative, length)
@@ -183,15 +191,16 @@ class Window:
         if first:  # by definition
             addition = replace(addition, length=length)
         # What is no keyframe goes, and so does the oldest where there are too many.
-        if len(self._views) > 2 and not self._is_keyframe[-2]:
-            self._forget(len(self._views) - 2)
         self.settled = np.empty((0, 3))
+        if len(self._views) > 2 and not self._is_keyframe[-2]:
+            self._settle(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
+            self._forget(len(self._views) - 2)
         if sum(self._is_keyframe) > self._tuning.keyframes:
-            self.settled = self._places(self._landmarks.anchors == 0)
-            self._take_along(0)
+            self._settle(self._landmarks.anchors == 0)
             self._forget(0)
         if relative.t.any():
             self._choose_keyframe()
+        self._latest = self._depths_of(relative, addition.length)
         return addition
 
     def landmarks(self) -> Array:
@@ -205,16 +214,33 @@ class Window:
         places = in_frame(self._K, self._poses, sure, len(self._views) - 1)
         return np.asarray(places / sure.rho[:, None])
 
-    def _length(self, relative: RelativePose, guess: float) -> float:
-        """Length of the pair: a robust mean over landmarks beside which it has a match."""
+    def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
+        """
+        Length of the pair, and by which share it may be off.
+
+        A robust mean over landmarks beside which it has a match; where the camera turned past
+        them, over the matches of the pair before.
+        """
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
         known, match = self._beside(x, self._landmarks.seen[:, -1])
+        if len(known) < self._tuning.few:
+            known, match = self._near(x, *self._latest)
         if not relative.t.any() or len(known) < self._tuning.few:
-            return guess
+            return guess, self._tuning.guessed
         in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x[match]),
                                          rays(self._K, y[match]))
         length = _weighted_median(in_units / known, known / sigma)
-        return length if length > 0 else guess
+        return (length, self._tuning.told) if length > 0 else (guess, self._tuning.guessed)
+
+    def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
+        """Pixels (N, 2) of a pair's inliers in its second frame, and inverse depths (N,) there."""
+        inliers = relative.inliers & relative.t.any()
+        y = relative.y_opt[inliers]
+        rays_x = rays(self._K, relative.x[inliers])
+        rho, _ = inverse_depths(relative.R, relative.t, rays_x, rays(self._K, y))
+        depths = (rays_x @ relative.R.T + rho[:, None] * relative.t)[:, 2]
+        ahead = (rho > 0) & (depths > 0)
+        return y[ahead], rho[ahead] / (depths[ahead] * length)
 
     def _beside(self, x: Array, chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
         """
@@ -223,13 +249,18 @@ class Window:
         Gives inverse depths (M,) there of those that do, and indices (M,) into x.
         """
         before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
-        if not len(before) or not len(x):
-            return np.empty(0), np.empty(0, np.int64)
         places = in_frame(self._K, self._poses, before, len(self._views) - 1)
-        away, match = cKDTree(x).query(projected(self._K, places),
-                                       distance_upper_bound=self._tuning.beside)
-        near = np.isfinite(away) & (places[:, 2] > 0)
-        return (before.rho / places[:, 2])[near], match[near]
+        ahead = places[:, 2] > 0
+        return self._near(x, projected(self._K, places[ahead]),
+                          before.rho[ahead] / places[ahead, 2])
+
+    def _near(self, x: Array, points: Array, rho: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Tell the same of pixels x beside points (P, 2) of some inverse depths (P,)."""
+        if not len(points) or not len(x):
+            return np.empty(0), np.empty(0, np.int64)
+        away, match = cKDTree(x).query(points, distance_upper_bound=self._tuning.beside)
+        near = np.isfinite(away)
+        return rho[near], match[near]
 
     def agreement(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
@@ -288,8 +319,13 @@ class Window:
         self._views.append(view)
         self._landmarks = self._landmarks.with_frame()
 
-    def _add_pair(self, relative: RelativePose, length: float, first: bool) -> None:
-        """Add what all matches of the pair tell of its rotation and direction to the prior."""
+    def _add_pair(self, relative: RelativePose, length: float, share: float) -> None:
+        """
+        Add what all matches of the pair tell of its rotation and direction to the prior.
+
+        And its length, which may be off by a share: where landmarks tell next to nothing of it,
+        it would go wherever a prior drives it that was linearised elsewhere.
+        """
         R, t = relative.R, length * relative.t
         # With steps (omega, upsilon) of the frame before and of the new one, the motion turns by
         # omega_new - R omega_before and shifts by upsilon_new - [t]x omega_new - R upsilon_before.
@@ -298,12 +334,11 @@ class Window:
         J[:3, 6:9], J[3:, 6:9], J[3:, 9:] = np.eye(3), -skew(t), np.eye(3)
         if relative.t.any():
             J_pair = np.concatenate([J[:3], sphere_tangents(relative.t).T @ J[3:] / length])
-            information = J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
+            along = relative.t @ J[3:] / (share * length)
+            information = (J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
+                           + np.outer(along, along))
         else:
             information = J[:3].T @ J[:3] * _ROTATION_ALONE
-        if first:
-            along = relative.t @ J[3:] / length
-            information += _UNIT * np.outer(along, along)
         H = np.zeros_like(self._prior.H)
         H[-12:, -12:] = information
         self._prior.add(H, np.zeros(len(H)), self._poses)
@@ -489,13 +524,14 @@ class Window:
         return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
                         J @ covariance @ J.T)
 
-    def _take_along(self, frame: int) -> None:
-        """Take what the landmarks of a frame tell into the prior, before it goes."""
+    def _settle(self, chosen: NDArray[np.bool_]) -> None:
+        """Take what some landmarks tell into the prior, and drop them, before a frame goes."""
         everything = self._landmarks
-        self._landmarks = everything.of(everything.anchors == frame)
+        self.settled = np.concatenate([self.settled, self._places(chosen)])
+        self._landmarks = everything.of(chosen)
         reduced = self._reduced(observe(self._K, self._poses, self._landmarks))
         self._prior.add(reduced.H, reduced.g, self._poses)
-        self._landmarks = everything
+        self._landmarks = everything.of(~chosen)
 
     def _forget(self, frame: int) -> None:
         """Eliminate a frame from the prior, and drop it with its landmarks."""

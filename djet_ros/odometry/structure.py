@@ -37,6 +37,9 @@ _LEAST_NOISE = 0.02
 # of them in a row are no accident.
 _SURPRISE, _IN_A_ROW = 16.0, 8
 
+# rad; chosen: a pair that is less sure of its direction than this makes no unit of a track.
+_UNSURE = 0.25
+
 # Seconds; chosen: short lengths over which tell together what each does not.
 _TOGETHER = 1.0
 
@@ -181,7 +184,7 @@ class OneScale:
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
         """Add a frame to the window; None where no length comes of it, and it begins anew."""
-        if not self._window.is_new or relative.t.any():
+        if not self._window.is_new or _tells_direction(relative):
             try:
                 addition = self._window.add(view, relative, guess)
             except np.linalg.LinAlgError:  # of matches that do not hold together
@@ -270,6 +273,12 @@ class OneScale:
         self._log += gain * off
         self._variance *= 1 - gain
         self._kept[0] *= 1 - gain
+
+
+def _tells_direction(relative: RelativePose) -> bool:
+    """Tell whether a pair is so sure of where the camera went that depths can come of it."""
+    return bool(relative.t.any() and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1]
+                < _UNSURE**2)
 
 
 def _tells(lengths: Array) -> bool:
