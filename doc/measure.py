@@ -20,6 +20,7 @@ import json
 import os
 from pathlib import Path
 import platform
+import shutil
 import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -27,6 +28,7 @@ from typing import Any
 
 import djet_ros
 from djet_ros.config.flat import from_flat
+from djet_ros.config.sections import Config
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
@@ -35,6 +37,7 @@ from djet_ros.lab.bench import bench
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.coverage import normalised_square
 from djet_ros.lab.integration import estimated_trajectory, true_trajectory
+from djet_ros.lab.lens import examine
 from djet_ros.lab.methods import default_methods, make_methods, Method
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
 from djet_ros.lab.provenance import digest_of_the_code
@@ -72,8 +75,11 @@ CHAINED = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
 # Metres; a drive that is shorter has no drift by KITTI's measure.
 DRIVE = 100.0
 # How drives are replayed; the camera's height over the road is KITTI's own word.
-REPLAYED = {'images alone': {},
+ALONE = 'images alone'
+REPLAYED = {ALONE: {},
             '`camera_height`': {'odometry.scale': 'camera_height', 'odometry.camera_height': 1.65}}
+# Standard errors beside the distortion that is found by which it is taken too.
+BESIDE = (-2, -1, 1, 2)
 BENCH_PAIRS = 40
 # An error that a true covariance of five degrees of freedom allows in one pair of a thousand.
 SURPRISING = float(chi2.ppf(0.999, 5))
@@ -381,15 +387,47 @@ def drive(folder: Path) -> dict[str, Any]:
         chained = make_methods(CHAINED, ['best'], {})
         found = {'frames': datasets[0].pairs + 1, 'length': rounded(length(folder)),
                  'chained': by_method(datasets, chained, estimated(datasets, chained)),
-                 'replays': {how: replayed(folder, values, Path(name) / str(number))
-                             for number, (how, values) in enumerate(REPLAYED.items())}}
+                 'replays': {how: replayed(folder, values) for how, values in REPLAYED.items()},
+                 **lens(folder, Path(name))}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
-def replayed(folder: Path, values: dict[str, Any], output: Path) -> dict[str, Any]:
+def lens(folder: Path, place: Path) -> dict[str, Any]:
+    """Replay a drive without the distortion that it tells itself, if it is worth correcting."""
+    with closing(open_recording(folder)) as recording:
+        try:
+            report = examine(recording, Config(), lambda: None)
+        except DjetError:
+            # Straight ahead tells nothing.
+            return {}
+    if not report.worth_correcting:
+        return {}
+    k1, sigma = report.fit.k1, report.fit.sigma
+    undone = with_distortion(folder, k1, place)
+    return {'lens': {
+        'k1': rounded(k1), 'sigma': rounded(sigma),
+        'replays': {how: replayed(undone, values) for how, values in REPLAYED.items()},
+        'beside': {str(off): replayed(with_distortion(folder, k1 + off * sigma, place),
+                                      REPLAYED[ALONE]) for off in BESIDE}}}
+
+
+def with_distortion(folder: Path, k1: float, place: Path) -> Path:
+    """Give a KITTI sequence whose calib.txt says what its images have of distortion."""
+    copied = place / f'{k1:.9f}' / 'sequences' / folder.name
+    copied.mkdir(parents=True)
+    (copied / 'image_0').symlink_to(folder.resolve() / 'image_0')
+    shutil.copy(folder / 'times.txt', copied)
+    (copied / 'calib.txt').write_text(
+        f'{(folder / "calib.txt").read_text("utf-8").rstrip()}\nD: {k1:.9f} 0 0 0 0\n', 'utf-8')
+    (copied.parents[1] / 'poses').symlink_to(folder.resolve().parents[1] / 'poses')
+    return copied
+
+
+def replayed(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
     """Replay a sequence with some parameters; gives what its summary tells of the whole way."""
     config = from_flat(values)
-    with closing(open_recording(folder)) as recording, ResultsFolder(output, config) as results:
+    with TemporaryDirectory() as name, closing(open_recording(folder)) as recording, \
+            ResultsFolder(Path(name) / 'results', config) as results:
         summary = Replay(recording, config, folder.name).run(results).summary
     return {what: {name: rounded(value) if value is not None else None
                    for name, value in summary[what].items()} for what in ('drift', 'positions')}

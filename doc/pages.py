@@ -39,6 +39,9 @@ OURS = ('djet', 'rpe', 'pjet', 'five_point')
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
 DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
+# Figures of a replayed drive, and how it is replayed where nothing tells metres.
+REPLAYED = ('positions off, rmse in m', 'scale, end over start', 't_rel, %', 'r_rel, ° per 100 m')
+ALONE = 'images alone'
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
 # A ratio beyond this says no more than that.
@@ -355,12 +358,10 @@ def drift(results: Any) -> str:
     chained = [(name, TITLES[one['method']], *(number(one['drift'][what]) for what in (
         'translation_percent', 'rotation_deg_per_100m')))
         for name, part in drives for one in part['chained']]
-    replays = [(f'{name}, {how}', number(one['positions']['rmse_m'], 2),
-                number(one['positions']['scale_change']),
-                # Without metres t_rel says nothing.
-                number(one['drift']['translation_percent'], 2),
-                number(one['drift']['rotation_deg_per_100m']))
-               for name, part in drives for how, one in part['replays'].items()]
+    replays = [(f'{name}, {how}', *replay(one)) for name, part in drives
+               for how, one in [*part['replays'].items(), *(
+                   (f'{how}, lens undone', one)
+                   for how, one in part.get('lens', {'replays': {}})['replays'].items())]]
     whole = ', '.join(f'{name} ({part["frames"]} frames, {part["length"]:.0f} m)'
                       for name, part in drives)
     return (paragraph(f'Of {whole}. Pairs chained, each by itself, with the lengths of the ground '
@@ -368,8 +369,32 @@ def drift(results: Any) -> str:
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
             + paragraph('As `djet replay` has them, with lengths of its own; positions after '
                         'alignment with one scale:')
-            + table(('', 'positions off, rmse in m', 'scale, end over start', 't_rel, %',
-                     'r_rel, ° per 100 m'), replays))
+            + table(('', *REPLAYED), replays))
+
+
+def lens(results: Any) -> str:
+    """Lay out drives as they are replayed with more and less distortion than was found."""
+    text = ''
+    for name, part in results['parts'].items():
+        if 'lens' not in part:
+            continue
+        found = part['lens']
+        k1, sigma = found['k1'], found['sigma']
+        runs = {0.0: part['replays'][ALONE], k1: found['replays'][ALONE],
+                **{k1 + int(off) * sigma: one for off, one in found['beside'].items()}}
+        text += (paragraph(f"{known_as(name.removeprefix('drive '))}, {part['frames']} frames, "
+                           f'{ALONE}; `djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
+                 + table(('k1', *REPLAYED), ((f'{value:.4f}', *replay(runs[value]))
+                                             for value in sorted(runs))))
+    return text or 'No drive tells a distortion that is worth correcting.\n'
+
+
+def replay(one: Any) -> tuple[str, ...]:
+    """Figures of a replay, as REPLAYED names them."""
+    return (number(one['positions']['rmse_m'], 2), number(one['positions']['scale_change']),
+            # Without metres t_rel says nothing.
+            number(one['drift']['translation_percent'], 2),
+            number(one['drift']['rotation_deg_per_100m']))
 
 
 def surprise(results: Any) -> str:
@@ -551,7 +576,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'measured with': measured_with, 'compared': compared, 'table 1': table_1,
     'peers': peer_settings, 'beyond': beyond,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
-    'odometry': odometry, 'drift': drift, 'surprise': surprise, 'closure': closure,
+    'odometry': odometry, 'drift': drift, 'lens': lens, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'joined': joined, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height',

@@ -196,6 +196,33 @@ def test_pairs_that_each_turn_too_far_drift_by_that_over_a_long_way(small_kitti,
     assert f'| KITTI 07 | RP-E | {figures} |' in page
 
 
+def test_a_drive_is_replayed_without_the_distortion_that_it_tells(small_kitti, tmp_path):
+    folder = small_kitti(frames=3)
+    as_it_is, undone = (KittiSequence(one) for one in (
+        folder, script('measure').with_distortion(folder, 0.0125, tmp_path)))
+    assert not as_it_is.distortion.any()
+    assert undone.distortion.tolist() == [0.0125, 0, 0, 0, 0]
+    assert np.array_equal(undone.poses, as_it_is.poses) and len(undone) == 3
+    # Straight ahead tells none.
+    assert script('measure').lens(folder, tmp_path) == {}
+
+
+def test_the_page_holds_the_distortion_that_was_found_against_others():
+    def one(off: float) -> dict[str, dict[str, float]]:
+        return {'positions': {'rmse_m': off, 'scale_change': 1.0},
+                'drift': {'translation_percent': 0.5, 'rotation_deg_per_100m': 0.25}}
+    part = {'frames': 9, 'length': 5.0, 'chained': [], 'replays': {'images alone': one(2.5)},
+            'lens': {'k1': 0.02, 'sigma': 0.005, 'replays': {'images alone': one(0.5)},
+                     'beside': {'-2': one(1.5), '1': one(0.75)}}}
+    results = {'parts': {'drive kitti 07': part}}
+    figures = '1.000 | 0.50 | 0.250 |'
+    rows = [line for line in script('pages').lens(results).splitlines() if figures in line]
+    assert rows == [f'| {k1} | {off} | {figures}' for k1, off in (
+        ('0.0000', '2.50'), ('0.0100', '1.50'), ('0.0200', '0.50'), ('0.0250', '0.75'))]
+    assert f'| KITTI 07, images alone, lens undone | 0.50 | {figures}' in script(
+        'pages').drift(results)
+
+
 def record(pair: int, rotation: Rotation, way: np.ndarray) -> PairRecord:
     """Give what a method made of a pair of sequence 07."""
     return PairRecord('07', pair, pair, pair + 1, 'rpe', 'best', '', Status.OK.value, 99, 90,
