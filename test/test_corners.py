@@ -57,9 +57,23 @@ def test_points_have_room_for_a_descriptor(image):
     assert len(features) > 200
     fine = np.rint(features.points[features.octaves == 0]).astype(int)
     assert describable(fine, image.shape).all()
-    assert (np.diff(np.unique(features.octaves)) == 1).all()
     assert not features.angles.any()
     assert (features.responses >= 1.0).all()
+
+
+def test_corners_of_the_middle_size_wait_until_they_are_asked_for(image):
+    features = detect_corners(image, 100, 1.0)
+    assert set(features.octaves) == {0, 2}
+    every = features.with_others
+    assert np.bincount(every.octaves).tolist() == [70, 25, 18]
+    assert every.descriptors.shape == (113, 32)
+    assert np.array_equal(every.descriptors[:88], features.descriptors)
+
+
+def test_where_corners_are_few_all_sizes_are_told_at_once():
+    features = detect_corners(squares(100)[0], 2000, 1.0)
+    assert set(features.octaves) == {0, 1, 2}
+    assert features.with_others is features
 
 
 def test_points_follow_an_image_by_parts_of_a_pixel(image):

@@ -8,7 +8,7 @@ beside the larger one there is an edge, whose stair steps pass for corners at on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -21,8 +21,15 @@ from djet_ros.core.types import Features
 import numpy as np
 from numpy.typing import NDArray
 
-# How many times smaller the image is made for corners of each size, and their shares of all.
-_SIZES = ((1.0, 0.6), (1.44, 0.25), (2.07, 0.15))
+# How many times smaller the image is made for corners of each size, by octaves, and how many of
+# them are told, as shares of what is asked for.
+_SCALES = (1.0, 1.44, 2.0)
+_SHARES = (0.7, 0.25, 0.18)
+
+# Octaves that are always told. The one between helps only where they have few corners, or where
+# views are so far apart that a corner is seen in another size; these are told beyond what is asked
+# for.
+_FOLLOWED, _BETWEEN = (0, 2), 1
 
 # Side of the block, in each second pixel, over which gradients are collected.
 _BLOCK = 3
@@ -34,8 +41,11 @@ _LEAST_RATIO = 0.1
 _STRIP = 64
 
 # Corners are the strongest of all that are so near, in each second pixel each way: those of the
-# wider surroundings come first, and the others where there are not enough.
+# wider surroundings, and others beside them where there are not enough.
 _APART, _AT_LEAST_APART = 3, 1
+
+# chosen: share of the corners that are wanted that is enough.
+_ENOUGH = 0.9
 
 # The strongest of each cell of this side, in pixels, come first, then the second, and so on.
 _CELL = 40
@@ -51,22 +61,18 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
 
     contrast: rms slope, in gray levels per pixel, that a corner has at least in its weakest
     direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
-    in the image made smaller. Octaves number the sizes. mask: (H, W) bool, where no point may be;
-    smoothed: gray as ORB's tests see it, where that is known already.
+    in the image made smaller. Octaves number the sizes; where there are enough without it, those
+    of the middle size are the others. mask: (H, W) bool, where no point may be; smoothed: gray as
+    ORB's tests see it, where that is known already.
     """
-    sizes = [(octave, scale, round(share * max_features))
-             for octave, (scale, share) in enumerate(_SIZES)
-             if min(gray.shape) > 2 * scale * (REACH + 1)]
-    found = each(lambda size: _of_size(gray, *size, contrast, mask), sizes)
-    if not found:
-        none = np.empty(0, np.float32)
-        return Features.described(np.empty((0, 2)), np.empty(0, np.int32), none, none,
-                                  np.empty((0, 32), np.uint8))
-    points, octaves, responses, pixels = zip(*found)
-    places = [(scale, there) for (_, scale, _), there in zip(sizes, pixels)]
-    return Features(np.concatenate(points), np.concatenate(octaves),
-                    np.zeros(sum(map(len, points)), np.float32), np.concatenate(responses),
-                    lambda: _descriptors(gray, places, smoothed))
+    def of_size(octave: int, most: int) -> Features:
+        return _of_size(gray, octave, most, contrast, mask, smoothed)
+
+    wanted = [round(share * max_features) for share in _SHARES]
+    found = Features.together(each(lambda octave: of_size(octave, wanted[octave]), _FOLLOWED))
+    if len(found) < _ENOUGH * sum(wanted[octave] for octave in _FOLLOWED):
+        return Features.together([found, of_size(_BETWEEN, max_features - len(found))])
+    return replace(found, others=lambda: of_size(_BETWEEN, wanted[_BETWEEN]))
 
 
 def corner_slopes(image: Image) -> NDArray[np.float32]:
@@ -150,37 +156,43 @@ def _short(numbers: NDArray[np.int64]) -> NDArray[Any]:
     return numbers.astype(np.min_scalar_type(numbers.max(initial=0)))
 
 
-def _of_size(gray: Image, octave: int, scale: float, most: int, contrast: float,
-             mask: Mask | None,
-             ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float32], Pixels]:
-    """Points, octaves and responses of the corners of one size; their pixels in its image."""
+def _of_size(gray: Image, octave: int, most: int, contrast: float, mask: Mask | None,
+             smoothed: Image | None) -> Features:
+    """Detect the corners of one size; none in an image that has no room for a descriptor."""
+    scale = _SCALES[octave]
+    if min(gray.shape) <= 2 * scale * (REACH + 1):
+        none = np.empty(0, np.float32)
+        return Features.described(np.empty((0, 2)), np.empty(0, np.int32), none, none,
+                                  np.empty((0, 32), np.uint8))
     image = _made_smaller(gray, scale)
     slopes = corner_slopes(image)
-    lonely, peaks = (slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8))
-                     for side in (2 * _APART + 1, 2 * _AT_LEAST_APART + 1))
-    # Of a flat array, five times as fast.
-    rows, columns = np.divmod(np.flatnonzero(peaks & (slopes > contrast**2)), slopes.shape[1])
-    points = _exact_peaks(slopes, rows, columns)
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
-    inside = describable(_pixels(points), image.shape) & ~at(mask, (points + 0.5) * zoom - 0.5)
-    points, rows, columns = points.compress(inside, axis=0), rows[inside], columns[inside]
-    strengths = slopes[rows, columns]
-    chosen = spread_out(_pixels(points), strengths, most, lonely[rows, columns])
-    points, strengths = points[chosen], strengths[chosen]
-    return ((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
-            np.sqrt(strengths), _pixels(points))
 
+    def peaks(apart: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        found = _peaks(slopes, apart, contrast, image.shape)
+        points = _exact_peaks(slopes, found)
+        if mask is None:
+            return found, points
+        free = ~at(mask, (points + 0.5) * zoom - 0.5)
+        return found[free], points.compress(free, axis=0)
 
-def _descriptors(gray: Image, places: Sequence[tuple[float, Pixels]],
-                 smoothed: Image | None) -> Image:
-    """Descriptors (N, 32) at pixels of the image made smaller by a scale, for some scales."""
-    def of_size(place: tuple[float, Pixels]) -> Image:
-        scale, pixels = place
+    found, points = peaks(_APART)
+    lonely = np.zeros(slopes.size, bool)
+    lonely[found] = True
+    if len(found) < _ENOUGH * most:
+        found, points = peaks(_AT_LEAST_APART)
+    strengths = slopes.ravel()[found]
+    chosen = spread_out(_pixels(points), strengths, most, lonely[found])
+    points, strengths = points.take(chosen, axis=0), strengths[chosen]
+
+    def describe() -> Image:
+        # Made anew, which is seldom: views that are kept would keep it.
         seen = (smoothed if scale == 1 and smoothed is not None
                 else smooth(_made_smaller(gray, scale)))
-        return dense_descriptors(seen, pixels)
+        return dense_descriptors(seen, _pixels(points))
 
-    return np.concatenate(each(of_size, places))
+    return Features((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
+                    np.zeros(len(points), np.float32), np.sqrt(strengths), describe)
 
 
 def _made_smaller(gray: Image, scale: float) -> Image:
@@ -191,18 +203,32 @@ def _made_smaller(gray: Image, scale: float) -> Image:
     return np.asarray(cv2.resize(gray, (width, height)), np.uint8)
 
 
-def _exact_peaks(slopes: NDArray[np.float32], rows: NDArray[np.int64],
-                 columns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Pixels (N, 2) of the image at which parabolas through peaks of the slopes are highest."""
-    padded = cv2.copyMakeBorder(slopes, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    here, places = slopes[rows, columns], []
-    for index, down, right in ((columns, 0, 1), (rows, 1, 0)):
-        before = padded[rows + 1 - down, columns + 1 - right]
-        after = padded[rows + 1 + down, columns + 1 + right]
+def _peaks(slopes: NDArray[np.float32], apart: int, contrast: float, shape: tuple[int, ...]
+           ) -> NDArray[np.int64]:
+    """Find slopes that are the strongest of all that are so near; places in the flat array."""
+    side = 2 * apart + 1
+    highest = cv2.dilate(slopes, np.ones((side, side), np.uint8))
+    # Of a flat array, five times as fast.
+    found = np.flatnonzero((slopes == highest) & (slopes > contrast**2))
+    rows, columns = np.divmod(found, slopes.shape[1])
+    # Wherever the corner is in there, up to a pixel off, its descriptor has room.
+    return found[describable(2 * np.stack([columns, rows], axis=1) + 1, shape, 1)]
+
+
+def _exact_peaks(slopes: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.float64]:
+    """
+    Pixels (M, 2) of the image at which parabolas through peaks of the slopes are highest.
+
+    found: (M,) places of the peaks in the flat array, none of them at its border.
+    """
+    flat, width = slopes.ravel(), slopes.shape[1]
+    here, points = flat[found], np.empty((len(found), 2))
+    for axis, index, step in ((0, found % width, 1), (1, found // width, width)):
+        before, after = flat[found - step], flat[found + step]
         curvature = np.maximum(2 * here - before - after, np.float32(1e-9))
-        places.append(index + np.clip((after - before) / (2 * curvature), -0.5, 0.5))
-    # The middle of two pixels is half a pixel beyond the first.
-    return 2 * np.stack(places, axis=1).astype(np.float64) + 0.5
+        # The middle of two pixels is half a pixel beyond the first.
+        points[:, axis] = 2 * (index + np.clip((after - before) / (2 * curvature), -0.5, 0.5)) + .5
+    return points
 
 
 def _pixels(points: NDArray[np.float64]) -> Pixels:

@@ -60,12 +60,15 @@ class TwoViewEstimator:
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:
-            features = self.features(gray, mask, smoothed)
+            features = self._detected(gray, mask, smoothed)
         return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
 
-    def features(self, gray: NDArray[np.uint8], mask: Mask | None = None,
-                 smoothed: NDArray[np.uint8] | None = None) -> Features:
-        """Detect the features of a gray image (H, W) uint8, but where a mask (H, W) is True."""
+    def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
+        """Detect all features of a gray image (H, W) uint8, but where a mask (H, W) is True."""
+        return self._detected(gray, mask, None).with_others
+
+    def _detected(self, gray: NDArray[np.uint8], mask: Mask | None,
+                  smoothed: NDArray[np.uint8] | None) -> Features:
         if self.config.detector == 'corners':
             return detect_corners(gray, self.config.max_features, self.config.corner_contrast,
                                   mask, smoothed)
@@ -88,15 +91,16 @@ class TwoViewEstimator:
         if foreseen is not None and prior is not None:
             (x, y), bits, ahead = foreseen
             result = self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known, ahead,
-                                             bits, timings=timings))
+                                             bits, sought=len(previous.features), timings=timings))
             if _as_good(result, prior):
                 return result
 
         # Otherwise they are sought anywhere.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
+        sought = len(previous.features.with_others)
         return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known,
-                                       timings=timings))
+                                       sought=sought, timings=timings))
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the surest matches first."""
@@ -206,7 +210,7 @@ class TwoViewEstimator:
     def _verdict(self, pair: Pair, track: Track) -> RelativePose:
         with _timed(pair.timings, 'result'):
             result = verdict(pair, track, self.config)
-        return replace(result, timings=pair.timings)
+        return replace(result, timings=pair.timings, sought=pair.sought)
 
 
 def _of(values: Array | None, chosen: NDArray[np.bool_]) -> Array | None:

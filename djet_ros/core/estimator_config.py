@@ -25,7 +25,8 @@ class EstimatorConfig:
         'djet', 'residual surface: djet (descriptors), pjet (intensities), rpe (re-projection), '
         'or five_point (the start alone)', choices=METHODS)
     max_features: int = parameter(
-        2000, 'features detected per image', minimum=8, maximum=20000)
+        2000, 'features detected per image, and an eighth more where views are far apart',
+        minimum=8, maximum=20000)
     detector: str = parameter(
         'corners', 'features: corners (well spread, of three sizes, descriptors unrotated) or orb '
         '(as OpenCV detects them, descriptors rotated)', choices=('corners', 'orb'))

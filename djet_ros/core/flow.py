@@ -13,8 +13,8 @@ from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
 
-# Side of the window in pixels: the smaller the more exact, and at this one OpenCV is fastest.
-_WINDOW = 9
+# Side of the window in pixels: the smaller the more exact, and OpenCV takes so many at once.
+_WINDOW = 8
 
 # Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and
 # where they are not.

@@ -89,6 +89,8 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
 
     search_radius: as a share of the longer side; 1 matches all with all, by descriptors alone.
     """
+    previous, current = (replace(view, features=view.features.with_others)
+                         for view in (previous, current))
     there, here = previous.features, current.features
     if search_radius >= 1:
         pairs = match_everywhere(there, here)
@@ -109,7 +111,7 @@ def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, rea
     foreseen = foresee(previous.features, current.K, R, prior)
     y, bits = follow(previous, current, foreseen, reach, levels)
     found = np.isfinite(bits)
-    if found.sum() < max(_ENOUGH * prior.inliers.sum(), _MANY):
+    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
         return None
     # Where many are far off, as after a step twice as long, others are farther than the reach.
     off = np.linalg.norm((y - foreseen)[found], axis=1)
@@ -126,9 +128,15 @@ def _match_turned(previous: View, current: View, places: Array, prior: RelativeP
     turned = replace(previous.features, points=places)
     near = reach_of(prior, current.K) if prior is not None else radius
     pairs = match_nearby(turned, current.features, min(near, radius))
-    if prior is not None and near < radius and len(pairs) < _ENOUGH * prior.inliers.sum():
+    if (prior is not None and near < radius
+            and len(pairs) < _ENOUGH * _expected(prior, len(places))):
         pairs = match_nearby(turned, current.features, radius)
     return pairs
+
+
+def _expected(prior: RelativePose, sought: int) -> float:
+    """Tell how many inliers the motion before would have had among so many features."""
+    return float(prior.inliers.sum() * (sought / prior.sought if prior.sought else 1.0))
 
 
 def _settled(previous: View, current: View, y: Array, bits: Array, pairs: NDArray[np.int64]

@@ -40,8 +40,8 @@ class Pair:
     matches were followed, so that its basin will do as a start where none other comes near, its t
     may be zeros; bits: (N,) in which descriptors at x and y differ, where that is known already;
     covariances: (N, 2, 2) of y, up to a common factor, which re-projection errors count by, all
-    alike where they are not told; observe: is shown each round of Algorithm 1; timings: gets the
-    seconds of each stage.
+    alike where they are not told; sought: of how many features, see ``RelativePose``; observe: is
+    shown each round of Algorithm 1; timings: gets the seconds of each stage.
     """
 
     previous: View
@@ -53,5 +53,6 @@ class Pair:
     ahead: Pose | None = None
     bits: Array | None = None
     covariances: Array | None = None
+    sought: int = 0
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)

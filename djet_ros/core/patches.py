@@ -34,7 +34,7 @@ _SQUARE = np.concatenate([np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1) - (_RADI
 
 # Steps, which cost little after the first, and pixels that they come to at most: farther off is
 # something else.
-_STEPS, _FARTHEST = 4, 1
+_STEPS, _FARTHEST = 3, 1
 
 # Square gray levels; where a patch has no more slope than this, nothing tells where it is.
 _LEAST_SLOPE = 1e-3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from functools import cached_property
@@ -48,7 +48,8 @@ class Features:
 
     points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) sizes;
     angles: (N,) degrees; responses: (N,); describe: gives the descriptors, which are made when
-    they are first asked for, as pairs that go on like the one before do without.
+    they are first asked for, as pairs that go on like the one before do without; others: gives
+    more features, in the same way, which only views that are far apart are worth.
     """
 
     points: Array
@@ -56,6 +57,18 @@ class Features:
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]
     describe: Callable[[], NDArray[np.uint8]]
+    others: Callable[[], Features] | None = None
+
+    @classmethod
+    def together(cls, parts: Sequence[Features]) -> Features:
+        """Put features of one image together, but for their others."""
+        # Not the parts: one that keeps what it is part of would stay in memory.
+        describe = [part.describe for part in parts]
+        return cls(np.concatenate([part.points for part in parts]),
+                   np.concatenate([part.octaves for part in parts]),
+                   np.concatenate([part.angles for part in parts]),
+                   np.concatenate([part.responses for part in parts]),
+                   lambda: np.concatenate([one() for one in describe]))
 
     @classmethod
     def described(cls, points: Array, octaves: NDArray[np.int32], angles: NDArray[np.float32],
@@ -70,6 +83,11 @@ class Features:
     def descriptors(self) -> NDArray[np.uint8]:
         """Descriptors (N, 32), for matching only."""
         return self.describe()
+
+    @cached_property
+    def with_others(self) -> Features:
+        """Give these features, and the others if there are any."""
+        return self if self.others is None else Features.together([self, self.others()])
 
 
 @dataclass(frozen=True)
@@ -133,7 +151,8 @@ class RelativePose:
     losses: (N,) each match's loss on its surface, the last known one where it was culled;
     culled: how many matches had no surface in the end; indefinite: how many surfaces had no
     minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other motions
-    that were considered, the signs of their t open.
+    that were considered, the signs of their t open; sought: how many features of the previous
+    image were looked for, 0 where matches were given.
     """
 
     status: Status
@@ -156,3 +175,4 @@ class RelativePose:
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)
     rivals: tuple[Pose, ...] = ()
+    sought: int = 0
