@@ -11,6 +11,7 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
+from djet_ros.odometry import structure
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import ConstantScale, Scale, scale_source, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
@@ -212,9 +213,16 @@ def test_a_pair_that_hardly_knows_where_the_camera_went_makes_no_unit(cards):
     sure = [estimator.estimate(*pair) for pair in pairwise(views)]
     wide = np.diag([0.0, 0.0, 0.0, 0.3, 0.3])**2
     unsure = replace(sure[0], covariance_5=sure[0].covariance_5 + wide)
-    assert not scale.of_step((0, 10**8), views[1], unsure)[1].known
-    assert scale.is_new
-    assert scale.of_step((10**8, 2 * 10**8), views[2], sure[1])[1].value == pytest.approx(1)
+    assert scale.refuses(unsure) and not scale.refuses(sure[0])
+    scale.of_step((0, 10**8), views[1], sure[0])
+    assert not scale.refuses(unsure)
+
+
+def test_a_first_pair_that_is_refused_tells_a_turn_and_no_way(cards, monkeypatch):
+    monkeypatch.setattr(structure, '_UNSURE', 0.0)
+    first, = Drive(cards).go(steps()[:1])
+    assert first.status is Status.NO_PARALLAX and not first.motion[:3, 3].any()
+    assert first.motion[:3, :3] == pytest.approx(steps()[0][:3, :3], abs=1e-3)
 
 
 def test_a_speed_makes_metres_and_landmarks_carry_them_on_where_it_falls_silent(cards):

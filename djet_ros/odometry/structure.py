@@ -94,6 +94,11 @@ class OneScale:
         """Whether there are no landmarks yet, or none are kept."""
         return not self._carried or self._window.is_new
 
+    def refuses(self, relative: RelativePose) -> bool:
+        """Whether a pair is too unsure of where the camera went to be the first with depths."""
+        return bool(self._carried and self._window.is_new and relative.t.any()
+                    and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1] > _UNSURE**2)
+
     def begin(self, view: View) -> None:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
         if not self._carried:
@@ -184,7 +189,7 @@ class OneScale:
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
         """Add a frame to the window; None where no length comes of it, and it begins anew."""
-        if not self._window.is_new or _tells_direction(relative):
+        if not self._window.is_new or relative.t.any():
             try:
                 addition = self._window.add(view, relative, guess)
             except np.linalg.LinAlgError:  # of matches that do not hold together
@@ -273,12 +278,6 @@ class OneScale:
         self._log += gain * off
         self._variance *= 1 - gain
         self._kept[0] *= 1 - gain
-
-
-def _tells_direction(relative: RelativePose) -> bool:
-    """Tell whether a pair is so sure of where the camera went that depths can come of it."""
-    return bool(relative.t.any() and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1]
-                < _UNSURE**2)
 
 
 def _tells(lengths: Array) -> bool:
