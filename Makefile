@@ -8,7 +8,7 @@ SEQUENCE ?=
 FRAMES ?= 21
 REAL_FRAMES ?=
 ONLY ?=
-TABLES ?= dds soak outvoted links loops 'live loops' 'camera height' coverage
+TABLES ?= dds soak outvoted links loops 'live loops' 'camera height' 'short ways' coverage
 SEEDS ?= 0,1,2,3,4
 # in the order of their names: files of few tests, some of them long, would come last
 PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
@@ -51,7 +51,7 @@ results: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/pages.py
 
 # tables beside those: TABLES of node, dds, soak, outvoted, links, loops, 'live loops',
-# 'camera height' and coverage
+# 'camera height', 'short ways' and coverage
 recorded: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/record.py $(TABLES)
 	$(VENV)/bin/python doc/pages.py

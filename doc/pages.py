@@ -580,7 +580,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'ablation': ablation, 'joined': joined, 'speed': speed,
     **{name: recorded(name) for name in (
         'node', 'dds', 'soak', 'outvoted', 'links', 'loops', 'live loops', 'camera height',
-        'coverage')},
+        'short ways', 'coverage')},
 }
 
 

@@ -6,7 +6,8 @@ plays a recording, one is the node, and this one listens; it needs djet_ros[dds,
 be any command, such as one that brings its own ROS along. A table that can't be measured is said
 in a line and left as it was; the exit status is 1 then.
 
-    python doc/record.py links outvoted soak 'camera height' loops dds 'live loops' coverage
+    python doc/record.py links outvoted soak loops dds coverage
+    python doc/record.py 'camera height' 'short ways' 'live loops'
     python doc/record.py node --node '. install/setup.sh; ros2 run djet_ros vo_node --ros-args'
 """
 
@@ -20,6 +21,7 @@ import json
 import os
 from pathlib import Path
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -295,6 +297,43 @@ def camera_height(place: Path, args: argparse.Namespace) -> dict[str, Any]:
                        'of the path', 'normalised error, rms'], 'rows': rows}
 
 
+def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Replay ways that are too short for a drift, by images alone."""
+    sources = kitti(args, '06')
+    for name, folder in kitti(args, '00').items():
+        sources[f'{name.replace("0–", "15–")}, a sequence of its own'] = from_frame(
+            folder, 15, place)
+    sources |= {f'TUM {folder.name.removeprefix("rgbd_dataset_")}': folder
+                for folder in sorted(args.data.glob('tum/*/'))}
+    for seed in range(3):
+        sources[f'rendered `handheld`, seed {seed}, 100 frames'] = render_sequence(
+            'handheld', place / f'seed{seed}', 100, seed)
+    rows = []
+    for name, source in sources.items():
+        djet('replay', source, '--output', place / 'replay', '--overwrite')
+        found = json.loads((place / 'replay' / 'summary.json').read_text('utf-8'))['positions']
+        rows.append([name, f"{found['way_m']:.3g} m", known(found['scale_change'], '.3f'),
+                     f"{1e3 * found['rmse_m']:.3g} mm"])
+    return {'how': '`djet replay SEQUENCE`, images alone.',
+            'header': ['', 'way', 'scale, end over start', 'positions off (rmse)'], 'rows': rows}
+
+
+def from_frame(folder: Path, first: int, place: Path) -> Path:
+    """Give a KITTI sequence that begins later, as one of its own."""
+    cut = place / 'sequences' / folder.name
+    (cut / 'image_0').mkdir(parents=True)
+    (place / 'poses').mkdir()
+    for image in sorted(folder.glob('image_0/*'))[first:]:
+        (cut / 'image_0' / image.name).symlink_to(image.resolve())
+    shutil.copy(folder / 'calib.txt', cut)
+    poses = f'poses/{folder.name}.txt'
+    for source, target in ((folder / 'times.txt', cut / 'times.txt'),
+                           (folder.parents[1] / poses, place / poses)):
+        rows = source.read_text('utf-8').splitlines(keepends=True)
+        target.write_text(''.join(rows[first:]), 'utf-8')
+    return cut
+
+
 def lengths(folder: Path, frames: int | None) -> Array:
     """Length, true length and standard deviation (N, 3) of each step whose length is known."""
     dataset, = open_datasets([folder], Selection(end=frames), folder.parent)
@@ -362,8 +401,8 @@ def covered(folder: Path, name: str = '') -> list[list[str]]:
             if any(row['told'] or row.get('untold') for row in rows)]
 
 
-def known(value: float, form: str) -> str:
-    return f'{value:{form}}' if np.isfinite(value) else '–'
+def known(value: float | None, form: str) -> str:
+    return f'{value:{form}}' if value is not None and np.isfinite(value) else '–'
 
 
 # Processes on a graph
@@ -626,7 +665,8 @@ def playing(source: Path, *words: Any) -> Iterator[None]:
 
 MEASURED: dict[str, Callable[[Path, argparse.Namespace], dict[str, Any]]] = {
     'node': node, 'dds': dds, 'soak': soak, 'outvoted': outvoted, 'links': links, 'loops': loops,
-    'live loops': live_loops, 'camera height': camera_height, 'coverage': coverage}
+    'live loops': live_loops, 'camera height': camera_height, 'short ways': short_ways,
+    'coverage': coverage}
 
 
 if __name__ == '__main__':
