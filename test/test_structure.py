@@ -213,9 +213,16 @@ def test_a_pair_that_hardly_knows_where_the_camera_went_makes_no_unit(cards):
     sure = [estimator.estimate(*pair) for pair in pairwise(views)]
     wide = np.diag([0.0, 0.0, 0.0, 0.3, 0.3])**2
     unsure = replace(sure[0], covariance_5=sure[0].covariance_5 + wide)
-    assert scale.refuses(unsure) and not scale.refuses(sure[0])
-    scale.of_step((0, 10**8), views[1], sure[0])
-    assert not scale.refuses(unsure)
+    first, second = (0, 10**8), (10**8, 2 * 10**8)
+    assert scale.refuses(first, unsure) and not scale.refuses(first, sure[0])
+    # Metres that are measured need no unit.
+    speeds = SpeedScale()
+    speeds.add_speed(0, 1.6)
+    scale.configure(ESTIMATOR, speeds, 0.05)
+    assert not scale.refuses(first, unsure)
+    scale.configure(ESTIMATOR, Unmeasured(), 0.05)
+    scale.of_step(first, views[1], sure[0])
+    assert not scale.refuses(second, unsure)
 
 
 def test_a_first_pair_that_is_refused_tells_a_turn_and_no_way(cards, monkeypatch):

@@ -94,10 +94,15 @@ class OneScale:
         """Whether there are no landmarks yet, or none are kept."""
         return not self._carried or self._window.is_new
 
-    def refuses(self, relative: RelativePose) -> bool:
-        """Whether a pair is too unsure of where the camera went to be the first with depths."""
+    def refuses(self, span_ns: tuple[int, int], relative: RelativePose) -> bool:
+        """
+        Whether a pair is too unsure of where the camera went to be the unit of the track.
+
+        One whose length is measured makes none.
+        """
         return bool(self._carried and self._window.is_new and relative.t.any()
-                    and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1] > _UNSURE**2)
+                    and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1] > _UNSURE**2
+                    and not self._source.between(*span_ns).known)
 
     def begin(self, view: View) -> None:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
