@@ -1,7 +1,6 @@
 """One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
@@ -11,7 +10,6 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
-from djet_ros.odometry import structure
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import ConstantScale, Scale, scale_source, SpeedScale, Unmeasured
 from djet_ros.odometry.structure import OneScale
@@ -200,36 +198,6 @@ def test_without_any_parallax_there_is_no_unit_yet(cards):
     turns = drive.go([pose(yaw=0.03)] * 2)
     assert all(result.scale_kind is Scale.UNKNOWN for result in turns)
     assert drive.go(steps()[:2])[0].scale == pytest.approx(1)
-
-
-def test_a_pair_that_hardly_knows_where_the_camera_went_makes_no_unit(cards):
-    """Its depths would be anything, and all that comes after would be held against them."""
-    estimator, scale = TwoViewEstimator(ESTIMATOR), OneScale()
-    scale.configure(ESTIMATOR, Unmeasured(), 0.05)
-    scale.reset()
-    views = [estimator.view(frame.gray, frame.K) for frame in (
-        cards.frame(0.0, pose(x=0.16 * step), noise=step) for step in range(3))]
-    scale.begin(views[0])
-    sure = [estimator.estimate(*pair) for pair in pairwise(views)]
-    wide = np.diag([0.0, 0.0, 0.0, 0.3, 0.3])**2
-    unsure = replace(sure[0], covariance_5=sure[0].covariance_5 + wide)
-    first, second = (0, 10**8), (10**8, 2 * 10**8)
-    assert scale.refuses(first, unsure) and not scale.refuses(first, sure[0])
-    # Metres that are measured need no unit.
-    speeds = SpeedScale()
-    speeds.add_speed(0, 1.6)
-    scale.configure(ESTIMATOR, speeds, 0.05)
-    assert not scale.refuses(first, unsure)
-    scale.configure(ESTIMATOR, Unmeasured(), 0.05)
-    scale.of_step(first, views[1], sure[0])
-    assert not scale.refuses(second, unsure)
-
-
-def test_a_first_pair_that_is_refused_tells_a_turn_and_no_way(cards, monkeypatch):
-    monkeypatch.setattr(structure, '_UNSURE', 0.0)
-    first, = Drive(cards).go(steps()[:1])
-    assert first.status is Status.NO_PARALLAX and not first.motion[:3, 3].any()
-    assert first.motion[:3, :3] == pytest.approx(steps()[0][:3, :3], abs=1e-3)
 
 
 def test_a_speed_makes_metres_and_landmarks_carry_them_on_where_it_falls_silent(cards):

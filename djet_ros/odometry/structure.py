@@ -37,9 +37,6 @@ _LEAST_NOISE = 0.02
 # of them in a row are no accident.
 _SURPRISE, _IN_A_ROW = 16.0, 8
 
-# rad; chosen: a pair that is less sure of its direction than this makes no unit of a track.
-_UNSURE = 0.25
-
 # Seconds; chosen: short lengths over which tell together what each does not.
 _TOGETHER = 1.0
 
@@ -93,16 +90,6 @@ class OneScale:
     def is_new(self) -> bool:
         """Whether there are no landmarks yet, or none are kept."""
         return not self._carried or self._window.is_new
-
-    def refuses(self, span_ns: tuple[int, int], relative: RelativePose) -> bool:
-        """
-        Whether a pair is too unsure of where the camera went to be the unit of the track.
-
-        One whose length is measured makes none.
-        """
-        return bool(self._carried and self._window.is_new and relative.t.any()
-                    and np.linalg.eigvalsh(relative.covariance_5[3:, 3:])[-1] > _UNSURE**2
-                    and not self._source.between(*span_ns).known)
 
     def begin(self, view: View) -> None:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""

@@ -197,8 +197,6 @@ class VisualOdometry:
             return self._lose(frame, view, relative, self._one_scale.of_rest(span))
 
         # Its length in the one scale of the track, by what frames share or by what measures it.
-        if self._one_scale.refuses(span, relative):
-            relative = replace(relative, status=Status.NO_PARALLAX, t=np.zeros(3))
         waits = self._waits(relative)
         told, length = ((relative, self._one_scale.of_rest(span)) if waits
                         else self._one_scale.of_step(span, view, relative))
