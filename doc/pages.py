@@ -39,8 +39,8 @@ OURS = ('djet', 'rpe', 'pjet', 'five_point')
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
 DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
-# Figures of a replayed drive, and how it is replayed where nothing tells metres.
-REPLAYED = ('positions off, rmse in m', 'scale, end over start', 't_rel, %', 'r_rel, ° per 100 m')
+# Columns of a replayed drive, and how it is replayed where nothing tells metres.
+OF_REPLAY = ('positions off, rmse in m', 'scale, end over start', 't_rel, %', 'r_rel, ° per 100 m')
 ALONE = 'images alone'
 # Errors below this, in degrees, are as good as none.
 EQUAL = 0.001
@@ -369,7 +369,7 @@ def drift(results: Any) -> str:
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
             + paragraph('As `djet replay` has them, with lengths of its own; positions after '
                         'alignment with one scale:')
-            + table(('', *REPLAYED), replays))
+            + table(('', *OF_REPLAY), replays))
 
 
 def lens(results: Any) -> str:
@@ -384,13 +384,13 @@ def lens(results: Any) -> str:
                 **{k1 + int(off) * sigma: one for off, one in found['beside'].items()}}
         text += (paragraph(f"{known_as(name.removeprefix('drive '))}, {part['frames']} frames, "
                            f'{ALONE}; `djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
-                 + table(('k1', *REPLAYED), ((f'{value:.4f}', *replay(runs[value]))
-                                             for value in sorted(runs))))
+                 + table(('k1', *OF_REPLAY), ((f'{value:.4f}', *replay(runs[value]))
+                                              for value in sorted(runs))))
     return text or 'No drive tells a distortion that is worth correcting.\n'
 
 
 def replay(one: Any) -> tuple[str, ...]:
-    """Figures of a replay, as REPLAYED names them."""
+    """Figures of a replay, as OF_REPLAY names them."""
     return (number(one['positions']['rmse_m'], 2), number(one['positions']['scale_change']),
             # Without metres t_rel says nothing.
             number(one['drift']['translation_percent'], 2),

@@ -21,7 +21,6 @@ import json
 import os
 from pathlib import Path
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -301,8 +300,9 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Replay ways that are too short for a drift, by images alone."""
     sources = kitti(args, '06')
     for name, folder in kitti(args, '00').items():
-        sources[f'{name.replace("0–", "15–")}, a sequence of its own'] = from_frame(
-            folder, 15, place)
+        bag = place / 'later'
+        djet('kitti-to-bag', folder, bag, '--start', 15)
+        sources[f'{name.replace("0–", "15–")}, a sequence of its own'] = bag
     sources |= {f'TUM {folder.name.removeprefix("rgbd_dataset_")}': folder
                 for folder in sorted(args.data.glob('tum/*/'))}
     for seed in range(3):
@@ -316,22 +316,6 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
                      f"{1e3 * found['rmse_m']:.3g} mm"])
     return {'how': '`djet replay SEQUENCE`, images alone.',
             'header': ['', 'way', 'scale, end over start', 'positions off (rmse)'], 'rows': rows}
-
-
-def from_frame(folder: Path, first: int, place: Path) -> Path:
-    """Give a KITTI sequence that begins later, as one of its own."""
-    cut = place / 'sequences' / folder.name
-    (cut / 'image_0').mkdir(parents=True)
-    (place / 'poses').mkdir()
-    for image in sorted(folder.glob('image_0/*'))[first:]:
-        (cut / 'image_0' / image.name).symlink_to(image.resolve())
-    shutil.copy(folder / 'calib.txt', cut)
-    poses = f'poses/{folder.name}.txt'
-    for source, target in ((folder / 'times.txt', cut / 'times.txt'),
-                           (folder.parents[1] / poses, place / poses)):
-        rows = source.read_text('utf-8').splitlines(keepends=True)
-        target.write_text(''.join(rows[first:]), 'utf-8')
-    return cut
 
 
 def lengths(folder: Path, frames: int | None) -> Array:

@@ -259,8 +259,9 @@ def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards)
         result, = drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03)])
         here = result.pose[:3, :3] @ drive.odometry.landmarks(settled=True).T
         depths.append((here.T + result.pose[:3, 3])[:, 2] * np.hypot(0.32, 0.03))
-    left = np.concatenate(depths)
-    off = np.abs(left[:, None] / DEPTHS - 1).min(1)
+    left = [part for part in depths if len(part)]
+    assert 2 <= len(left) < 30  # not with each frame, but as they go out of sight
+    off = np.abs(np.concatenate(left)[:, None] / DEPTHS - 1).min(1)
     assert len(off) > 50
     assert np.median(off) < 0.03
 
@@ -345,7 +346,7 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
     assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)
 
 
-@pytest.mark.parametrize('seed', [1, 4, 6])
+@pytest.mark.parametrize('seed', [0, 1, 4, 6])
 def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
     """It turns by 15 degrees a frame: landmarks are gone after a few, at times all at once."""
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()

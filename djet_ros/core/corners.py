@@ -226,8 +226,9 @@ def _exact_peaks(slopes: NDArray[np.float32], found: NDArray[np.int64]) -> NDArr
     for axis, index, step in ((0, found % width, 1), (1, found // width, width)):
         before, after = flat[found - step], flat[found + step]
         curvature = np.maximum(2 * here - before - after, np.float32(1e-9))
+        highest = index + np.clip((after - before) / (2 * curvature), -0.5, 0.5)
         # The middle of two pixels is half a pixel beyond the first.
-        points[:, axis] = 2 * (index + np.clip((after - before) / (2 * curvature), -0.5, 0.5)) + .5
+        points[:, axis] = 2 * highest + 0.5
     return points
 
 

@@ -156,8 +156,8 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
-        # What the newest pair saw in its second frame: pixels (N, 2) and inverse depths (N,).
-        self._latest = np.empty((0, 2)), np.empty(0)
+        # The newest pair and its length, where it has a direction.
+        self._latest: tuple[RelativePose, float] | None = None
         self.settled = np.empty((0, 3))
 
     @property
@@ -200,7 +200,7 @@ class Window:
             self._forget(0)
         if relative.t.any():
             self._choose_keyframe()
-        self._latest = self._depths_of(relative, addition.length)
+        self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
 
     def landmarks(self) -> Array:
@@ -221,22 +221,24 @@ class Window:
         A robust mean over landmarks beside which it has a match; where the camera turned past
         them, over the matches of the pair before.
         """
+        unknown = guess, self._tuning.guessed
+        if not relative.t.any():
+            return unknown
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
         known, match = self._beside(x, self._landmarks.seen[:, -1])
+        if len(known) < self._tuning.few and self._latest is not None:
+            known, match = self._near(x, *self._depths_of(*self._latest))
         if len(known) < self._tuning.few:
-            known, match = self._near(x, *self._latest)
-        if not relative.t.any() or len(known) < self._tuning.few:
-            return guess, self._tuning.guessed
+            return unknown
         in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x[match]),
                                          rays(self._K, y[match]))
         length = _weighted_median(in_units / known, known / sigma)
-        return (length, self._tuning.told) if length > 0 else (guess, self._tuning.guessed)
+        return (length, self._tuning.told) if length > 0 else unknown
 
     def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
         """Pixels (N, 2) of a pair's inliers in its second frame, and inverse depths (N,) there."""
-        inliers = relative.inliers & relative.t.any()
-        y = relative.y_opt[inliers]
-        rays_x = rays(self._K, relative.x[inliers])
+        y = relative.y_opt[relative.inliers]
+        rays_x = rays(self._K, relative.x[relative.inliers])
         rho, _ = inverse_depths(relative.R, relative.t, rays_x, rays(self._K, y))
         depths = (rays_x @ relative.R.T + rho[:, None] * relative.t)[:, 2]
         ahead = (rho > 0) & (depths > 0)
