@@ -385,8 +385,15 @@ def chunks(folder: Path) -> list[str]:
 def workers_of(process: subprocess.Popen[str]) -> list[int]:
     """Process ids of the pool's workers."""
     children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
-    return [int(child) for child in children
-            if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
+    return [int(child) for child in children if b'spawn_main' in called(child)]
+
+
+def called(process: str) -> bytes:
+    """Words that a process was called with; none where it has ended meanwhile."""
+    try:
+        return Path(f'/proc/{process}/cmdline').read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b''
 
 
 @pytest.mark.slow
