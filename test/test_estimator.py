@@ -546,6 +546,20 @@ def test_steps_of_nine_metres_through_leaves_are_found_among_mostly_false_matche
 
 # Real frames.
 
+def test_basins_are_told_apart_by_what_each_comes_to_with_patches_of_its_own(kitti: Path):
+    """On panels without texture a wrong one fits matches as well, seen as itself has them."""
+    indoor = kitti.parent / 'tartanair/sequences/indoor'
+    if not indoor.is_dir():
+        pytest.skip(f'{indoor} is not there')
+    sequence = KittiSequence(indoor, start=1, end=3)
+    estimator = TwoViewEstimator()
+    result = estimator.estimate(*(estimator.view(sequence.image(i), sequence.K)
+                                  for i in range(2)))
+    true_motion = np.linalg.inv(sequence.poses[1]) @ sequence.poses[0]
+    assert np.degrees(rotation_angle(result.R, true_motion[:3, :3])) < 0.1
+    assert np.degrees(direction_angle(result.t, true_motion[:3, 3])) < 2
+
+
 @pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_name):
     sequence = KittiSequence(kitti / 'sequences/06', start=20, end=29)

@@ -57,6 +57,32 @@ def estimate(x: np.ndarray, y: np.ndarray, before: Pose | None = None) -> Relati
         uniform_view(), uniform_view(), x, y, prior)
 
 
+@pytest.mark.parametrize(('behind', 'before', 'status'), [
+    (20, None, Status.OK), (95, None, Status.AMBIGUOUS), (95, 'likewise', Status.OK),
+    (105, 'likewise', Status.OK)])
+def test_where_as_many_points_are_behind_as_before_the_camera_its_way_is_told_by_none_of_them(
+        behind: int, before: str | None, status: Status) -> None:
+    """Edges along the way have false matches on epipolar lines, on the wrong half as often."""
+    rng = np.random.default_rng(4)
+    seen = two_views(rng, t=FORWARD, count=100)
+    on_lines = two_views(rng, t=np.negative(FORWARD), count=behind)
+    anywhere = rng.uniform((0, 0), SIZE, (2, 2 * behind, 2))
+    x, y = (np.concatenate(parts) for parts in zip(
+        (seen.x, seen.y), (on_lines.x, on_lines.y), anywhere))
+    result = estimate(x, y, Pose(seen.R, seen.t) if before else None)
+    assert result.status is status
+    if status is Status.OK:
+        assert direction_angle(result.t, seen.t) < 1e-3
+        assert direction_claimed(result) < 1
+    else:
+        assert direction_claimed(result) > 30
+
+
+def direction_claimed(result: RelativePose) -> float:
+    """Give the standard deviation of the direction in degrees, where that is largest."""
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(result.covariance_5[3:, 3:])[-1])))
+
+
 @pytest.mark.parametrize('motion', BODIES)
 def test_of_two_bodies_equally_deep_none_is_taken_for_the_world_for_sure(motion: str) -> None:
     _, x, y, _ = scene_with_body(200, 300, motion, (300, 1000), DEEP)

@@ -136,7 +136,7 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
         others_move = not turned_so[costs_in_front(problem, refined, tight).argmin()]
         possible = turned_so
     basins = _promising(problem, refined, tight, BASIN_TUNING.refined_starts, possible)
-    best = basins.pop(_likeliest(losses_at(problem, basins, tight), places, basins, prior))
+    best = basins.pop(likeliest(losses_at(problem, basins, tight), places, basins, prior))
     # All matches are placed equally well, whatever they move with.
     residuals = epipolar_residuals(problem, best.R, best.t)
     scale = min(map(core_scale, refined.r)) if others_move else core_scale(residuals.r)
@@ -200,7 +200,7 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
     """Take the likeliest of a solution and its rivals, and tell how much it is preferred."""
     poses = [solution.pose, *refined_rivals(problem, rivals, loss)]
     losses = losses_at(problem, poses, loss)
-    best = _likeliest(losses, places, poses, prior)
+    best = likeliest(losses, places, poses, prior)
     if best != 0:
         solution = minimise(problem, poses[best].R, poses[best].t, loss)
         poses[best] = solution.pose
@@ -211,7 +211,7 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
         if apart(poses[best], pose) > BASIN_TUNING.same_basin)
 
 
-def _likeliest(losses: Array, places: Array, poses: list[Pose], prior: Pose | None) -> int:
+def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose | None) -> int:
     """
     Which of S poses costs least, or, of those undecided between, is next to the prior.
 

@@ -205,7 +205,11 @@ class TwoViewEstimator:
         with _timed(pair.timings, 'jet'):
             if self.config.method == 'five_point':
                 return hold(surface, pair.current.K, pair.y, starts[0])
-            return track_jointly(pair, surface, starts, self.config, ahead)
+            track = track_jointly(pair, surface, starts, self.config, ahead)
+        if track is not None and pair.observe is not None:
+            for step in track.rounds:
+                pair.observe(step)
+        return track
 
     def _verdict(self, pair: Pair, track: Track) -> RelativePose:
         with _timed(pair.timings, 'result'):

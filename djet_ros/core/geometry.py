@@ -170,12 +170,17 @@ def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.boo
     return np.asarray((depth_x > 0) & (depth_y > 0))
 
 
-def facing(R: Array, t: Array, rays_x: Array, rays_y: Array) -> float:
-    """Sign, 1 or -1, with which t brings more of the points to the front of both cameras."""
+def sides(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
+    """Sign (N,) of t that brings each point to the front of both cameras, 0 where neither does."""
     # The other sign of t has all depths the other way round.
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     ahead, behind = ((depth_x > 0) & (depth_y > 0), (depth_x < 0) & (depth_y < 0))
-    return 1.0 if ahead.sum() >= behind.sum() else -1.0
+    return ahead.astype(float) - behind
+
+
+def facing(R: Array, t: Array, rays_x: Array, rays_y: Array) -> float:
+    """Sign, 1 or -1, with which t brings more of the points to the front of both cameras."""
+    return 1.0 if sides(R, t, rays_x, rays_y).sum() >= 0 else -1.0
 
 
 def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:

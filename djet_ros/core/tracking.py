@@ -8,8 +8,10 @@ from djet_ros.core.basins import (
     Ahead,
     basin_ahead,
     basin_of,
+    BASIN_TUNING,
     judged,
     LEAST_SCALE,
+    likeliest,
     right_basin,
 )
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -39,7 +41,16 @@ from djet_ros.core.joining import with_places
 from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import as_matched, Placed
-from djet_ros.core.rivals import change, goes_on, Rival, second_motion, SecondMotion
+from djet_ros.core.rivals import (
+    apart,
+    change,
+    DECIDED,
+    goes_on,
+    preferences,
+    Rival,
+    second_motion,
+    SecondMotion,
+)
 from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.starts import Known
 from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
@@ -81,8 +92,9 @@ class Track:
     voting: (N,) bool, matches that took part; placed: where gray levels have y (N, 2), through the
     last warp, or y itself where that was not asked; minima: (N, 2) the surfaces' own minima y*,
     joined with these for matches that voted; y_opt: (N, 2) the final step onto the epipolar line;
-    losses: (N,) last known surface values; rivals: other motions that explain the voting matches;
-    guess: whether that is so because two bodies move, and nothing tells which is the world.
+    losses: (N,) last known surface values; rounds: what led there; rivals: other motions that
+    explain the voting matches; guess: whether that is so because two bodies move, and nothing
+    tells which is the world.
     """
 
     pose: Pose
@@ -94,9 +106,14 @@ class Track:
     y_opt: Array
     losses: Array
     indefinite: int
-    iterations: int
+    rounds: tuple[Round, ...] = ()
     rivals: tuple[Rival, ...] = ()
     guess: bool = False
+
+    @property
+    def iterations(self) -> int:
+        """Give how many rounds were made."""
+        return len(self.rounds)
 
     def scale(self) -> float:
         """Give the robust standard deviation of the residuals, in pixels of a typical surface."""
@@ -116,11 +133,11 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
     surface: on the matches of the pair. The cheapest of the refined `starts` goes on; of those
-    that the matches do not decide between, the one next to the motion before. Without any starts
-    they are looked for around the pose ahead, which is likely, and from which the keypoints were
-    followed: exactly enough for the first round to go by them alone. Where two bodies move, it is
-    the camera's motion, as far as that can be told. None where too few matches have a usable
-    surface.
+    that the matches do not decide between, each is led to its own end, and the one next to the
+    motion before is taken where they are still undecided. Without any starts they are looked for
+    around the pose ahead, which is likely, and from which the keypoints were followed: exactly
+    enough for the first round to go by them alone. Where two bodies move, it is the camera's
+    motion, as far as that can be told. None where too few matches have a usable surface.
     """
     everything, turn = np.ones(len(pair.y), bool), pair.known.turn
     algorithm = _Algorithm(pair, surface, config, everything)
@@ -129,6 +146,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
         return track
     first = algorithm.first
     untold = replace(pair, known=Known())
+    algorithm, track = _contested(algorithm, track, pair, surface, config, ahead)
     if turn is not None and not turn.may_be(track.pose.R):
         for rival in first.rivals:
             led = _Algorithm(untold, surface, config, everything).run([rival])
@@ -144,6 +162,39 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
         members[first.voting] = second.members
         track = _Algorithm(untold, surface, config, members).run([taken]) or track
     return replace(track, rivals=(Rival(other, 0.0),), guess=True) if guess else track
+
+
+def _contested(algorithm: _Algorithm, track: Track, pair: Pair, surface: ResidualSurface,
+               config: EstimatorConfig, ahead: Ahead | None) -> tuple[_Algorithm, Track]:
+    """
+    Lead all basins to their own ends where the matches decide between none, and choose once more.
+
+    After the first round keypoints lie, and patches are warped, as one pose has them, which
+    favours it: a wrong one keeps matches that suit it, at three times the noise of the right one.
+    A match that has no vote costs what one does that is far off. Re-projection errors are the same
+    whatever pose they are seen by, and judged already.
+    """
+    if config.method == 'rpe' or all(rival.preference >= DECIDED for rival in track.rivals):
+        return algorithm, track
+    first = algorithm.first
+    began = sorted([first.solution.pose, *first.rivals], key=lambda pose: apart(track.pose, pose))
+    ends = [(algorithm, track)]
+    for pose in began[1:]:
+        led = _Algorithm(pair, surface, config, np.ones(len(pair.y), bool))
+        end = led.run([pose], ahead)
+        if end is not None:
+            ends.append((led, end))
+    loss = Loss('geman_mcclure', config.loss_scale * min(end.scale() for _, end in ends))
+    losses = np.full((len(ends), len(pair.y)), loss.scale**2)
+    for row, (_, end) in zip(losses, ends):
+        row[end.voting] = loss(end.residuals.r**2)[0]
+    poses = [end.pose for _, end in ends]
+    best = likeliest(losses, surface.x, poses, pair.before)
+    algorithm, track = ends[best]
+    rivals = [Rival(pose, float(preference))
+              for pose, preference in zip(poses, preferences(losses, surface.x, best))
+              if apart(track.pose, pose) > BASIN_TUNING.same_basin]
+    return algorithm, replace(track, rivals=tuple(rivals))
 
 
 @dataclass(frozen=True)
@@ -185,7 +236,7 @@ class _Algorithm:
 
     def run(self, starts: list[Pose], ahead: Ahead | None = None) -> Track | None:
         """Take rounds until the pose rests; None where too few matches have a surface."""
-        poses, most = starts, self._config.max_iterations
+        poses, most, rounds = starts, self._config.max_iterations, []
         # Places that were followed tell the pose well enough to sample surfaces only once: around
         # them on its lines, as it stretches the patches.
         by_places = ahead is not None and most > 1
@@ -210,8 +261,7 @@ class _Algorithm:
             optimum = _optimum_on_line(paraboloids, self._surface.x,
                                        fundamental(self._K, pose.R, pose.t))
             self._losses[self._alive] = paraboloids.values(optimum)[self._alive]
-            if self._pair.observe is not None:
-                self._pair.observe(Round(self._keypoints, fits, self._warp, pose, optimum))
+            rounds.append(Round(self._keypoints, fits, self._warp, pose, optimum))
             if last:
                 break
             self._advance(pose, optimum)
@@ -219,7 +269,7 @@ class _Algorithm:
         minima = paraboloids.minima()
         minima[voting] = (self._K @ found.problem.rays_y)[:2].T
         return Track(pose, found.loss, found.solution.residuals, voting, minima, placed, optimum,
-                     self._losses, no_minimum, number, rivals)
+                     self._losses, no_minimum, tuple(rounds), rivals)
 
     def _fits(self, by_places: bool) -> Paraboloids:
         """Fit surfaces around the keypoints, or take these as they are."""
@@ -301,7 +351,7 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     residuals = epipolar_residuals(jet_problem(K, surface.x, paraboloids), pose.R, pose.t)
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
     return Track(pose, Loss(), residuals, voting, paraboloids.minima(), as_matched(y), optimum,
-                 paraboloids.values(optimum), 0, 0)
+                 paraboloids.values(optimum), 0)
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None

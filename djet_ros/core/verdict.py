@@ -6,16 +6,16 @@ from djet_ros.core.covariance import difference, pose_covariance, spanning, squa
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     epipolar_lines,
-    facing,
     fit_rotation,
     fundamental,
     line_distances,
     rays,
+    sides,
 )
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import quantile
-from djet_ros.core.rivals import DECIDED, false_alarms, goes_on
+from djet_ros.core.rivals import change, DECIDED, false_alarms, goes_on, preferences
 from djet_ros.core.tracking import Track, TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
@@ -49,7 +49,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     inliers = track.inliers()
     # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
     rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
-    sign = facing(R, track.pose.t, rays_x, rays_y)
+    sign, other_way = _sign(track.pose, rays_x, rays_y, x[inliers], pair.before)
     t = sign * track.pose.t
 
     covariances = pose_covariance(
@@ -69,7 +69,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         if parallax < max(config.min_parallax, _OUT_OF_NOISE * track.scale()):
             status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
-            status, covariances = _judged(Pose(R, t), covariances, track, pair.before)
+            status, covariances = _judged(Pose(R, t), covariances, track, pair.before, other_way)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
         status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,
@@ -78,7 +78,27 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations,
-        rivals=tuple(rival.pose for rival in track.rivals))
+        rivals=(*(rival.pose for rival in track.rivals), *([Pose(R, -t)] if other_way else [])))
+
+
+def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,
+          before: Pose | None) -> tuple[float, bool]:
+    """
+    Tell the sign of t, and whether the other one may be right as well.
+
+    rays_x, rays_y: (N, 3) of the matches that agree, places: (N, 2) their pixels in the previous
+    image. False ones along epipolar lines, as edges on the way have them, are behind the cameras
+    as often as before them: where points before and behind do not decide, by the test of
+    ``preferences``, the motion before does.
+    """
+    votes = sides(pose.R, pose.t, rays_x, rays_y)
+    sign = 1.0 if votes.sum() >= 0 else -1.0
+    if preferences(np.stack([-votes, votes]) * sign, places, 0)[1] >= DECIDED:
+        return sign, False
+    ways = {way: Pose(pose.R, way * pose.t) for way in (sign, -sign)}
+    if before is not None:
+        sign = min(ways, key=lambda way: change(before, ways[way]))
+    return sign, before is None or not goes_on(before, ways[sign], ways[-sign])
 
 
 def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
@@ -95,12 +115,13 @@ def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
-            before: Pose | None) -> tuple[Status, tuple[Array, Array]]:
+            before: Pose | None, other_way: bool) -> tuple[Status, tuple[Array, Array]]:
     """
     Tell whether rivals leave a pose unsure, and widen its covariances to span them.
 
-    Those that the covariance allows of are spanned by it already. Any other is the true motion
-    with the probability that the preference comes from noise.
+    other_way: whether t may have the other sign as well, which is a rival too. Those that the
+    covariance allows of are spanned by it already. Any other is the true motion with the
+    probability that the preference comes from noise.
     """
     status = Status.TWO_MOTIONS if track.guess else Status.OK
     for rival in track.rivals:
@@ -112,6 +133,11 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
             status = Status.AMBIGUOUS
         covariances = spanning(covariances[0], pose.t, off,
                                float(ndtr(-_TRUSTED * rival.preference)))
+    if other_way:
+        status = status if track.guess else Status.AMBIGUOUS
+        # It lies 2 away by its chord, to no side more than to another.
+        for off in np.sqrt(2) * np.eye(5)[3:]:
+            covariances = spanning(covariances[0], pose.t, off, 0.5)
     return status, covariances
 
 
