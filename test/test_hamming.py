@@ -133,7 +133,7 @@ def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
     points = np.array([[60, 50], [90, 60], [70, 70], [80, 66]])
     warps = np.array([np.eye(3, 2), 1.25 * np.eye(3, 2), [[0.9, 0.2], [-0.1, 1.1], [0, 0]],
                       [[0.9, 0.2], [-0.1, 1.1], [0.01, -0.006]]])
-    bits = np.less(*intensities_through(warps, smoothed, points))
+    bits = np.less(*intensities_through(warps, [(smoothed, len(points))], points))
     assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
 
     def between(x, y):

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 from djet_ros.core.hamming import Image, Pixels, sum_over_tests, Tests
 from djet_ros.core.orb_pattern import TESTS
+from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,17 +30,18 @@ def smooth_finely(gray: Image, scale: float = 1.0) -> Grades:
     return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _STEPS * kernel, kernel), np.int16)
 
 
-def grades(p: NDArray[Any], q: NDArray[Any], grading: float, contrast: float = 1.0) -> Grades:
+def grades(p: NDArray[Any], q: NDArray[Any], grading: float,
+           contrast: float | Array = 1.0) -> Grades:
     """
     Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level.
 
-    contrast: of the image that they are to be compared with, over that of their own. Between
-    pixels p and q are float32.
+    contrast: of the image that they are to be compared with, over that of their own, (N,) where
+    they are of several. Between pixels p and q are float32.
     """
     reach = _reach(grading)
     differences = p - q
-    if contrast != 1 or differences.dtype != np.int16:
-        differences = np.rint(differences * np.float32(contrast))
+    if differences.dtype != np.int16 or np.any(contrast != 1):
+        differences = np.rint(differences * np.asarray(contrast, np.float32))
     return np.asarray(np.clip(differences, -reach, reach), np.int16)
 
 

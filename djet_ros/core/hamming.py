@@ -8,7 +8,7 @@ patches that are seen through a warp are tested between pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]
 Tests = NDArray[np.int64]
+# An image, and how many of the points that come one after the other are in it.
+Shown = tuple[NDArray[Any], int]
 
 # Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
 _BLOCK = 2048
@@ -92,16 +94,16 @@ def intensities(smoothed: NDArray[Any], points: Pixels,
     return patches[py, px], patches[qy, qx]
 
 
-def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
+def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
                         tests: Tests = TESTS
                         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """
     Intensities (T, N) float32 at both ends of T tests, on patches seen through a warp.
 
-    warp: (N, 3, 2) W and c of `geometry.patch_warp`, W not singular; points: (N, 2) pixels. The
-    tests look between pixels, at the dx from the point that is seen at their dy: of
-    dy = W dx / (1 + c^T dx), that is dx = u / (1 - c^T u) with u = W^-1 dy. Beyond the image its
-    border goes on.
+    warp: (N, 3, 2) W and c of `geometry.patch_warp`, W not singular; images: in whose order the
+    points are; points: (N, 2) pixels. The tests look between pixels, at the dx from the point that
+    is seen at their dy: of dy = W dx / (1 + c^T dx), that is dx = u / (1 - c^T u) with
+    u = W^-1 dy. Beyond the image its border goes on.
     """
     inverse = inverses(warp[:, :2])
     nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
@@ -110,13 +112,12 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
                                          * np.einsum('nj,nj->n', nearer, nearer))
     inverse, nearer = inverse.astype(np.float32), nearer.astype(np.float32)
     ends, of_tests = _ends(tests.tobytes())
-    # OpenCV is three times as fast on floating point numbers as on short ones.
-    image, places = smoothed.astype(np.float32, copy=False), points.astype(np.float32)
+    places = points.astype(np.float32)
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
-    def look(start: int) -> None:
+    def look(task: tuple[NDArray[np.float32], slice]) -> None:
         # Points first: what is near one another in the image comes one after the other.
-        block = slice(start, start + _WARPED_BLOCK)
+        image, block = task
         away = [inverse[block, axis] @ ends for axis in (0, 1)]
         bent = np.flatnonzero(bend[block] > _BENT)
         if len(bent):
@@ -126,9 +127,20 @@ def intensities_through(warp: Array, smoothed: NDArray[Any], points: Array,
         x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
         cv2.remap(image, x, y, cv2.INTER_LINEAR, values[block], cv2.BORDER_REPLICATE)
 
-    each(look, range(0, len(points), _WARPED_BLOCK))
+    each(look, _blocks(images))
     by_end = np.asarray(cv2.transpose(values)) if len(points) else values.T
     return by_end[of_tests[0]], by_end[of_tests[1]]
+
+
+def _blocks(images: Sequence[Shown]) -> list[tuple[NDArray[np.float32], slice]]:
+    """Give passes over the points of some images: each an image, and which points."""
+    blocks, end = [], 0
+    for image, count in images:
+        # OpenCV is three times as fast on floating point numbers as on short ones.
+        floating, begin, end = image.astype(np.float32, copy=False), end, end + count
+        blocks += [(floating, slice(start, min(start + _WARPED_BLOCK, end)))
+                   for start in range(begin, end, _WARPED_BLOCK)]
+    return blocks
 
 
 @lru_cache(maxsize=8)

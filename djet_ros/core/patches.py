@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import gather_patches, Image
+from djet_ros.core.hamming import gather_patches, Image, Shown
 from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
@@ -87,8 +87,8 @@ def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> 
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        places[block], covariances[block] = expect(floating, x[block], warp[block]).place(
-            here, y[block])
+        expected = expect([(floating, len(x[block]))], x[block], warp[block])
+        places[block], covariances[block] = expected.place(here, y[block])
 
     each(refine, range(0, len(y), _BLOCK))
     return Placed(places, covariances)
@@ -107,13 +107,6 @@ class Expected(NamedTuple):
     inverses: Array
     gray: Gray
     contrasts: Array
-
-    @classmethod
-    def together(cls, parts: Sequence[Expected]) -> Expected:
-        """Put patches of several images together."""
-        slopes, inverse, gray, contrasts = zip(*parts, strict=True)
-        return cls(np.concatenate(slopes, axis=2), np.concatenate(inverse),
-                   np.concatenate(gray, axis=1), np.concatenate(contrasts))
 
     def place(self, here: Image, y: Array) -> Placed:
         """Give where they are in an image, next to y (N, 2), see ``place_exactly``."""
@@ -167,12 +160,20 @@ class _Seen:
         return places - self._whole
 
 
-def expect(image: Gray, points: Array, warp: Array) -> Expected:
-    """Tell how patches around points (N, 2) of a float32 image look through a warp (N, 3, 2)."""
+def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
+    """
+    Tell how patches around points (N, 2) look through a warp (N, 3, 2).
+
+    images: float32, in whose order the points are.
+    """
     back = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2, dtype=np.float32)
     x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
-    by_point = cv2.remap(image, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    by_point, end = np.empty_like(x), 0
+    for image, count in images:
+        these, end = slice(end, end + count), end + count
+        cv2.remap(image, x[these], y[these], cv2.INTER_LINEAR, by_point[these],
+                  cv2.BORDER_REPLICATE)
     wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)
     middle = wide[1:-1, 1:-1]
     gray = (middle - middle.mean((0, 1))).reshape(-1, len(points))

@@ -7,6 +7,7 @@ optimiser does not know which one it is given.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -21,6 +22,7 @@ from djet_ros.core.hamming import (
     intensities,
     intensities_through,
     Pixels,
+    Shown,
     smooth,
 )
 from djet_ros.core.masks import at
@@ -227,8 +229,17 @@ class DescriptorDistances:
         contrast: that of the image which they are to be compared with. Raises ValueError where a
         point is too close to the border for a descriptor, and there is no warp.
         """
-        p, q = (intensities(seen, np.asarray(points, np.int64), self._tests) if warp is None
-                else intensities_through(warp, seen, points, self._tests))
+        if warp is not None:
+            return self._through(warp, [(seen, len(points))], points, contrast)
+        return self._graded(intensities(seen, np.asarray(points, np.int64), self._tests), contrast)
+
+    def _through(self, warp: Array, images: Sequence[Shown], points: Array,
+                 contrast: float | Array) -> NDArray[Any]:
+        return self._graded(intensities_through(warp, images, points, self._tests), contrast)
+
+    def _graded(self, ends: tuple[NDArray[Any], NDArray[Any]], contrast: float | Array
+                ) -> NDArray[Any]:
+        p, q = ends
         return grades(p, q, self._grading, contrast) if self._grading else p < q
 
     def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
@@ -246,13 +257,17 @@ class DescriptorDistances:
         References are taken between pixels, so that a minimum at y comes to lie on a whole pixel:
         there a paraboloid fits without a bias. warp: (N, 3, 2) how they are seen at y.
         """
-        return self.around(self.shifted(there, x, y, warp, contrast), here, y, radius)
+        return self.around(self.shifted([(there, len(x))], x, y, warp, contrast), here, y, radius)
 
-    def shifted(self, there: NDArray[Any], x: Array, y: Array, warp: Array,
-                contrast: float) -> NDArray[Any]:
-        """Descriptors (T, N) next to x whose minima at y come to lie on whole pixels."""
+    def shifted(self, there: Sequence[Shown], x: Array, y: Array, warp: Array,
+                contrast: float | Array) -> NDArray[Any]:
+        """
+        Descriptors (T, N) next to x whose minima at y come to lie on whole pixels.
+
+        there: the images that x are in, one after the other; contrast: (N,) where they differ.
+        """
         back = times(inverses(warp[:, :2]), y - np.rint(y))
-        return self.reference(there, x - back, contrast, warp)
+        return self._through(warp, there, x - back, contrast)
 
     def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
                radius: int) -> Paraboloids:

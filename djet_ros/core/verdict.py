@@ -78,7 +78,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations,
-        rivals=(*(rival.pose for rival in track.rivals), *([Pose(R, -t)] if other_way else [])))
+        rivals=(*(rival.pose for rival in track.rivals),
+                *([Pose(R, -t)] if other_way and t.any() else [])))
 
 
 def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,

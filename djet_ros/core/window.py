@@ -46,7 +46,7 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import expect, Expected, Placed
+from djet_ros.core.patches import expect, Placed
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
@@ -413,28 +413,30 @@ class Window:
         """
         if not len(mine):
             return mine, no_paraboloids(0)
-        anchors, here = self._landmarks.anchors[mine], self._views[-1].tested
-        found, references = self._landmarks.found[mine], []
+        here, (anchors, counts) = self._views[-1].tested, self._anchored(mine)
         # Of where they are sampled: that of where they were expected would bend the scale.
         strengths = self._distances.strengths(here, np.rint(places).astype(np.int64))
-        were = self._landmarks.strengths[mine]
-        for anchor in np.unique(anchors):
-            some = anchors == anchor
-            contrast = contrast_of(strengths[some], were[some])
-            references.append(self._distances.shifted(
-                self._views[anchor].floating, found[some], places[some], warps[some], contrast))
-        fits, _ = with_minimum(self._distances.around(
-            np.concatenate(references, axis=1), here, places, radius), 'drop')
+        split = np.cumsum(counts)[:-1]
+        contrasts = [contrast_of(*parts) for parts in zip(
+            np.split(strengths, split), np.split(self._landmarks.strengths[mine], split))]
+        references = self._distances.shifted(
+            [(self._views[anchor].floating, count) for anchor, count in zip(anchors, counts)],
+            self._landmarks.found[mine], places, warps, np.repeat(contrasts, counts))
+        fits, _ = with_minimum(self._distances.around(references, here, places, radius), 'drop')
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 
     def _placed(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
         """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
-        anchors, found = self._landmarks.anchors[mine], self._landmarks.found[mine]
-        expected = Expected.together([
-            expect(self._views[anchor].gray_levels, found[some], warps[some])
-            for anchor in np.unique(anchors) for some in (anchors == anchor,)])
+        images = [(self._views[anchor].gray_levels, count)
+                  for anchor, count in zip(*self._anchored(mine))]
+        expected = expect(images, self._landmarks.found[mine], warps)
         return expected.place(self._views[-1].gray, places)
+
+    def _anchored(self, mine: NDArray[np.int64]) -> tuple[list[int], list[int]]:
+        """Give the anchors of landmarks (M,), which they are ordered by, and how many each has."""
+        anchors, counts = np.unique(self._landmarks.anchors[mine], return_counts=True)
+        return anchors.tolist(), counts.tolist()
 
     def _take(self, mine: NDArray[np.int64], fits: Paraboloids, placed: Placed) -> None:
         """Take as observations where surfaces and gray levels have landmarks (M,) together."""
