@@ -128,6 +128,17 @@ def test_few_points_are_tested_as_many_are():
         assert np.array_equal(one, other[:, :9])
 
 
+def test_patches_of_two_images_are_in_one_pass_what_each_has_by_itself():
+    rng = np.random.default_rng(5)
+    images = rng.integers(0, 256, (2, 120, 160), np.uint8)
+    points, warps = rng.uniform(20, 100, (700, 2)), np.tile(1.1 * np.eye(3, 2), (700, 1, 1))
+    together = intensities_through(warps, [(images[0], 300), (images[1], 400)], points)
+    for image, some in zip(images, (slice(0, 300), slice(300, 700))):
+        alone = intensities_through(warps[some], [(image, len(points[some]))], points[some])
+        for one, other in zip(alone, together):
+            np.testing.assert_allclose(other[:, some], one, atol=1e-3)
+
+
 def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
     smoothed = smooth(pictures()['textured'])
     points = np.array([[60, 50], [90, 60], [70, 70], [80, 66]])

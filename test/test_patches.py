@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.patches import place_exactly
+from djet_ros.core.patches import expect, place_exactly
 import numpy as np
 import pytest
 
@@ -55,6 +55,18 @@ def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
     off = np.linalg.norm(found - true, axis=1)
     assert np.median(off) < 0.02
     assert np.quantile(off, 0.95) < 0.06
+
+
+def test_patches_of_two_images_are_expected_in_one_pass_as_each_by_itself(
+        points: np.ndarray) -> None:
+    images = [image(warp, np.zeros(2)).astype(np.float32)
+              for warp in (WARPS['none'], WARPS['a roll'])]
+    warps = as_seen(WARPS['larger'], len(points))
+    together = expect([(images[0], 100), (images[1], len(points) - 100)], points, warps)
+    for there, some in zip(images, (slice(100), slice(100, None))):
+        alone = expect([(there, len(points[some]))], points[some], warps[some])
+        np.testing.assert_allclose(together.gray[:, some], alone.gray, atol=1e-3)
+        np.testing.assert_allclose(together.inverses[some], alone.inverses, rtol=1e-3)
 
 
 def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None:
