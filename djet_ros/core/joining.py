@@ -37,6 +37,9 @@ _PLACED = 4.0
 # with both shows in no difference.
 _SHARED = 2.0
 
+# Share of an upper quartile below which a median is as good as nothing; far below what is seen.
+_NOTHING = 1e-12
+
 
 def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Placed) -> JetProblem:
     """
@@ -132,5 +135,6 @@ def _noise_of_each(squared: Array) -> Array:
     two.
     """
     middle, upper = median(squared), quantile(squared, 0.75)
-    unlike = np.log2(max(upper / max(middle, 1e-300) - 1, 1.0)) * _SHARED  # 2 / nu
+    ratio = upper / max(middle, _NOTHING * upper, 1e-300)
+    unlike = np.log2(max(ratio - 1, 1.0)) * _SHARED  # 2 / nu
     return np.asarray((1 + unlike / 2 * squared) / (1 + unlike))
