@@ -127,20 +127,20 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
         x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
         cv2.remap(image, x, y, cv2.INTER_LINEAR, values[block], cv2.BORDER_REPLICATE)
 
-    each(look, _blocks(images))
+    each(look, blocks(images))
     by_end = np.asarray(cv2.transpose(values)) if len(points) else values.T
     return by_end[of_tests[0]], by_end[of_tests[1]]
 
 
-def _blocks(images: Sequence[Shown]) -> list[tuple[NDArray[np.float32], slice]]:
-    """Give passes over the points of some images: each an image, and which points."""
-    blocks, end = [], 0
+def blocks(images: Sequence[Shown]) -> list[tuple[NDArray[np.float32], slice]]:
+    """Give passes over the points of some images: each an image in float32, and which points."""
+    passes, end = [], 0
     for image, count in images:
         # OpenCV is three times as fast on floating point numbers as on short ones.
         floating, begin, end = image.astype(np.float32, copy=False), end, end + count
-        blocks += [(floating, slice(start, min(start + _WARPED_BLOCK, end)))
+        passes += [(floating, slice(start, min(start + _WARPED_BLOCK, end)))
                    for start in range(begin, end, _WARPED_BLOCK)]
-    return blocks
+    return passes
 
 
 @lru_cache(maxsize=8)

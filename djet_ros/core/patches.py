@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import gather_patches, Image, Shown
+from djet_ros.core.hamming import blocks, gather_patches, Image, Shown
 from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
@@ -164,14 +164,13 @@ def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
     """
     Tell how patches around points (N, 2) look through a warp (N, 3, 2).
 
-    images: float32, in whose order the points are.
+    images: in whose order the points are.
     """
     back = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2, dtype=np.float32)
     x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
-    by_point, end = np.empty_like(x), 0
-    for image, count in images:
-        these, end = slice(end, end + count), end + count
+    by_point = np.empty_like(x)
+    for image, these in blocks(images):
         cv2.remap(image, x[these], y[these], cv2.INTER_LINEAR, by_point[these],
                   cv2.BORDER_REPLICATE)
     wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)
