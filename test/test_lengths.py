@@ -12,7 +12,6 @@ from djet_ros.core.types import Status
 from djet_ros.lab.lengths import go, step_squares, stretch_squares, Way, way_of, WayChunk
 from djet_ros.lab.store import RecordStore
 from djet_ros.odometry.scale import Common
-from djet_ros.odometry.uncertainty import _ALIKE, _PASSED_ON
 from djet_ros.odometry.visual_odometry import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
@@ -84,13 +83,11 @@ def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
     assert way.hidden_length == pytest.approx(0.98)
     assert way.rotation_deg_per_100m == pytest.approx(0, abs=1e-6)
     assert way.turn_square_100 < 1e-6
-    # After n metres of 1 % each, steps claim a per cent of the root of n, and twice as much as
-    # they err alike; without a word of it, the unit wanders by 0.1 % a metre.
+    # After n metres of 1 % each, steps claim a per cent of the root of n; without a word of it,
+    # the unit wanders by 0.1 % a metre.
     for metres, square in ((25, way.pose_square_25), (100, way.pose_square_100)):
-        alike = 1 + 2 * _ALIKE * sum((1 - lag / metres) * _PASSED_ON**lag
-                                     for lag in range(1, metres))
         off = 1e-3 * metres * (metres / 2 + 5)
-        claimed = 0.01 * np.sqrt(metres * alike + metres**2 / 10)
+        claimed = 0.01 * np.sqrt(metres + metres**2 / 10)
         assert square == pytest.approx((off / claimed)**2 / chi2.median(6), rel=0.15)
     lost = [replace(one, status=Status.AMBIGUOUS) for one in results_of(told, told)]
     assert way_of(chunk, straight(true), lost, lost).tracked == 0

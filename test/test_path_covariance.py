@@ -129,8 +129,8 @@ def test_the_covariance_that_is_published_is_that_of_its_steps():
         result = odometry.process(Frame(frame.gray, frame.K, number * 10**8, 'camera'))
         if number:
             assert result.common is not None
-            path = path.moved_by_pair(before, result.motion, result.motion_covariance,
-                                      result.common)
+            path = path.moved(before, np.linalg.inv(before) @ result.pose,
+                              result.motion_covariance, result.common)
             assert result.pose_covariance == pytest.approx(path.pose)
         results.append(result)
         here = here @ pose(x=0.16, z=0.12)

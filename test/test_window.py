@@ -7,6 +7,7 @@ from typing import Any
 
 from djet_ros.core.bundle import in_frame, projected
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import rotation_exp, rotation_log
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.core.window import Window, WINDOW_TUNING
 import numpy as np
@@ -27,11 +28,11 @@ class Street:
     """
     Points (N, 3) beside and on a street, seen from a camera that goes a metre ahead each frame.
 
-    noise: pixels, of each place in each frame.
+    noise: pixels, of each place in each frame; turned: rad, by which each pair's rotation is off.
     """
 
-    def __init__(self, seed: int, frames: int, noise: float) -> None:
-        self.rng, self.noise = np.random.default_rng(seed), noise
+    def __init__(self, seed: int, frames: int, noise: float, turned: float = 0.0) -> None:
+        self.rng, self.noise, self.turned = np.random.default_rng(seed), noise, turned
         count = 14 * (frames + 70)
         ahead = self.rng.uniform(0, frames + 70, count)
         road = self.rng.uniform(size=count) < 0.25
@@ -52,9 +53,10 @@ class Street:
         """Points (M,) that a frame and the next have matched, and what they tell: the truth."""
         (x, here), (y, there) = self.seen(frame), self.seen(frame + 1)
         which = self.rng.permutation(np.flatnonzero(here & there))[:count]
+        R = rotation_exp(self.turned * self.rng.normal(size=3)) if self.turned else np.eye(3)
         return which, RelativePose(
-            Status.OK, np.eye(3), np.array([0.0, 0, -1]), np.eye(5) * _SURE**2, x=x[which],
-            y=y[which], y_opt=y[which], inliers=np.ones(len(which), bool))
+            Status.OK, R, np.array([0.0, 0, -1]), np.eye(5) * max(_SURE, self.turned)**2,
+            x=x[which], y=y[which], y_opt=y[which], inliers=np.ones(len(which), bool))
 
 
 class NumbersWindow(Window):
@@ -67,6 +69,7 @@ class NumbersWindow(Window):
             strengths=lambda seen, points: np.ones(len(points)))
         self._street, self._which = street, dict[tuple[float, ...], int]()
         self._frame, self.told, self.taken, self.thrown = 0, list[float](), 0, 0
+        self.pairs = list[Numbers]()
         self.start(blank())
 
     def go(self) -> float:
@@ -74,7 +77,9 @@ class NumbersWindow(Window):
         which, pair = self._street.pair(self._frame)
         self._which.update(zip(map(tuple, pair.x.tolist()), which.tolist()))
         self._frame += 1
-        return self.add(blank(), pair, 1.0).length
+        self.pairs.append(pair.R)
+        self.added = self.add(blank(), pair, 1.0)
+        return self.added.length
 
     def _measure(self) -> None:
         found, newest = self._landmarks, len(self._views) - 1
@@ -137,3 +142,31 @@ def test_noise_does_not_change_the_scale() -> None:
     drifts = np.log(last / first)
     assert abs(drifts.mean()) < 0.01
     assert drifts.std() < 0.01
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_track_turns_astray_by_less_than_half_of_what_its_pairs_do(seed: int) -> None:
+    window = NumbersWindow(Street(seed, 60, 0.1, turned=5e-4))
+    chained, here, off = np.eye(3), np.eye(4), []
+    for _ in range(60):
+        window.go()
+        chained = window.pairs[-1] @ chained
+        here = here @ window.added.onward
+        window.tell(window.added.onward)
+        off.append([np.linalg.norm(rotation_log(R)) for R in (chained, here[:3, :3])])
+    by_pairs, told = np.sqrt(np.square(off).mean(0))
+    assert told < 0.5 * by_pairs
+
+
+def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
+    window, here = NumbersWindow(Street(0, 40, 0.02)), np.eye(4)
+    ways = []
+    for number in range(40):
+        window.go()
+        onward = np.eye(4) if number == 10 else window.added.onward
+        window.tell(onward)
+        here = here @ onward
+        ways.append(onward[2, 3])
+    assert ways[9] == pytest.approx(1, abs=0.02) and ways[10] == 0
+    assert ways[11] == pytest.approx(1 + WINDOW_TUNING.mended, abs=0.02)
+    assert here[2, 3] == pytest.approx(40, abs=0.2)

@@ -55,6 +55,13 @@ class Poses:
         R = np.einsum('fij,akj->faik', self.R, self.R)
         return R, self.t[:, None] - np.einsum('faij,aj->fai', R, self.t)
 
+    def camera(self, frame: int) -> Array:
+        """Give a frame's camera in the world, (4, 4)."""
+        camera = np.eye(4)
+        camera[:3, :3] = self.R[frame].T
+        camera[:3, 3] = -self.R[frame].T @ self.t[frame]
+        return camera
+
     def joined(self, R: Array, t: Array) -> Poses:
         """Give the poses and one more, R (3, 3) and t (3,)."""
         return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]))

@@ -37,6 +37,8 @@ from djet_ros.core.geometry import (
     inverse_depths,
     patch_warp,
     rays,
+    rotation_exp,
+    rotation_log,
     skew,
     slant_warp,
     sphere_tangents,
@@ -104,6 +106,9 @@ class WindowTuning:
     # that nothing tells; landmarks that are measured in both frames are far surer
     told: float = 0.02
     guessed: float = 0.5
+    # chosen: share of the way to where the frame before is by now that a step makes up for. By
+    # all of it the track would jump, by none drift two times as much over a hundred frames
+    mended: float = 0.2
 
 
 WINDOW_TUNING = WindowTuning()
@@ -125,7 +130,8 @@ class Addition:
 
     R (3, 3), t (3,) with its length in the unit of the track: x_new = R x_before + t; sigma:
     standard deviation of the length, as if the frames before stood where the window has them, and
-    covariance (6, 6) of all of it, over R -> exp([w]_x) R and t + dt.
+    covariance (6, 6) of all of it, over R -> exp([w]_x) R and t + dt. onward: (4, 4) the newest
+    camera in the one before as that was told: with a part of what has become known of it since.
     """
 
     R: Array
@@ -133,6 +139,7 @@ class Addition:
     length: float
     sigma: float
     covariance: Array
+    onward: Array
 
 
 class Window:
@@ -156,6 +163,8 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
+        # The newest camera as it was told; its pose may have been refined since.
+        self._told = np.eye(4)
         # The newest pair and its length, where it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
         self.settled = np.empty((0, 3))
@@ -202,6 +211,10 @@ class Window:
             self._choose_keyframe()
         self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
+
+    def tell(self, motion: Array) -> None:
+        """Take note of what was told of the newest step, (4, 4), in the unit of the track."""
+        self._told = self._told @ motion
 
     def landmarks(self) -> Array:
         """Places (M, 3) of landmarks in the newest frame, in the unit of the track."""
@@ -526,7 +539,21 @@ class Window:
         J[3:, :3] = -skew(t)
         # Where rounding leaves less than nothing, nobody knows.
         return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
-                        J @ covariance @ J.T)
+                        J @ covariance @ J.T, self._onward())
+
+    def _onward(self) -> Array:
+        """
+        Go on (4, 4) from where the camera before was told to be.
+
+        By the step to the newest frame, and a part of what the one before has been refined by: a
+        track drifts less by it, but need not jump.
+        """
+        before, newest = self._poses.camera(-2), self._poses.camera(-1)
+        refined = np.linalg.inv(self._told) @ before
+        mended, share = np.eye(4), self._tuning.mended
+        mended[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
+        mended[:3, 3] = share * refined[:3, 3]
+        return np.asarray(mended @ np.linalg.inv(before) @ newest)
 
     def _settle(self, chosen: NDArray[np.bool_]) -> None:
         """Take what some landmarks tell into the prior, and drop them, before a frame goes."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -175,7 +176,7 @@ def stretch_squares(truth: Array, results: Sequence[OdometryResult], metres: flo
         last = int(np.searchsorted(gone, gone[first] + metres))
         if last >= len(truth):
             break
-        pose, path = _integrated(results[first + 1:last + 1], *_unit_before(first, gone, results))
+        pose, path = _integrated(results[first:last + 1], *_unit_before(first, gone, results))
         true = np.linalg.inv(truth[first]) @ truth[last]
         off = np.concatenate([true[:3, 3] - pose[:3, 3],
                               rotation_log(true[:3, :3] @ pose[:3, :3].T)])
@@ -202,22 +203,21 @@ def _unit_before(first: int, gone: Array, results: Sequence[OdometryResult]
 
 def _integrated(results: Sequence[OdometryResult], unit: float, variance: float, wandered: float
                 ) -> tuple[Array, PathCovariance]:
-    """Chain steps in a unit, given with its variance and how far the scale had wandered then."""
+    """
+    Go on from the first of some results, as all were told, in a unit.
+
+    It is given with its variance and how far the scale had wandered when it was told.
+    """
     scaled = np.diag([np.exp(unit)] * 3 + [1.0] * 3)
     pose, path = np.eye(4), PathCovariance()
-    for result in results:
-        motion = result.motion.copy()
+    for before, result in pairwise(results):
+        motion = np.linalg.inv(before.pose) @ result.pose
         motion[:3, 3] *= np.exp(unit)
         common = result.common and Common(np.array(
             [variance + max(_wandered(result) - wandered, 0.0), 0.0]), np.ones(2))
-        moved = path.moved_by_pair if _told(result) else path.moved
-        path = moved(pose, motion, scaled @ result.motion_covariance @ scaled, common)
+        path = path.moved(pose, motion, scaled @ result.motion_covariance @ scaled, common)
         pose = pose @ motion
     return pose, path
-
-
-def _told(result: OdometryResult) -> bool:
-    return result.status in TRACKED and not result.stationary
 
 
 def _wandered(result: OdometryResult) -> float:

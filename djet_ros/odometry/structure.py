@@ -10,6 +10,7 @@ coarse or missing, and where the source falls silent the last factor goes on, le
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Array, Pose, RelativePose, View
@@ -44,6 +45,19 @@ _TOGETHER = 1.0
 # Least share of landmarks that agree with a right motion (0.75 was the least that was seen), how
 # improbable fewer have to be, and how many landmarks tell nothing.
 _RIGHT, _BY_CHANCE, _FEW = 0.75, 1e-3, 8
+
+
+class Step(NamedTuple):
+    """
+    A step of the track.
+
+    relative: the motion that was estimated, in length; onward: (4, 4) the current camera in the
+    one before as the track goes on, where landmarks that outlast pairs tell that.
+    """
+
+    relative: RelativePose
+    length: Length
+    onward: Array | None = None
 
 
 class OneScale:
@@ -100,23 +114,22 @@ class OneScale:
         if self._speed is not None:
             self._doubt(_TORN**2)
 
-    def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose
-                ) -> tuple[RelativePose, Length]:
+    def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Step:
         """
         Give a step whose motion was estimated, from the newest frame of the track on, its length.
 
-        Gives the motion too: that of the pair, but where it has too little parallax to tell of a
+        Its motion is that of the pair, but where it has too little parallax to tell of a
         translation, what landmarks tell that were seen from further away.
         """
         measured = self._source.between(*span_ns)
         if not self._carried:
-            return relative, self._in_metres(measured)
+            return Step(relative, self._in_metres(measured))
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
         addition = self._added(current, relative, guess)
         if addition is None:
-            return relative, (self._in_metres(measured) if measured.known
-                              else unknown(guess * float(np.exp(self._log))))
+            return Step(relative, self._in_metres(measured) if measured.known
+                        else unknown(guess * float(np.exp(self._log))))
         if not relative.t.any():
             relative = _as_landmarks_tell(relative, addition, guess)
         own = self._wandered(addition, relative, seconds)
@@ -124,19 +137,37 @@ class OneScale:
             self._hear(measured, addition.length, own, seconds)
             # Until the factor is known, lengths are as sure as they are measured.
             if self._source.exact or not self._metric:
-                return relative, self._in_metres(measured)
+                return self._onward(relative, self._in_metres(measured), addition, True)
         value = addition.length * float(np.exp(self._log))
         # The factor of a relative scale is that of the whole track, and no error of a step.
         common = np.hypot(np.sqrt(self._variance), self._share) if self._metric else 0.0
-        return relative, Length(value, value * float(np.hypot(own, common)), True, self._metric,
-                                measured.known, self._common(self._variance, self._metric))
+        length = Length(value, value * float(np.hypot(own, common)), True, self._metric,
+                        measured.known, self._common(self._variance, self._metric))
+        return self._onward(relative, length, addition)
 
-    def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> None:
+    def _onward(self, relative: RelativePose, length: Length, addition: Addition,
+                as_measured: bool = False) -> Step:
+        """
+        Give a step that goes on as the window has it.
+
+        as_measured: whether its length is right as it is, and the window's is not asked; nor is it
+        where landmarks do not tell any.
+        """
+        onward = addition.onward.copy()
+        if as_measured or not relative.t.any():
+            onward[:3, 3] = -addition.length * relative.R.T @ relative.t
+        self._window.tell(onward)
+        onward[:3, 3] *= length.value / addition.length
+        return Step(relative, length, onward)
+
+    def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose,
+               told: Array) -> None:
         """
         Go on at a frame whose motion is in doubt, from the newest frame of the track on.
 
-        Where the best guess of it gives landmarks their depths, they are seen on; the track tells
-        no motion then, but does not lose its scale. Otherwise it begins anew.
+        Where the best guess of it gives landmarks their depths, they are seen on: the track does
+        not lose its scale, and steps to come make up for what was `told` (4, 4), a turn at most.
+        Otherwise it begins anew.
         """
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         if self._speed is None or not relative.t.any() or not self.agrees(
@@ -144,6 +175,7 @@ class OneScale:
             self.begin(current)
         elif (addition := self._added(current, relative, self._speed * seconds)) is not None:
             self._wandered(addition, relative, seconds)
+            self._window.tell(told)
 
     def of_rest(self, span_ns: tuple[int, int]) -> Length:
         """Length that a step would have had where the camera stands, or the motion is unknown."""

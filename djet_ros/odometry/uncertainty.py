@@ -100,7 +100,7 @@ class PathCovariance:
     def moved(self, pose: Array, motion: Array, covariance: Array,
               common: Common | None = None) -> PathCovariance:
         """
-        Give that of ``pose @ motion``, both (4, 4), for a motion that no pair of images tells.
+        Give that of ``pose @ motion``, both (4, 4), for a motion that errs by itself.
 
         covariance: (6, 6) of what errs in the motion alone; common: of its length, beside that.
         """
@@ -112,7 +112,7 @@ class PathCovariance:
     def moved_by_pair(self, pose: Array, motion: Array, covariance: Array,
                       common: Common | None = None) -> PathCovariance:
         """
-        Give that of ``pose @ motion``, both (4, 4), for a motion that a pair of images told.
+        Give that of ``pose @ motion``, both (4, 4), for a motion that a pair alone has told.
 
         Pairs that follow one another see the same things, and err alike.
         """

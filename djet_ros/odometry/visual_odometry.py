@@ -23,7 +23,7 @@ from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
 from djet_ros.odometry.scale import Common, Length, Scale, scale_source, ScaleSource
 from djet_ros.odometry.standstill import Standstill
-from djet_ros.odometry.structure import OneScale
+from djet_ros.odometry.structure import OneScale, Step
 from djet_ros.odometry.uncertainty import (
     motion_covariance,
     PathCovariance,
@@ -198,24 +198,33 @@ class VisualOdometry:
 
         # Its length in the one scale of the track, by what frames share or by what measures it.
         waits = self._waits(relative)
-        told, length = ((relative, self._one_scale.of_rest(span)) if waits
-                        else self._one_scale.of_step(span, view, relative))
+        step = (Step(relative, self._one_scale.of_rest(span)) if waits
+                else self._one_scale.of_step(span, view, relative))
 
         # Integrate the motion and its uncertainty; this frame is the next reference.
-        motion = camera_motion(told, length.value)
-        path = self._path.moved_by_pair(
-            self._pose, motion, motion_covariance(told, length.own), length.common)
+        motion = camera_motion(step.relative, step.length.value)
+        pose, path = self._integrated(step, motion)
         keyframe = self._one_scale.keyframe
-        result = self._result(frame, relative.status, relative, length, motion,
-                              motion_covariance(told, length), path,
+        result = self._result(frame, relative.status, relative, step.length, motion,
+                              motion_covariance(step.relative, step.length), pose, path,
                               keyframe=None if keyframe is None else keyframe and not waits)
         if not waits:
-            self._pose, self._path = result.pose, path
+            self._pose, self._path = pose, path
             self._refer_to(frame, view)
         self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
         return result
+
+    def _integrated(self, step: Step, motion: Array) -> tuple[Array, PathCovariance]:
+        """Go on by a step: as landmarks have it that outlast pairs, or by the pair alone."""
+        covariance, common = motion_covariance(step.relative, step.length.own), step.length.common
+        if step.onward is not None:
+            # What neighbouring pairs err alike, landmarks that both of them see put right.
+            return self._pose @ step.onward, self._path.moved(
+                self._pose, step.onward, covariance, common)
+        return self._pose @ motion, self._path.moved_by_pair(
+            self._pose, motion, covariance, common)
 
     def _waits(self, relative: RelativePose) -> bool:
         """Tell whether the reference stays until a pair with it tells the way."""
@@ -333,7 +342,7 @@ class VisualOdometry:
         # The reference frame may be a keyframe, and serves both.
         keyframe = None if self._one_scale.keyframe is None else False
         result = self._result(frame, Status.NO_PARALLAX, relative, length, np.eye(4), covariance,
-                              self._path.moved(self._pose, np.eye(4), covariance),
+                              self._pose, self._path.moved(self._pose, np.eye(4), covariance),
                               stationary=True, keyframe=keyframe)
         # What it has crept by now is part of the motion that will be told one day.
         crept = self._standstill.crept(relative, self._config.standstill)
@@ -353,12 +362,13 @@ class VisualOdometry:
         given_up = self._bad_pairs >= self._config.max_lost
         motion, covariance = self._carried(frame)
         path = self._path.moved(self._pose, motion, covariance)
-        result = self._result(frame, relative.status, relative, length, motion, covariance, path)
+        result = self._result(frame, relative.status, relative, length, motion, covariance,
+                              self._pose @ motion, path)
         if given_up or relative.status in UNDECIDED:
             if given_up:
                 self._one_scale.begin(view)
             else:
-                self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative)
+                self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative, motion)
             self._refer_to(frame, view)
             self._pose, self._path = result.pose, path
             if self._prior is not None:
@@ -384,11 +394,11 @@ class VisualOdometry:
                 one.forget_before(self._since_ns)
 
     def _result(self, frame: Frame, status: Status, relative: RelativePose, length: Length,
-                motion: Array, covariance: Array, path: PathCovariance,
+                motion: Array, covariance: Array, pose: Array, path: PathCovariance,
                 stationary: bool = False, keyframe: bool | None = None) -> OdometryResult:
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
-            self._pose @ motion, covariance, path.pose, length.value, length.known, stationary,
+            pose, covariance, path.pose, length.value, length.known, stationary,
             self._since_ns, self._since_covariance, length.metric, length.measured, length.common,
             keyframe)
 
