@@ -1,7 +1,7 @@
 """Corners are spread, real and between pixels, whatever the image."""
 
 import cv2
-from djet_ros.core.corners import corner_slopes, detect_corners, spread_out
+from djet_ros.core.corners import corner_slopes, detect_corners, noise_of, spread_out
 from djet_ros.core.hamming import describable
 import numpy as np
 import pytest
@@ -41,6 +41,32 @@ def test_a_stair_stepped_edge_has_no_corners():
     # It has where it leaves the image.
     inside = (features.points[:, 1] > 60) & (features.points[:, 1] < 240)
     assert not inside.any()
+
+
+def noisy(image, sigma):
+    noise = np.random.default_rng(3).normal(0, sigma, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize('sigma', [2, 5, 15])
+def test_noise_alone_has_no_corners(sigma):
+    assert len(detect_corners(noisy(np.full((480, 640), 128.0), sigma), 2000, 1.0)) < 10
+
+
+def test_corners_are_found_in_noise_and_no_others():
+    image, corners = squares(100)
+    features = detect_corners(noisy(image, 8), 2000, 1.0)
+    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    assert ways.min(0).max() <= 10
+    assert (ways.min(1) <= 10).mean() > 0.97
+
+
+@pytest.mark.parametrize('sigma', [2, 5, 15])
+def test_noise_is_told_where_an_image_is_flat(image, sigma):
+    image = np.tile(image, (2, 2))
+    image[:, :300] = 90
+    assert noise_of(noisy(image, sigma)) == pytest.approx(sigma, rel=0.2)
+    assert noise_of(image) == 0
 
 
 def test_slopes_are_told_in_gray_levels_per_pixel():

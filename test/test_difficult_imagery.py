@@ -126,6 +126,11 @@ def rolling(i: int, gray: Gray) -> Gray:
         np.uint8)
 
 
+def grainy(i: int, gray: Gray) -> Gray:
+    return np.clip(np.rint(gray + np.random.default_rng(i).normal(0, 12, gray.shape)),
+                   0, 255).astype(np.uint8)
+
+
 def wrong_matches(share: float) -> Iterator[Outcome]:
     """Give the inliers of a pair, with a share of them replaced by matches to anywhere."""
     scene = make_scene('road', size=SIZE)
@@ -158,6 +163,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     '3 of 8 frames out of focus': partial(drive, 'blur'),
     'every third frame dropped': partial(drive, 'road', keep=lambda i: i % 3 != 1),
     'dim and hazy water, particles': partial(drive, 'underwater'),
+    'noise of 12 gray levels': partial(drive, 'indoor', grainy),
     '1 % of the matches wrong': lambda: wrong_matches(0.01),
     '50 % of the matches wrong': lambda: wrong_matches(0.5),
     'half of the image moves by itself': partial(drive, 'moving_object'),

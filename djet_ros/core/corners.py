@@ -16,6 +16,7 @@ from djet_ros.core.cells import rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import at, Mask
 from djet_ros.core.orb_pattern import REACH
+from djet_ros.core.paraboloid import quantile
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Features
 import numpy as np
@@ -50,6 +51,19 @@ _ENOUGH = 0.9
 # The strongest of each cell of this side, in pixels, come first, then the second, and so on.
 _CELL = 40
 
+# Of noise alone no corner has a slope of more than 0.6 of its standard deviation a pixel; chosen:
+# somewhat more, as the flattest blocks tell an eighth too little of it.
+_ABOVE_NOISE = 0.8
+
+# Second differences along rows of those along columns: what a slope or an edge along either has
+# none of, and six times the standard deviation of noise (Immerkaer, CVIU 64, 1996).
+_TWICE_CURVED = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
+_OF_NOISE = 6.0
+
+# Side in pixels of the blocks in which noise is told, from one row of them to the next, and which
+# share of the blocks is taken to be flat.
+_FLAT_BLOCK, _ROWS_APART, _FLAT = 8, 96, 0.2
+
 # Sum of the weights of a Sobel operator's side, times its distance: its answer to a slope of 1.
 _SOBEL = 8.0
 
@@ -60,10 +74,10 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     Detect corners in a gray image (H, W) uint8; images too small for a descriptor give none.
 
     contrast: rms slope, in gray levels per pixel, that a corner has at least in its weakest
-    direction. Points lie between pixels; descriptors are ORB's, unrotated, of the nearest pixels
-    in the image made smaller. Octaves number the sizes; where there are enough without it, those
-    of the middle size are the others. mask: (H, W) bool, where no point may be; smoothed: gray as
-    ORB's tests see it, where that is known already.
+    direction, and more than noise makes of nothing. Points lie between pixels; descriptors are
+    ORB's, unrotated, of the nearest pixels in the image made smaller. Octaves number the sizes;
+    where there are enough without it, those of the middle size are the others. mask: (H, W) bool,
+    where no point may be; smoothed: gray as ORB's tests see it, where that is known already.
     """
     def of_size(octave: int, most: int) -> Features:
         return _of_size(gray, octave, most, contrast, mask, smoothed)
@@ -73,6 +87,22 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     if len(found) < _ENOUGH * sum(wanted[octave] for octave in _FOLLOWED):
         return Features.together([found, of_size(_BETWEEN, max_features - len(found))])
     return replace(found, others=lambda: of_size(_BETWEEN, wanted[_BETWEEN]))
+
+
+def noise_of(image: Image) -> float:
+    """Tell the standard deviation of an image's noise, in gray levels, where it is flattest."""
+    first = np.arange(0, len(image) - _FLAT_BLOCK - 1, _ROWS_APART)
+    across = image.shape[1] // _FLAT_BLOCK
+    if not len(first) or not across:
+        return 0.0
+    rows = image[first[:, None] + np.arange(_FLAT_BLOCK + 2)]
+    curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_32F, _TWICE_CURVED)
+    # The rows beside each row of blocks are there for its differences.
+    whole = np.abs(curved.reshape(rows.shape)[:, 1:-1, :across * _FLAT_BLOCK])
+    means = cv2.resize(whole.reshape(-1, whole.shape[2]), (across, len(first)),
+                       interpolation=cv2.INTER_AREA)
+    # The mean of what is normal, whatever its sign, is sqrt(2 / pi) of its standard deviation.
+    return float(quantile(np.ravel(means), _FLAT) * np.sqrt(np.pi / 2) / _OF_NOISE)
 
 
 def corner_slopes(image: Image) -> NDArray[np.float32]:
@@ -165,7 +195,7 @@ def _of_size(gray: Image, octave: int, most: int, contrast: float, mask: Mask | 
         return Features.described(np.empty((0, 2)), np.empty(0, np.int32), none, none,
                                   np.empty((0, 32), np.uint8))
     image = _made_smaller(gray, scale)
-    slopes = corner_slopes(image)
+    slopes, contrast = corner_slopes(image), max(contrast, _ABOVE_NOISE * noise_of(image))
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
 
     def peaks(apart: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -31,8 +31,8 @@ class EstimatorConfig:
         'corners', 'features: corners (well spread, of three sizes, descriptors unrotated) or orb '
         '(as OpenCV detects them, descriptors rotated)', choices=('corners', 'orb'))
     corner_contrast: float = parameter(
-        1.0, 'slope in its weakest direction that makes a corner, in gray levels per pixel; lower '
-        'it for dim images', minimum=0.01, maximum=100.0)
+        1.0, 'slope in its weakest direction that makes a corner, in gray levels per pixel; noise '
+        'asks for more by itself; lower it for dim images', minimum=0.01, maximum=100.0)
     fast_threshold: int = parameter(
         20, 'contrast in gray levels that makes a feature of the detector orb',
         minimum=1, maximum=255)
