@@ -82,7 +82,10 @@ def flat(level: int) -> Gray:
 
 
 def noise(seed: int, size: tuple[int, int] = (320, 240)) -> Gray:
-    return np.random.default_rng(seed).integers(0, 256, size[::-1], dtype=np.uint8)
+    """Grains of some pixels; what differs from pixel to pixel has no corners."""
+    grains = np.random.default_rng(seed).integers(
+        0, 256, (max(size[1] // 3, 1), max(size[0] // 3, 1)), np.uint8)
+    return np.asarray(cv2.resize(grains, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def one_feature() -> Gray:
