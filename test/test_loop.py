@@ -94,5 +94,6 @@ def test_live_it_shrinks_by_a_factor_too(block):
         return position_rmse(aligned(positions, true, scaled=False), true)
 
     assert len(before) == 214
-    # What both laps have in common no loop can tell, and the odometry leaves little more.
-    assert error(after) < min(error(before) / 2, 0.25)
+    # What both laps have in common no loop can tell, and the odometry leaves little more: a tenth
+    # of a metre of 362.
+    assert error(after) < min(error(before) / 1.5, 0.06)
