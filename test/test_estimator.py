@@ -22,6 +22,7 @@ from djet_ros.core.geometry import (
     line_distances,
     rays,
     rotation_angle,
+    rotation_log,
     sphere_tangents,
     unit,
 )
@@ -232,6 +233,19 @@ def test_turning_on_the_spot_is_told_from_going():
     assert result.status == Status.NO_PARALLAX
     assert not result.t.any()
     assert errors_of(result, seen.R, seen.t)[0] < 0.02
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_way_too_short_to_be_told_does_not_bend_the_rotation(seed):
+    seen = two_views(np.random.default_rng(seed), count=500, near=500, far=1500)
+    y = seen.y + np.random.default_rng(seed + 50).normal(0, 0.03, seen.y.shape)
+    result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
+        uniform_view(), uniform_view(), seen.x, y)
+    assert result.status == Status.NO_PARALLAX
+    off = rotation_log(seen.R @ result.R.T)
+    # All go to one side alike by more than a pixel, which a turn by itself does too.
+    assert np.linalg.norm(off) < 0.1 / 700
+    assert off @ np.linalg.solve(result.covariance_6[:3, :3], off) < 16.3
 
 
 class WatchedSurface(DescriptorSurface):

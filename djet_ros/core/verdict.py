@@ -64,10 +64,11 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         status = Status.TOO_FEW_INLIERS
     else:
         # Where a rotation alone explains the matches, any direction of t would do.
-        R_alone = fit_rotation(rays_x, rays_y)
+        R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale()
         parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
-        if parallax < max(config.min_parallax, _OUT_OF_NOISE * track.scale()):
-            status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
+        if parallax < max(config.min_parallax, noise):
+            # It is bent by a translation that is small, but out of noise.
+            status, R, t = (Status.NO_PARALLAX, R_alone if parallax < noise else R, np.zeros(3))
         else:
             status, covariances = _judged(Pose(R, t), covariances, track, pair.before, other_way)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
