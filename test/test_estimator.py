@@ -236,15 +236,15 @@ def test_turning_on_the_spot_is_told_from_going():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_way_too_short_to_be_told_does_not_bend_the_rotation(seed):
+def test_a_turn_that_makes_up_for_a_way_too_short_to_be_told_says_how_far_it_may_be_bent(seed):
     seen = two_views(np.random.default_rng(seed), count=500, near=500, far=1500)
     y = seen.y + np.random.default_rng(seed + 50).normal(0, 0.03, seen.y.shape)
     result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
         uniform_view(), uniform_view(), seen.x, y)
     assert result.status == Status.NO_PARALLAX
     off = rotation_log(seen.R @ result.R.T)
-    # All go to one side alike by more than a pixel, which a turn by itself does too.
-    assert np.linalg.norm(off) < 0.1 / 700
+    # All go to one side alike by half a pixel and more, which a turn by itself does too.
+    assert np.linalg.norm(off) > 0.5 / 700
     assert off @ np.linalg.solve(result.covariance_6[:3, :3], off) < 16.3
 
 

@@ -10,6 +10,7 @@ from djet_ros.core.geometry import (
     fundamental,
     line_distances,
     rays,
+    rotation_log,
     sides,
 )
 from djet_ros.core.hamming import match_distances
@@ -67,8 +68,11 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale()
         parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
         if parallax < max(config.min_parallax, noise):
-            # It is bent by a translation that is small, but out of noise.
-            status, R, t = (Status.NO_PARALLAX, R_alone if parallax < noise else R, np.zeros(3))
+            if parallax >= noise:
+                # What is out of noise is a way, which the turn by itself makes up for.
+                bent = np.append(rotation_log(R_alone @ R.T), [0.0, 0.0])
+                covariances = spanning(covariances[0], t, bent, 1.0)
+            status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
             status, covariances = _judged(Pose(R, t), covariances, track, pair.before, other_way)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
