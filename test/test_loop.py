@@ -4,6 +4,7 @@ A rendered block, driven twice: what closing the loop is good for.
 Images are small, so that the odometry drifts a lot; lengths are the true ones.
 """
 
+from itertools import accumulate
 import json
 import os
 import subprocess
@@ -68,6 +69,7 @@ def test_live_it_shrinks_by_a_factor_too(block):
     hear = {'relative_pose_cov': slam.relative_pose, 'odometry': slam.odometry,
             'relative_pose_status': slam.relative_pose_status}
     before, pairs, images = {}, {}, 0
+    told = {'odometry': before, 'relative_pose_cov': pairs}
     for topic, _, message in source.messages({source.image_topic, source.info_topic}):
         if topic == source.info_topic:
             tracker.camera_info(message)
@@ -81,10 +83,8 @@ def test_live_it_shrinks_by_a_factor_too(block):
         for name, said in tracker.image(message):
             if name in hear:
                 hear[name](said)
-            if name == 'odometry':
-                before.update([pose_of(said)])
-            if name == 'relative_pose_cov':
-                pairs.update([pose_of(said)])
+            if name in told:
+                told[name].update([pose_of(said)])
         while not slam.idle:
             slam.work()
     path = dict(slam.work(at_once=True))['path']
@@ -95,10 +95,8 @@ def test_live_it_shrinks_by_a_factor_too(block):
         true = np.array([truth[stamp][:3, 3] for stamp in after])
         return position_rmse(aligned(positions, true, scaled=False), true)
 
-    here, chained = np.eye(4), {}
-    for stamp in before:
-        here = here @ pairs.get(stamp, np.eye(4))
-        chained[stamp] = here
+    chained = dict(zip(before, accumulate(
+        (pairs.get(stamp, np.eye(4)) for stamp in before), np.matmul)))
     assert len(before) == 214
     # What both laps have in common no loop can tell, and the odometry leaves little more than it:
     # it goes by landmarks already, and pairs are what a graph begins with.
