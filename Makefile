@@ -10,6 +10,8 @@ REAL_FRAMES ?=
 ONLY ?=
 TABLES ?= dds soak outvoted links loops 'live loops' 'camera height' 'short ways' coverage
 SEEDS ?= 0,1,2,3,4
+# what an installation is made of, beside what it finds in place
+BUILT := setup.py $(wildcard djet_ros/compiled/*.[ch])
 # in the order of their names: files of few tests, some of them long, would come last
 PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
@@ -63,11 +65,11 @@ pages: $(VENV)/.installed-test,peers
 clean:
 	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info
 
-$(VENV)/.installed: setup.py | $(VENV)/bin/pip
+$(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .
 	touch $@
 
-$(VENV)/.installed-%: setup.py | $(VENV)/bin/pip
+$(VENV)/.installed-%: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable '.[$*]'
 	touch $@
 
@@ -75,7 +77,7 @@ $(AUDIT)/.installed: setup.py | $(AUDIT)/bin/pip
 	$(AUDIT)/bin/pip install --quiet --editable '.[audit,cluster,dds,peers,slam]'
 	touch $@
 
-$(LOWEST)/.installed-test: setup.py test/lowest.txt | $(LOWEST)/bin/pip
+$(LOWEST)/.installed-test: $(BUILT) test/lowest.txt | $(LOWEST)/bin/pip
 	$(LOWEST)/bin/pip install --quiet --editable '.[test]' --constraint test/lowest.txt
 	touch $@
 

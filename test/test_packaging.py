@@ -20,8 +20,8 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 NODES = ('vo_node', 'pose_graph_node')
-NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.egg-info', 'build', 'demo', 'fuzz',
-                                    'install', 'log')
+NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.so', '*.egg-info', 'build', 'demo',
+                                    'fuzz', 'install', 'log')
 COLCON = Path(sys.executable).with_name('colcon')
 
 needs_colcon = pytest.mark.skipif(not COLCON.exists(), reason=f'no {COLCON}')
@@ -47,16 +47,21 @@ def copied(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 @pytest.fixture(scope='module')
 def environment(copied: Callable[[str], Path]) -> Path:
     """Install, without dependencies, the wheel built from the source distribution."""
-    pytest.importorskip('pip')
-    if Version(version('setuptools')) < Version('70.1'):
-        pytest.skip('setuptools before 70.1 builds no wheels by itself')
     source = copied('pip')
     folder = source.parents[1]
     run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', folder, cwd=source)
     archive, = folder.glob('*.tar.gz')
+    return installed(archive, folder)
+
+
+def installed(source: Path, folder: Path) -> Path:
+    """Build the wheel, and install it without dependencies into a new environment in a folder."""
+    pytest.importorskip('pip')
+    if Version(version('setuptools')) < Version('70.1'):
+        pytest.skip('setuptools before 70.1 builds no wheels by itself')
     offline = ('--no-index', '--no-deps')
     run(sys.executable, '-m', 'pip', 'wheel', *offline, '--no-build-isolation', '--wheel-dir',
-        folder, archive, cwd=folder)
+        folder, source, cwd=folder)
     wheel, = folder.glob('*.whl')
     run(sys.executable, '-m', 'venv', '--without-pip', 'venv', cwd=folder)
     run(sys.executable, '-m', 'pip', '--python', folder / 'venv', 'install', *offline, wheel,
@@ -95,6 +100,28 @@ def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
         assert (environment / 'bin' / node).exists()
     assert not (environment / 'lib' / 'djet_ros').exists()
     assert shares_its_files(environment)
+
+
+def has_compiled_loops(python: Path, cwd: Path) -> bool:
+    """Whether the package that is installed beside an interpreter finds them."""
+    return run(python, '-c', 'from pathlib import Path\n'
+               'import djet_ros\nprint(*Path(djet_ros.__file__).parent.glob("compiled/_loops*"))',
+               cwd=cwd) != '\n'
+
+
+@pytest.mark.skipif(shutil.which('cc') is None, reason='no C compiler')
+def test_pip_compiles_inner_loops_from_the_source_distribution(environment: Path) -> None:
+    assert has_compiled_loops(environment / 'bin' / 'python', environment)
+
+
+def test_pip_installs_all_else_without_a_compiler(
+        copied: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('CC', 'false')
+    source = copied('bare')
+    folder = source.parents[1]
+    python = installed(source, folder) / 'bin' / 'python'
+    assert not has_compiled_loops(python, folder)
+    assert run(python.with_name('djet'), '--version', cwd=folder)
 
 
 @needs_colcon

@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import times
 from djet_ros.core.types import Array
@@ -345,6 +346,12 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
 
     weights: (M,) of the observations; weight: that of where the landmarks were found.
     """
+    if compiled.library is not None:
+        o = observed
+        return Reduced(*compiled.eliminate(
+            (o.landmark, o.frame, o.anchor),
+            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
+            (o.held, o.off, weight), (o.K, inverse_of(o.K)), (_NEAREST, _TRACE), frames))
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root

@@ -9,11 +9,26 @@ graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
-from djet_ros.core.hamming import Image, Pixels, sum_over_tests, Tests
-from djet_ros.core.orb_pattern import TESTS
+from djet_ros import compiled
+from djet_ros.core.hamming import (
+    blocks,
+    ends_of,
+    Image,
+    intensities_through,
+    looks_through,
+    MOST_NEARER,
+    Pixels,
+    require_describable,
+    Shown,
+    sum_over_tests,
+    Tests,
+)
+from djet_ros.core.orb_pattern import reach as reach_of, TESTS
+from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +60,30 @@ def grades(p: NDArray[Any], q: NDArray[Any], grading: float,
     return np.asarray(np.clip(differences, -reach, reach), np.int16)
 
 
+def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading: float,
+                   contrast: float | Array, tests: Tests = TESTS) -> Grades:
+    """
+    Grades (T, N) of tests on patches seen through a warp, see `hamming.intensities_through`.
+
+    contrast: as in `grades`.
+    """
+    if compiled.library is None:
+        return grades(*intensities_through(warp, images, points, tests), grading, contrast)
+    inverse, nearer, is_bent = looks_through(warp, tests)
+    nearer[~is_bent] = 0
+    places, ends = points.astype(np.float32), ends_of(tests)
+    of_each = np.broadcast_to(np.float32(contrast), len(points))
+
+    def look(task: tuple[NDArray[np.float32], slice]) -> Grades:
+        image, some = task
+        return compiled.grades_through(
+            image, (inverse[some], nearer[some]), places[some], of_each[some], ends,
+            _reach(grading), MOST_NEARER)
+
+    none = np.empty((len(tests), 0), np.int16)
+    return np.concatenate([none, *each(look, blocks(images, max(len(points), 1)))], axis=1)
+
+
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,
                     grading: float, tests: Tests = TESTS) -> NDArray[np.float32]:
     """
@@ -55,6 +94,10 @@ def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: in
     [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
     """
     reach = _reach(grading)
+    if compiled.library is not None:
+        require_describable(centres, fine, radius, tests)
+        return compiled.graded_surfaces(reference, fine, centres, radius, tests, reach_of(tests),
+                                        reach)
 
     def differ(outcomes: Grades, reference: Grades) -> NDArray[np.uint16]:
         np.clip(outcomes, np.int16(-reach), np.int16(reach), out=outcomes)

@@ -38,7 +38,7 @@ _WARPED_BLOCK = 256
 _BENT = 0.02
 
 # chosen: no part of a patch is nearer, or farther, than its middle by a larger factor.
-_MOST_NEARER = 2.0
+MOST_NEARER = 2.0
 
 # Tests times points below which it takes longer to gather patches than to look where tests do.
 _FEW = 20_000
@@ -105,13 +105,8 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
     is seen at their dy: of dy = W dx / (1 + c^T dx), that is dx = u / (1 - c^T u) with
     u = W^-1 dy. Beyond the image its border goes on.
     """
-    inverse = inverses(warp[:, :2])
-    nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
-    # The ends of tests are up to sqrt(2) times their reach from the point.
-    bend = 2 * reach(tests)**2 * np.sqrt(np.einsum('nij,nij->n', inverse, inverse)
-                                         * np.einsum('nj,nj->n', nearer, nearer))
-    inverse, nearer = inverse.astype(np.float32), nearer.astype(np.float32)
-    ends, of_tests = _ends(tests.tobytes())
+    inverse, nearer, is_bent = looks_through(warp, tests)
+    ends, of_tests = ends_of(tests)
     places = points.astype(np.float32)
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
@@ -119,9 +114,9 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
         # Points first: what is near one another in the image comes one after the other.
         image, block = task
         away = [inverse[block, axis] @ ends for axis in (0, 1)]
-        bent = np.flatnonzero(bend[block] > _BENT)
+        bent = np.flatnonzero(is_bent[block])
         if len(bent):
-            depths = (1 - nearer[block][bent] @ ends).clip(1 / _MOST_NEARER, _MOST_NEARER)
+            depths = (1 - nearer[block][bent] @ ends).clip(1 / MOST_NEARER, MOST_NEARER)
             for along in away:
                 along[bent] /= depths
         x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
@@ -132,20 +127,44 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
     return by_end[of_tests[0]], by_end[of_tests[1]]
 
 
-def blocks(images: Sequence[Shown]) -> list[tuple[NDArray[np.float32], slice]]:
-    """Give passes over the points of some images: each an image in float32, and which points."""
+def looks_through(warp: Array, tests: Tests
+                  ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """
+    Tell how tests look through warps (N, 3, 2): W^-1 (N, 2, 2), c^T W^-1 (N, 2).
+
+    And (N,) whether the latter matters.
+    """
+    inverse = inverses(warp[:, :2])
+    nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
+    # The ends of tests are up to sqrt(2) times their reach from the point.
+    bend = 2 * reach(tests)**2 * np.sqrt(np.einsum('nij,nij->n', inverse, inverse)
+                                         * np.einsum('nj,nj->n', nearer, nearer))
+    return inverse.astype(np.float32), nearer.astype(np.float32), bend > _BENT
+
+
+def blocks(images: Sequence[Shown], at_once: int = _WARPED_BLOCK
+           ) -> list[tuple[NDArray[np.float32], slice]]:
+    """
+    Give passes over the points of some images: each an image in float32, and which points.
+
+    at_once: so many of them at most.
+    """
     passes, end = [], 0
     for image, count in images:
         # OpenCV is three times as fast on floating point numbers as on short ones.
         floating, begin, end = image.astype(np.float32, copy=False), end, end + count
-        passes += [(floating, slice(start, min(start + _WARPED_BLOCK, end)))
-                   for start in range(begin, end, _WARPED_BLOCK)]
+        passes += [(floating, slice(start, min(start + at_once, end)))
+                   for start in range(begin, end, at_once)]
     return passes
+
+
+def ends_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Places (2, E) at which tests (T, 4) look, each of them once, and which (2, T) a test has."""
+    return _ends(tests.tobytes())
 
 
 @lru_cache(maxsize=8)
 def _ends(tests: bytes) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Places (2, E) at which tests (T, 4) look, each of them once, and which (2, T) a test has."""
     ends = np.frombuffer(tests, np.int64).reshape(-1, 2, 2).transpose(1, 0, 2)
     places, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
     return places.T.astype(np.float32), which.reshape(2, -1)

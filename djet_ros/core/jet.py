@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from djet_ros import compiled
 from djet_ros.core.geometry import (
     GENERATORS,
     inverse_of,
@@ -36,6 +37,10 @@ _MAX_DAMPING = 1e6
 # chosen: by its weight alone, as if all others were right, a match makes steps too short; by the
 # bend of its loss, too long where many are false. Half way takes three steps of four.
 LEAST_CURVED = 0.3
+
+# As those of it that are compiled take them.
+_LIMITS = np.array([_STEP_TOLERANCE, _GAIN_TOLERANCE, _MAX_DAMPING, LEAST_CURVED])
+_LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
 
 # Robust standard deviations beyond which residuals do not belong together; chosen: rounds in which
 # these are left out.
@@ -68,8 +73,12 @@ class JetProblem:
         """Give the same problem on some of the matches."""
         # Indexed, they would come points first, and all that is done with them take longer.
         places = np.arange(len(self.blur))[chosen]
-        return JetProblem(*(values.take(places, axis=-1) for values in (
-            self.rays_x, self.rays_y, self.spread, self.blur)))
+        return JetProblem(*(values.take(places, axis=-1) for values in self.matches))
+
+    @property
+    def matches(self) -> tuple[Array, Array, Array, Array]:
+        """Give all of its arrays."""
+        return self.rays_x, self.rays_y, self.spread, self.blur
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,11 @@ class Loss:
             root = np.sqrt(np.maximum(u, 1.0))
             return self.scale**2 * np.where(u <= 1, u, 2 * root - 1), 1 / root
         raise ValueError(f"loss is '{self.name}'; choose none, huber, cauchy or geman_mcclure")
+
+    @property
+    def numbers(self) -> tuple[int, float]:
+        """Give its number among all of them, and its bend."""
+        return _LOSSES.index(self.name), self.scale
 
     def curvature(self, squared: Array) -> Array:
         """Give the second derivative rho''(r) / 2, (N,): what a residual adds to the Hessian."""
@@ -215,6 +229,9 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
     Never ends above the cost of the start. t must have unit length; residuals: those at the start,
     where they are known.
     """
+    if compiled.library is not None:
+        R, t, left = compiled.minimise(problem.matches, loss.numbers, max_steps, _LIMITS, R, t)
+        return Solution(R, t, Residuals(*left))
     residuals = residuals or epipolar_residuals(problem, R, t)
     cost, weights = _cost(residuals, loss)
     damping = 1e-4

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.geometry import inverses
 from djet_ros.core.hamming import blocks, gather_patches, Image, Shown
 from djet_ros.core.paraboloid import times
@@ -35,6 +36,9 @@ _SQUARE = np.concatenate([np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1) - (_RADI
 # Steps, which cost little after the first, and pixels that they come to at most: farther off is
 # something else.
 _STEPS, _FARTHEST = 3, 1
+
+# Pixels from the border of an image where a patch has room for that.
+_MARGIN = _RADIUS + 1 + _FARTHEST
 
 # Square gray levels; where a patch has no more slope than this, nothing tells where it is.
 _LEAST_SLOPE = 1e-3
@@ -87,11 +91,39 @@ def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> 
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        expected = expect([(floating, len(x[block]))], x[block], warp[block])
-        places[block], covariances[block] = expected.place(here, y[block])
+        places[block], covariances[block] = place_all(
+            [(floating, len(x[block]))], x[block], warp[block], here, y[block])
 
     each(refine, range(0, len(y), _BLOCK))
     return Placed(places, covariances)
+
+
+def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Array) -> Placed:
+    """Do the same with patches around x (N, 2) of several gray images, in whose order x are."""
+    inside = within(y, here.shape, _MARGIN)
+    # Those at the border are looked for elsewhere, to no end.
+    began = np.where(inside[:, None], y, _MARGIN)
+    if compiled.library is None or min(here.shape) <= 2 * _MARGIN or not len(x):
+        places, noise, spread = expect(images, x, warp).stepped(here, began, inside)
+    else:
+        places, noise, spread = _stepped(images, x, warp, here, began, inside)
+    return Placed(np.where(inside[:, None], places, y),
+                  noise[:, None, None] * spread + _LEAST_ERROR**2 * np.eye(2))
+
+
+def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began: Array,
+             inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Take the steps of `Expected.stepped`, compiled."""
+    points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
+    tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _FARTHEST], float)
+    parts, start = [], 0
+    for image, count in images:
+        some = slice(start, start + count)
+        parts.append(compiled.place(image, here, points[some], inverse[some], began[some], tuning,
+                                    inside[some]))
+        start += count
+    places, noise, spread = (np.concatenate(values) for values in zip(*parts))
+    return places, noise, spread
 
 
 class Expected(NamedTuple):
@@ -108,20 +140,21 @@ class Expected(NamedTuple):
     gray: Gray
     contrasts: Array
 
-    def place(self, here: Image, y: Array) -> Placed:
-        """Give where they are in an image, next to y (N, 2), see ``place_exactly``."""
-        margin = _RADIUS + 1 + _FARTHEST
-        inside = within(y, here.shape, margin)
-        # Those at the border are looked for elsewhere, to no end.
-        began = np.where(inside[:, None], y, margin)
+    def stepped(self, here: Image, began: Array, inside: NDArray[np.bool_]
+                ) -> tuple[Array, Array, Array]:
+        """
+        Give where they are in an image, next to where they began (N, 2).
+
+        inside: (N,) those that may move. Gives places (N, 2), the variances (N,) of a pixel, and
+        the covariances (N, 2, 2) of places by such noise.
+        """
         seen, places = _Seen(self, here, began), began
         for _ in range(_STEPS):
             step = -times(self.inverses, seen.along_slopes(places).T)
             places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
         near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
-        noise = seen.noise(np.where(near[:, None], places, began))
-        return Placed(np.where(near[:, None], places, y),
-                      noise[:, None, None] * self.inverses + _LEAST_ERROR**2 * np.eye(2))
+        places = np.where(near[:, None], places, began)
+        return places, seen.noise(places), self.inverses
 
 
 class _Seen:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from djet_ros import compiled
 from djet_ros.core.geometry import (
     GENERATORS,
     rotation_exp,
@@ -95,6 +96,9 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     all are drawn to.
     """
     R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
+    if compiled.library is not None and held is None:
+        return Sketch(*compiled.refine_all(problem.matches, loss.numbers, steps,
+                                           _DAMPING_AT_FIRST, R, t))
     products = _products(problem)
     here = _look(problem, products, R, t, loss, held)
     damping = np.full(len(R), _DAMPING_AT_FIRST)

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import inverses, stretches
-from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
+from djet_ros.core.graded import graded_surfaces, grades, grades_through, smooth_finely
 from djet_ros.core.hamming import (
     describable,
     hamming_surfaces,
@@ -231,16 +231,14 @@ class DescriptorDistances:
         """
         if warp is not None:
             return self._through(warp, [(seen, len(points))], points, contrast)
-        return self._graded(intensities(seen, np.asarray(points, np.int64), self._tests), contrast)
+        p, q = intensities(seen, np.asarray(points, np.int64), self._tests)
+        return grades(p, q, self._grading, contrast) if self._grading else p < q
 
     def _through(self, warp: Array, images: Sequence[Shown], points: Array,
                  contrast: float | Array) -> NDArray[Any]:
-        return self._graded(intensities_through(warp, images, points, self._tests), contrast)
-
-    def _graded(self, ends: tuple[NDArray[Any], NDArray[Any]], contrast: float | Array
-                ) -> NDArray[Any]:
-        p, q = ends
-        return grades(p, q, self._grading, contrast) if self._grading else p < q
+        if self._grading:
+            return grades_through(warp, images, points, self._grading, contrast, self._tests)
+        return np.less(*intensities_through(warp, images, points, self._tests))
 
     def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:

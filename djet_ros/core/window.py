@@ -48,7 +48,7 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import expect, Placed
+from djet_ros.core.patches import place_all, Placed
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
@@ -443,8 +443,7 @@ class Window:
         """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
         images = [(self._views[anchor].gray_levels, count)
                   for anchor, count in zip(*self._anchored(mine))]
-        expected = expect(images, self._landmarks.found[mine], warps)
-        return expected.place(self._views[-1].gray, places)
+        return place_all(images, self._landmarks.found[mine], warps, self._views[-1].gray, places)
 
     def _anchored(self, mine: NDArray[np.int64]) -> tuple[list[int], list[int]]:
         """Give the anchors of landmarks (M,), which they are ordered by, and how many each has."""

@@ -14,6 +14,7 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.orb_pattern import REACH
@@ -62,6 +63,7 @@ def bench(source: Path, pairs: int,
 def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     """Measure everything: pipeline, D-JET stage, kernel, growth with points and window, memory."""
     figures = measure_pipeline(sequence, pairs)
+    figures['compiled_loops'] = compiled.library is not None
     previous, current, x, y = _crowded_pair(sequence)
     figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
     figures['kernel_tests'] = preset('best').binary_tests

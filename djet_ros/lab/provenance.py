@@ -23,7 +23,7 @@ def digest_of_the_code(more: Iterable[Path] = ()) -> str:
 def _package() -> bytes:
     """Digest the package, as it is when the program first asks."""
     digest, folder = hashlib.sha256(), Path(djet_ros.__file__).parent
-    for path in sorted(folder.rglob('*.py')):
+    for path in sorted(path for kind in ('*.py', '*.c', '*.h') for path in folder.rglob(kind)):
         digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
     return digest.digest()
 

@@ -1,0 +1,173 @@
+"""
+Inner loops of the core in C, where the package was built with a C compiler.
+
+The core does without: each has its like there in NumPy, which says what it does, and a test holds
+both together. They are the same to rounding. Arguments are of the shapes that are told, of any
+layout. `library` is None where there is none, and where the environment says ``DJET_COMPILED=0``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import c_double, c_float, c_int, c_void_p
+from importlib.util import find_spec
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.float32]
+
+# Rows of memory that the optimiser asks for, and by how much these may be longer than others.
+_ROWS, _FILLED_UP = 28, 3
+
+
+def _loaded() -> ctypes.CDLL | None:
+    found = find_spec('djet_ros.compiled._loops')
+    if found is None or found.origin is None or os.environ.get('DJET_COMPILED') == '0':
+        return None
+    # It has no Python in it, and so lets others run meanwhile.
+    return ctypes.CDLL(found.origin)
+
+
+library = _loaded()
+
+
+def place(there: Gray, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
+          tuning: Array, near: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """
+    Find N patches of one gray image (H, W) in another one: `core.patches.Expected.stepped`.
+
+    points: (N, 2) in `there`; inverse: (N, 2, 2) of their warps; began: (N, 2) in `here`, with
+    room for the patches and all steps; tuning: (4,) least slope, least noise, steps and the
+    farthest; near: (N,) which may move at all, and then which did not go too far. Gives places
+    (N, 2), variances (N,) of a pixel, and inverses (N, 2, 2).
+    """
+    n = len(points)
+    places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
+    given = _Given()
+    _call('djet_place', given(there, np.float32), c_int(there.shape[0]), c_int(there.shape[1]),
+          given(here, np.uint8), c_int(here.shape[1]), c_int(n), given(points, np.float32),
+          given(inverse, np.float32), given(began), given(tuning), given(places),
+          given(variances), given(inverses), given(near, np.bool_))
+    return places, variances, inverses
+
+
+def grades_through(image: Gray, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
+                   ends: tuple[Gray, NDArray[np.int64]], reach: int, most_nearer: float
+                   ) -> NDArray[np.int16]:
+    """
+    Grades (T, N) of tests on patches seen through warps: `core.graded.grades_through`.
+
+    image: (H, W); looks: (N, 2, 2) inverse warps, and (N, 2) by which share depths grow a pixel;
+    points: (N, 2); contrast: (N,); ends: (2, E) places at which tests look, and (2, T) which a
+    test has; reach: the largest grade; most_nearer: by which factor depths grow at most.
+    """
+    n, tests = len(points), ends[1].shape[1]
+    grades, given = np.empty((tests, n), np.int16), _Given()
+    _call('djet_grades_through', given(image, np.float32), c_int(image.shape[0]),
+          c_int(image.shape[1]), c_int(n), given(looks[0], np.float32),
+          given(looks[1], np.float32), c_float(most_nearer), given(points, np.float32),
+          given(contrast, np.float32), c_int(ends[0].shape[1]), given(ends[0].T, np.float32),
+          c_int(tests), given(ends[1], np.int64), c_int(reach), given(grades, np.int16))
+    return grades
+
+
+def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
+                    centres: NDArray[np.int64], radius: int, tests: NDArray[np.int64],
+                    far: int, reach: int) -> Gray:
+    """
+    Distances (P, P, N) of graded tests, P = 2 radius + 1: `core.graded.graded_surfaces`.
+
+    reference: (T, N); centres: (N, 2) pixels of the image (H, W), with room for windows and tests
+    (T, 4), which look at most `far` pixels away; reach: the largest grade.
+    """
+    n, side = len(centres), 2 * radius + 1
+    distances, given = np.empty((side, side, n), np.float32), _Given()
+    _call('djet_graded_surfaces', given(reference, np.int16), given(image, np.int16),
+          c_int(image.shape[1]), c_int(n), given(centres, np.int64), c_int(radius),
+          c_int(len(tests)), given(tests, np.int64), c_int(far), c_int(reach),
+          given(distances, np.float32))
+    return distances
+
+
+def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
+             limits: Array, R: Array, t: Array
+             ) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:
+    """
+    Minimise the summed loss from a pose: `core.jet.minimise`.
+
+    matches: a JetProblem's rays_x, rays_y, spread (3, N) and blur (N,); loss: which of none,
+    huber, cauchy, geman_mcclure, and where it bends; limits: (4,) of steps, of gains, of the
+    damping, and the least share of curvature. Gives R, t, and the residuals' fields.
+    """
+    n = len(matches[3])
+    R, t = np.array(R, float, order='C'), np.array(t, float)
+    left = np.empty(n), np.empty(n), np.empty((5, n)), np.empty((2, 3))
+    given = _Given()
+    _call('djet_minimise', c_int(n), *map(given, matches), c_int(loss[0]), c_double(loss[1]),
+          c_int(steps), given(limits), given(R), given(t), *map(given, left), given(_memory(n)))
+    return R, t, (*left[:3], left[3].T)
+
+
+def refine_all(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
+               damping: float, R: Array, t: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """
+    Make some steps from each of S poses R (S, 3, 3), t (S, 3): `core.sketch.refine_all`.
+
+    As in `minimise`; damping: that of the first step. Gives a Sketch's fields.
+    """
+    n, starts = len(matches[3]), len(R)
+    R, t = np.array(R, float, order='C'), np.array(t, float, order='C')
+    costs, r, sign = np.empty(starts), np.empty((starts, n)), np.empty((starts, n))
+    given = _Given()
+    _call('djet_refine_all', c_int(n), *map(given, matches), c_int(loss[0]), c_double(loss[1]),
+          c_int(steps), c_double(damping), c_int(starts), given(R), given(t), given(costs),
+          given(r), given(sign), given(_memory(n)))
+    return R, t, costs, r, sign
+
+
+def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+              observed: tuple[Array, ...], held: tuple[Array, Array, float],
+              K: tuple[Array, Array], least: tuple[float, float], frames: int
+              ) -> tuple[Array, Array, Array, Array, Array]:
+    """
+    Sum up M observations of N landmarks by F frames, and eliminate these: `core.bundle.eliminate`.
+
+    which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
+    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); held:
+    (N, 2, 2), off (N, 2) and their weight; K: (3, 3) and its inverse; least: depth, and
+    information about a landmark. Gives a Reduced's fields.
+    """
+    n = len(held[1])
+    H, g = np.zeros((6 * frames, 6 * frames)), np.zeros(6 * frames)
+    coupling, variances = np.zeros((n, 3, 6 * frames)), np.empty((n, 3, 3))
+    slopes, gain = np.zeros((n, 3)), np.empty((3, 6 * frames))
+    given = _Given()
+    _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames),
+          *(given(one, np.int64) for one in which), *map(given, observed),
+          given(held[0]), given(held[1]), c_double(held[2]), *map(given, K),
+          *map(c_double, least), *map(given, (H, g, coupling, variances, slopes, gain)))
+    return H, g, coupling, variances, slopes
+
+
+class _Given:
+    """Gives where arrays lie, in C's order and of a type, and keeps them as long as itself."""
+
+    def __init__(self) -> None:
+        self._kept: list[NDArray[Any]] = []
+
+    def __call__(self, array: NDArray[Any], dtype: Any = np.float64) -> c_void_p:
+        ordered = np.ascontiguousarray(array, dtype)
+        self._kept.append(ordered)
+        return c_void_p(ordered.ctypes.data)
+
+
+def _memory(n: int) -> Array:
+    return np.empty((_ROWS, n + _FILLED_UP))
+
+
+def _call(name: str, *arguments: Any) -> None:
+    getattr(library, name)(*arguments)

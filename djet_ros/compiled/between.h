@@ -1,0 +1,62 @@
+/* Gray levels between pixels, of several places at once. */
+#ifndef DJET_BETWEEN_H
+#define DJET_BETWEEN_H
+
+#include <string.h>
+
+#include "common.h"
+
+enum { LANES = 8 };
+
+/* So many numbers side by side; sums are those of each lane by itself. */
+typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
+typedef int32_t Whole __attribute__((vector_size(LANES * sizeof(int32_t))));
+
+/* Numbers of two places, one after the other, to those of one axis; of few, the last stands in for
+   those that are lacking. */
+INLINE Lanes gathered(const float *values, int apart, int count)
+{
+    Lanes lanes = {0};
+    for (int l = 0; l < LANES; l++)
+        lanes[l] = values[(l < count ? l : count - 1) * apart];
+    return lanes;
+}
+
+INLINE Lanes load(const float *values)
+{
+    Lanes lanes;
+    memcpy(&lanes, values, sizeof lanes);
+    return lanes;
+}
+
+/* Each lane at least `least` and at most `most`, which what is no number is too. */
+INLINE Lanes clipped(Lanes values, float least, float most)
+{
+    const Whole above = values > least, below = values < most;
+    const Lanes lowest = (Lanes){0} + least, highest = (Lanes){0} + most;
+    const Whole raised = (above & (Whole)values) | (~above & (Whole)lowest);
+    return (Lanes)((below & raised) | (~below & (Whole)highest));
+}
+
+/* Gray levels between pixels; beyond the image its border goes on. */
+INLINE Lanes between(const float *image, int height, int width, Lanes x, Lanes y)
+{
+    x = clipped(x, 0, width - 1);
+    y = clipped(y, 0, height - 1);
+    const Whole left = __builtin_convertvector(clipped(x, 0, width - 2), Whole);
+    const Whole top = __builtin_convertvector(clipped(y, 0, height - 2), Whole);
+    const Whole first = top * width + left;
+    float corners[2][2][LANES];
+    for (int l = 0; l < LANES; l++)
+        for (int row = 0; row < 2; row++)
+            for (int column = 0; column < 2; column++)
+                corners[row][column][l] = image[first[l] + row * width + column];
+    x -= __builtin_convertvector(left, Lanes);
+    y -= __builtin_convertvector(top, Lanes);
+    const Lanes left_above = load(corners[0][0]), left_below = load(corners[1][0]);
+    const Lanes above = left_above + x * (load(corners[0][1]) - left_above);
+    const Lanes below = left_below + x * (load(corners[1][1]) - left_below);
+    return above + y * (below - above);
+}
+
+#endif

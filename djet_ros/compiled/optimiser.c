@@ -1,0 +1,410 @@
+/* The joint optimiser: core/jet.py has the residuals and steps, core/sketch.py those of many
+   starts. Here sums over matches are in another order, and so round otherwise. */
+#include <string.h>
+
+#include "common.h"
+
+enum { NONE, HUBER, CAUCHY, GEMAN_MCCLURE };
+
+/* So many matches are worked on side by side; rows are filled up with some that say nothing. */
+enum { LANES = 4 };
+typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
+
+/* Rays x and y* (3, m), spread (3, m) and blur (m,) of matches, m a multiple of LANES. */
+typedef struct {
+    int m;
+    const double *x, *y, *spread, *blur;
+} Problem;
+
+typedef struct {
+    int kind;
+    double scale;
+} Loss;
+
+/* Matches as a pose leaves them, rows of m. J: (5, m). */
+enum { ROWS_LEFT = 9, ROWS_GIVEN = 10 };
+typedef struct {
+    double *r, *sign, *weight, *curvature, *J;
+} Left;
+
+typedef struct {
+    double R[3][3], t[3];
+} Pose;
+
+INLINE Lanes load(const double *values)
+{
+    Lanes lanes;
+    memcpy(&lanes, values, sizeof lanes);
+    return lanes;
+}
+
+INLINE void store(double *values, Lanes lanes)
+{
+    memcpy(values, &lanes, sizeof lanes);
+}
+
+INLINE Lanes larger(Lanes a, Lanes b)
+{
+    for (int l = 0; l < LANES; l++)
+        a[l] = a[l] > b[l] ? a[l] : b[l];
+    return a;
+}
+
+INLINE Lanes roots(Lanes values)
+{
+    for (int l = 0; l < LANES; l++)
+        values[l] = sqrt(values[l]);
+    return values;
+}
+
+INLINE double sum_of(Lanes values)
+{
+    return (values[0] + values[1]) + (values[2] + values[3]);
+}
+
+static void multiply(const double A[3][3], const double B[3][3], double AB[3][3])
+{
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            AB[i][j] = A[i][0] * B[0][j] + A[i][1] * B[1][j] + A[i][2] * B[2][j];
+}
+
+static void cross_matrix(const double v[3], double S[3][3])
+{
+    const double values[3][3] = {{0, -v[2], v[1]}, {v[2], 0, -v[0]}, {-v[1], v[0], 0}};
+    memcpy(S, values, sizeof values);
+}
+
+/* geometry.sphere_tangents, as two rows. */
+static void sphere_tangents(const double t[3], double tangents[2][3])
+{
+    const double x = t[0], y = t[1], sign = copysign(1.0, t[2]), a = -1.0 / (sign + t[2]);
+    const double b = x * y * a;
+    const double values[2][3] = {{1.0 + sign * x * x * a, sign * b, -sign * x},
+                                 {b, sign + y * y * a, -y}};
+    memcpy(tangents, values, sizeof values);
+}
+
+/* How E = [t]_x R changes with a pose's five parameters. */
+static void slopes_of(const Pose *pose, const double tangents[2][3], double slopes[5][9])
+{
+    double T[3][3], S[3][3], turned[3][3];
+    cross_matrix(pose->t, T);
+    for (int k = 0; k < 5; k++) {
+        if (k < 3) {
+            const double axis[3] = {k == 0, k == 1, k == 2};
+            cross_matrix(axis, S);
+            multiply((const double (*)[3])S, pose->R, turned);
+            multiply((const double (*)[3])T, (const double (*)[3])turned,
+                     (double (*)[3])slopes[k]);
+        } else {
+            cross_matrix(tangents[k - 3], S);
+            multiply((const double (*)[3])S, pose->R, (double (*)[3])slopes[k]);
+        }
+    }
+}
+
+/* Take the residuals at a pose; the variances' own change is in J if they are `exact`. */
+INLINE void look(const Problem *problem, const Pose *pose, const double tangents[2][3], int exact,
+                 Left *left)
+{
+    double T[3][3], E[3][3], slopes[5][9];
+    cross_matrix(pose->t, T);
+    multiply((const double (*)[3])T, pose->R, E);
+    slopes_of(pose, tangents, slopes);
+    const int m = problem->m;
+    for (int k = 0; k < m; k += LANES) {
+        const double *rays_x = problem->x + k, *rays_y = problem->y + k,
+                     *spread = problem->spread + k;
+        const Lanes x[3] = {load(rays_x), load(rays_x + m), load(rays_x + 2 * m)};
+        const Lanes y[3] = {load(rays_y), load(rays_y + m), load(rays_y + 2 * m)};
+        const Lanes s[3] = {load(spread), load(spread + m), load(spread + 2 * m)};
+        Lanes line[3];
+        for (int i = 0; i < 3; i++)
+            line[i] = E[i][0] * x[0] + E[i][1] * x[1] + E[i][2] * x[2];
+        /* The line's first components, times the covariance of its point. */
+        const Lanes M[2] = {s[0] * line[0] + s[1] * line[1], s[1] * line[0] + s[2] * line[1]};
+        const Lanes variance = line[0] * M[0] + line[1] * M[1], zero = {0};
+        Lanes sign;
+        for (int l = 0; l < LANES; l++)
+            sign[l] = variance[l] < 0 ? -1.0 : 1.0;
+        const Lanes size = larger(sign * variance + load(problem->blur + k), zero + 1e-24);
+        const Lanes of = 1 / roots(size);
+        const Lanes r = (y[0] * line[0] + y[1] * line[1] + y[2] * line[2]) * of;
+        Lanes w[3] = {y[0] * of, y[1] * of, y[2] * of};
+        if (exact) {
+            const Lanes bent = r * sign / size;
+            w[0] -= bent * M[0];
+            w[1] -= bent * M[1];
+        }
+        store(left->r + k, r);
+        store(left->sign + k, sign);
+        Lanes products[9];
+        for (int i = 0; i < 9; i++)
+            products[i] = w[i / 3] * x[i % 3];
+        for (int j = 0; j < 5; j++) {
+            Lanes sum = slopes[j][0] * products[0];
+            for (int i = 1; i < 9; i++)
+                sum += slopes[j][i] * products[i];
+            store(left->J + j * m + k, sum);
+        }
+    }
+}
+
+/* Sum up the loss, and tell each match's weight and curvature: jet.Loss. */
+INLINE double cost_of(Loss loss, int m, Left *left)
+{
+    const double square = loss.scale * loss.scale;
+    const Lanes zero = {0}, one = zero + 1.0;
+    Lanes sum = {0};
+    for (int k = 0; k < m; k += LANES) {
+        const Lanes r = load(left->r + k), u = r * r / square;
+        Lanes value = r * r, weight = one, curvature = one;
+        if (loss.kind == GEMAN_MCCLURE) {
+            const Lanes flat = 1 / (1 + u);
+            value = r * r * flat;
+            weight = flat * flat;
+            curvature = (1 - 3 * u) * flat * flat * flat;
+        } else if (loss.kind == CAUCHY) {
+            for (int l = 0; l < LANES; l++)
+                value[l] = square * log1p(u[l]);
+            weight = 1 / (1 + u);
+            curvature = (1 - u) / ((1 + u) * (1 + u));
+        } else if (loss.kind == HUBER) {
+            const Lanes root = roots(larger(u, one));
+            weight = 1 / root;
+            for (int l = 0; l < LANES; l++) {
+                value[l] = square * (u[l] <= 1 ? u[l] : 2 * root[l] - 1);
+                curvature[l] = u[l] <= 1;
+            }
+        }
+        sum += load(left->sign + k) * value;
+        store(left->weight + k, weight);
+        store(left->curvature + k, curvature);
+    }
+    return sum_of(sum);
+}
+
+/* Hessian and gradient. A match curves as its weight says, or as its loss does, if that is more
+   than a share of it. */
+INLINE void sum_up(int m, const Left *left, int by_loss, double least_curved, double H[5][5],
+                   double gradient[5])
+{
+    Lanes a[15] = {{0}}, b[5] = {{0}};
+    for (int k = 0; k < m; k += LANES) {
+        const Lanes weight = load(left->weight + k);
+        const Lanes curved = by_loss ? larger(load(left->curvature + k), least_curved * weight)
+                                     : weight;
+        const Lanes pull = weight * load(left->sign + k) * load(left->r + k);
+        Lanes J[5];
+        for (int i = 0; i < 5; i++)
+            J[i] = load(left->J + i * m + k);
+        for (int i = 0, entry = 0; i < 5; i++) {
+            const Lanes weighed = J[i] * curved;
+            b[i] += J[i] * pull;
+            for (int j = i; j < 5; j++)
+                a[entry++] += weighed * J[j];
+        }
+    }
+    for (int i = 0, entry = 0; i < 5; i++) {
+        gradient[i] = sum_of(b[i]);
+        for (int j = i; j < 5; j++)
+            H[i][j] = H[j][i] = sum_of(a[entry++]);
+    }
+}
+
+/* Solve (H + ridge) step = -gradient by elimination with pivots; 0 where there is nothing to go
+   by. */
+static int damped_step(double H[5][5], const double gradient[5], double damping, double step[5])
+{
+    double most = 0;
+    for (int i = 0; i < 5; i++) {
+        for (int j = 0; j < 5; j++)
+            if (!isfinite(H[i][j]))
+                return 0;
+        most = H[i][i] > most ? H[i][i] : most;
+    }
+    if (most == 0)
+        return 0;
+    for (int i = 0; i < 5; i++) {
+        H[i][i] += damping * H[i][i] + 1e-12 * most;
+        step[i] = -gradient[i];
+    }
+    for (int i = 0; i < 5; i++) {
+        int pivot = i;
+        for (int j = i + 1; j < 5; j++)
+            pivot = fabs(H[j][i]) > fabs(H[pivot][i]) ? j : pivot;
+        for (int k = 0; k < 5; k++) {
+            const double one = H[i][k];
+            H[i][k] = H[pivot][k];
+            H[pivot][k] = one;
+        }
+        const double one = step[i];
+        step[i] = step[pivot];
+        step[pivot] = one;
+        for (int j = i + 1; j < 5; j++) {
+            const double share = H[j][i] / H[i][i];
+            for (int k = i; k < 5; k++)
+                H[j][k] -= share * H[i][k];
+            step[j] -= share * step[i];
+        }
+    }
+    for (int i = 4; i >= 0; i--) {
+        for (int j = i + 1; j < 5; j++)
+            step[i] -= H[i][j] * step[j];
+        step[i] /= H[i][i];
+    }
+    return 1;
+}
+
+/* jet.moved: the rotation from the left, then along the sphere. */
+static void move(const Pose *pose, const double tangents[2][3], const double step[5], Pose *moved)
+{
+    double S[3][3], square[3][3], turn[3][3];
+    const double angle = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]);
+    const double half = angle / 2 > 1e-9 ? angle / 2 : 1e-9, quotient = sin(half) / half;
+    cross_matrix(step, S);
+    multiply((const double (*)[3])S, (const double (*)[3])S, square);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            turn[i][j] = (i == j) + quotient * cos(half) * S[i][j]
+                         + quotient * quotient / 2 * square[i][j];
+    multiply((const double (*)[3])turn, pose->R, moved->R);
+    double t[3], length = 0;
+    for (int i = 0; i < 3; i++) {
+        t[i] = pose->t[i] + tangents[0][i] * step[3] + tangents[1][i] * step[4];
+        length += t[i] * t[i];
+    }
+    length = length > 0 ? sqrt(length) : 1.0;
+    for (int i = 0; i < 3; i++)
+        moved->t[i] = t[i] / length;
+}
+
+/* Rows of n, filled up. A match of no rays at all says nothing. */
+static Problem filled_up(int n, int m, const double *x, const double *y, const double *spread,
+                         const double *blur, double *memory)
+{
+    for (int row = 0; row < ROWS_GIVEN; row++) {
+        const double *from = row < 3 ? x + row * n : row < 6 ? y + (row - 3) * n
+                           : row < 9 ? spread + (row - 6) * n : blur;
+        memcpy(memory + row * m, from, (size_t)n * sizeof(double));
+        for (int k = n; k < m; k++)
+            memory[row * m + k] = row == ROWS_GIVEN - 1;
+    }
+    const Problem problem = {m, memory, memory + 3 * m, memory + 6 * m, memory + 9 * m};
+    return problem;
+}
+
+static Left left_in(double *memory, int m)
+{
+    const Left left = {memory, memory + m, memory + 2 * m, memory + 3 * m, memory + 4 * m};
+    return left;
+}
+
+typedef struct {
+    Pose pose;
+    double tangents[2][3], cost;
+    Left left;
+} Place;
+
+INLINE void arrive(const Problem *problem, Loss loss, int exact, Place *place)
+{
+    sphere_tangents(place->pose.t, place->tangents);
+    look(problem, &place->pose, (const double (*)[3])place->tangents, exact, &place->left);
+    place->cost = cost_of(loss, problem->m, &place->left);
+}
+
+static void swap(Place *one, Place *other)
+{
+    const Place kept = *one;
+    *one = *other;
+    *other = kept;
+}
+
+/* Minimise the summed loss by Levenberg-Marquardt steps: jet.minimise.
+   R (3, 3) and t (3,) are moved; r, sign (n,), J (5, n) and tangents (2, 3): those at the end;
+   limits: of steps, of gains, of the damping, and the least share of curvature;
+   memory: (28, m) with m = n rounded up to LANES. */
+WIDE void djet_minimise(int n, const double *x, const double *y, const double *spread,
+                        const double *blur, int kind, double scale, int most_steps,
+                        const double *limits, double *R, double *t, double *r, double *sign,
+                        double *J, double *tangents, double *memory)
+{
+    const int m = (n + LANES - 1) / LANES * LANES;
+    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
+    const Loss loss = {kind, scale};
+    Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
+    Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
+    memcpy(here.pose.R, R, sizeof here.pose.R);
+    memcpy(here.pose.t, t, sizeof here.pose.t);
+    arrive(&problem, loss, 1, &here);
+    double damping = 1e-4;
+    for (int number = 0; number < most_steps; number++) {
+        double H[5][5], gradient[5], step[5], length = 0;
+        sum_up(m, &here.left, 1, limits[3], H, gradient);
+        if (!damped_step(H, gradient, damping, step))
+            break;
+        for (int i = 0; i < 5; i++)
+            length += step[i] * step[i];
+        const int is_small = sqrt(length) < limits[0];
+        move(&here.pose, (const double (*)[3])here.tangents, step, &there.pose);
+        arrive(&problem, loss, 1, &there);
+        if (there.cost < here.cost) {
+            swap(&here, &there);
+            damping = fmax(damping / 10, 1e-9);
+            if (is_small || there.cost - here.cost < limits[1] * fabs(there.cost))
+                break;
+        } else {
+            damping *= 10;
+            if (damping > limits[2] || is_small)
+                break;
+        }
+    }
+    memcpy(R, here.pose.R, sizeof here.pose.R);
+    memcpy(t, here.pose.t, sizeof here.pose.t);
+    memcpy(tangents, here.tangents, sizeof here.tangents);
+    memcpy(r, here.left.r, (size_t)n * sizeof(double));
+    memcpy(sign, here.left.sign, (size_t)n * sizeof(double));
+    for (int j = 0; j < 5; j++)
+        memcpy(J + j * n, here.left.J + j * m, (size_t)n * sizeof(double));
+}
+
+/* Make some steps from each of S poses, with the variances of residuals held in each step:
+   sketch.refine_all. R: (S, 3, 3) and t: (S, 3) are moved; costs: (S,); r, sign: (S, n);
+   memory: as above. */
+WIDE void djet_refine_all(int n, const double *x, const double *y, const double *spread,
+                          const double *blur, int kind, double scale, int steps,
+                          double first_damping, int S, double *R, double *t, double *costs,
+                          double *r, double *sign, double *memory)
+{
+    const int m = (n + LANES - 1) / LANES * LANES;
+    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
+    const Loss loss = {kind, scale};
+    for (int start = 0; start < S; start++) {
+        Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
+        Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
+        memcpy(here.pose.R, R + 9 * start, sizeof here.pose.R);
+        memcpy(here.pose.t, t + 3 * start, sizeof here.pose.t);
+        arrive(&problem, loss, 0, &here);
+        double damping = first_damping;
+        for (int number = 0; number < steps; number++) {
+            double H[5][5], gradient[5], step[5];
+            sum_up(m, &here.left, 0, 0, H, gradient);
+            if (!damped_step(H, gradient, damping, step))
+                break;
+            move(&here.pose, (const double (*)[3])here.tangents, step, &there.pose);
+            arrive(&problem, loss, 0, &there);
+            if (there.cost < here.cost) {
+                swap(&here, &there);
+                damping = fmax(damping / 10, 1e-9);
+            } else {
+                damping *= 10;
+            }
+        }
+        memcpy(R + 9 * start, here.pose.R, sizeof here.pose.R);
+        memcpy(t + 3 * start, here.pose.t, sizeof here.pose.t);
+        costs[start] = here.cost;
+        memcpy(r + start * n, here.left.r, (size_t)n * sizeof(double));
+        memcpy(sign + start * n, here.left.sign, (size_t)n * sizeof(double));
+    }
+}

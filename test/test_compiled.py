@@ -1,0 +1,244 @@
+"""What is compiled says what its like in NumPy says, to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import pairwise
+import os
+import subprocess
+import sys
+from typing import TypeVar
+
+import cv2
+from djet_ros import compiled
+from djet_ros.core.bundle import eliminate, observe
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import preset
+from djet_ros.core.geometry import rotation_log
+from djet_ros.core.graded import graded_surfaces, grades_through, smooth_finely
+from djet_ros.core.jet import jet_problem, JetProblem, Loss, minimise
+from djet_ros.core.orb_pattern import pattern, reach
+from djet_ros.core.paraboloid import Paraboloids
+from djet_ros.core.patches import place_exactly
+from djet_ros.core.sketch import refine_all
+from djet_ros.core.starts import around
+from djet_ros.core.types import Pose, Status
+from djet_ros.lab.scenes import make_scene
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
+import numpy as np
+import pytest
+from test_bundle import K as BUNDLE_K, scene
+from two_view import moved_pose, textured, two_views
+
+pytestmark = pytest.mark.skipif(compiled.library is None, reason='it was built without a compiler')
+
+Result = TypeVar('Result')
+
+LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
+
+# Before 5.0, OpenCV's sampling, by which NumPy goes, knows 32 places between two pixels.
+EXACT = int(cv2.__version__.split('.')[0]) >= 5
+PIXELS = 1e-3 if EXACT else 0.02
+
+
+@contextmanager
+def by_numpy() -> Iterator[None]:
+    """Do without what is compiled."""
+    library, compiled.library = compiled.library, None
+    try:
+        yield
+    finally:
+        compiled.library = library
+
+
+def both(work: Callable[[], Result]) -> tuple[Result, Result]:
+    """Give what comes of it compiled, and by NumPy."""
+    done = work()
+    with by_numpy():
+        return done, work()
+
+
+def image(seed: int, size: tuple[int, int] = (320, 200)) -> np.ndarray:
+    return textured(np.random.default_rng(seed), size)
+
+
+def warps(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Give (N, 3, 2) as of a road that comes nearer, half of them in perspective."""
+    warp = np.tile(np.eye(3, 2), (count, 1, 1))
+    warp[:, :2] += rng.normal(0, 0.06, (count, 2, 2))
+    warp[::2, 2] = rng.normal(0, 0.004, (len(warp[::2]), 2))
+    return warp
+
+
+@pytest.fixture(params=LOSSES)
+def loss(request: pytest.FixtureRequest) -> Loss:
+    return Loss(request.param, 1.5)
+
+
+def problem(rng: np.random.Generator, count: int, indefinite: bool) -> tuple[JetProblem, Pose]:
+    """Give matches of two views, a fifth of them false, and a pose next to theirs."""
+    views = two_views(rng, count)
+    y = views.y + rng.normal(0, 0.2, views.y.shape)
+    y[::5] += rng.normal(0, 9, (len(y[::5]), 2))
+    half = rng.normal(size=(count, 2, 2))
+    A = half @ half.transpose(0, 2, 1) + 0.3 * np.eye(2)
+    if indefinite:
+        A[::4] *= -1
+    surfaces = Paraboloids(y, A, rng.normal(0, 0.1, (count, 2)), rng.uniform(1, 9, count),
+                           np.ones(count, bool))
+    return (jet_problem(views.K, views.x, surfaces, epipole_blur=5.0),
+            Pose(*moved_pose(views.R, views.t, 0.02, rng)))
+
+
+@pytest.mark.parametrize('count', [0, 1, 8, 9, 300])
+def test_patches_are_found_where_numpy_finds_them(count: int) -> None:
+    rng = np.random.default_rng(count)
+    there, here = image(0), np.roll(image(0), 1, axis=1)
+    # Some at the border, outside, and on flat ground.
+    here[:40] = there[:40] = 90
+    x = rng.uniform((-5, -5), (325, 205), (count, 2))
+    y = x + rng.uniform((-0.5, -1.5), (2.5, 1.5), x.shape)
+    warp = warps(rng, count)
+    ours, numpys = both(lambda: place_exactly(there, here, x, y, warp))
+    moved = (numpys.places != y).any(1)
+    assert ((ours.places != y).any(1) != moved).sum() <= 0.02 * count
+    off = np.abs(ours.places - numpys.places).max(1)
+    assert (off > PIXELS).sum() <= 0.05 * count
+    sizes = (np.linalg.det(placed.covariances) for placed in (ours, numpys))
+    np.testing.assert_allclose(np.log(next(sizes)), np.log(next(sizes)), atol=300 * PIXELS)
+
+
+@pytest.mark.parametrize('count', [0, 1, 7, 16, 17, 400])
+@pytest.mark.parametrize('radius', [1, 2, 7])
+@pytest.mark.parametrize(('tests', 'scale', 'grading'), [(96, 0.65, 48.0), (256, 1.0, 120.0),
+                                                         (16, 0.3, 0.2)])
+def test_surfaces_are_those_of_numpy_to_the_last_bit(
+        count: int, radius: int, tests: int, scale: float, grading: float) -> None:
+    rng, chosen = np.random.default_rng(1), pattern(tests, scale)
+    fine, margin = smooth_finely(image(1), scale), reach(chosen) + radius
+    # The outermost places at which they are defined are among them.
+    centres = rng.integers(margin, (320 - margin, 200 - margin), (count, 2))
+    centres[:1], centres[1:2] = margin, (319 - margin, 199 - margin)
+    reference = rng.integers(-round(4 * grading) or -1, (round(4 * grading) or 1) + 1,
+                             (tests, count)).astype(np.int16)
+    ours, numpys = both(lambda: graded_surfaces(reference, fine, centres, radius, grading, chosen))
+    np.testing.assert_array_equal(ours, numpys)
+
+
+@pytest.mark.parametrize('counts', [(0, 0), (0, 1), (100, 233)])
+def test_references_are_those_of_numpy_to_a_grade(counts: tuple[int, int]) -> None:
+    count = sum(counts)
+    images = [smooth_finely(image(seed), 0.65).astype(np.float32) for seed in (2, 3)]
+    points = np.random.default_rng(2).uniform((-9, -9), (330, 210), (count, 2))
+    contrasts = np.where(np.arange(count) < 100, 0.4, 1.1)
+    warp, chosen = warps(np.random.default_rng(3), count), pattern(96, 0.65)
+    ours, numpys = both(lambda: grades_through(
+        warp, list(zip(images, counts)), points, 48.0, contrasts, chosen))
+    assert ours.shape == numpys.shape == (96, count)
+    off = np.abs(ours.astype(int) - numpys)
+    assert off.max(initial=0) <= 1 + 100 * PIXELS
+    assert off.sum() <= 10 * PIXELS * off.size
+
+
+@pytest.mark.parametrize('count', [5, 8, 203])
+@pytest.mark.parametrize('indefinite', [False, True])
+def test_the_optimiser_takes_numpys_steps(loss: Loss, count: int, indefinite: bool) -> None:
+    matches, start = problem(np.random.default_rng(count), count, indefinite)
+    # More of them may lead apart what rounding began.
+    ours, numpys = both(lambda: minimise(matches, start.R, start.t, loss, 3))
+    np.testing.assert_allclose(ours.R, numpys.R, atol=1e-8)
+    np.testing.assert_allclose(ours.t, numpys.t, atol=1e-8)
+    for mine, others in zip(vars(ours.residuals).values(), vars(numpys.residuals).values()):
+        np.testing.assert_allclose(mine, others, rtol=1e-5, atol=1e-5 * np.abs(others).max())
+
+
+def test_the_optimiser_ends_where_numpy_does() -> None:
+    matches, start = problem(np.random.default_rng(0), 500, False)
+    ours, numpys = both(lambda: minimise(matches, start.R, start.t, Loss('geman_mcclure', 1.5)))
+    np.testing.assert_allclose(ours.R, numpys.R, atol=1e-9)
+    np.testing.assert_allclose(ours.t, numpys.t, atol=1e-9)
+
+
+@pytest.mark.parametrize('steps', [0, 4])
+def test_many_starts_are_refined_as_numpy_does(loss: Loss, steps: int) -> None:
+    matches, start = problem(np.random.default_rng(4), 203, True)
+    starts = [*around(start, 10), Pose(np.eye(3), np.zeros(3))]
+    ours, numpys = both(lambda: refine_all(matches, starts, loss, steps))
+    np.testing.assert_allclose(ours.costs, numpys.costs, rtol=1e-7)
+    np.testing.assert_allclose(ours.R, numpys.R, atol=1e-6)
+    np.testing.assert_allclose(ours.r, numpys.r, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(ours.sign, numpys.sign)
+
+
+def test_matches_that_tell_nothing_move_no_pose() -> None:
+    for rays in (np.zeros((3, 6)), np.full((3, 6), np.nan), np.empty((3, 0))):
+        matches = JetProblem(rays, rays, np.ones(rays.shape), np.zeros(rays.shape[1]))
+        for found in both(partial(minimise, matches, np.eye(3), np.array([0.0, 0, 1]), Loss())):
+            assert found.R.tolist() == np.eye(3).tolist()
+            assert found.t.tolist() == [0, 0, 1]
+
+
+def test_landmarks_are_eliminated_as_numpy_does() -> None:
+    rng = np.random.default_rng(5)
+    poses, landmarks = scene(rng, frames=6, landmarks=57)
+    landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
+    # One that nobody sees, and one whose place nothing holds.
+    landmarks.seen[11] = False
+    landmarks.held[12] = 0
+    observed = observe(BUNDLE_K, poses, landmarks)
+    weights = rng.uniform(0, 2, len(observed.residuals))
+    ours, numpys = both(lambda: eliminate(observed, weights, 1.7, 6))
+    for mine, others in zip(vars(ours).values(), vars(numpys).values(), strict=True):
+        np.testing.assert_allclose(mine, others, rtol=1e-6, atol=1e-9 * np.abs(others).max())
+
+
+def motions(frames: list[Frame], name: str) -> list[OdometryResult]:
+    odometry = VisualOdometry(preset(name))
+    return [odometry.process(frame) for frame in frames]
+
+
+def apart_by(one: OdometryResult, other: OdometryResult) -> float:
+    """Tell how many standard deviations two motions are apart, at most in any direction."""
+    off = np.linalg.inv(other.motion) @ one.motion
+    step = np.concatenate([off[:3, 3], rotation_log(off[:3, :3])])
+    return float(np.sqrt(step @ np.linalg.solve(other.motion_covariance, step)))
+
+
+@pytest.fixture(params=['road', 'handheld'])
+def frames(request: pytest.FixtureRequest) -> list[Frame]:
+    rendered = make_scene(request.param, seed=0, size=(416, 256))
+    return [Frame(rendered.render(pose, i), rendered.K, 10**8 * (i + 1))
+            for i, pose in enumerate(rendered.trajectory(8))]
+
+
+@pytest.mark.parametrize('name', ['best', 'fast', 'paper'])
+def test_pairs_come_out_the_same_with_and_without(frames: list[Frame], name: str) -> None:
+    estimator = TwoViewEstimator(preset(name))
+    views = [frame.view(estimator) for frame in frames[:4]]
+    for before, after in pairwise(views):
+        ours, numpys = both(partial(estimator.estimate, before, after))
+        assert ours.status == numpys.status
+        np.testing.assert_allclose(ours.R, numpys.R, atol=PIXELS / 100)
+        np.testing.assert_allclose(ours.t, numpys.t, atol=PIXELS / 10)
+
+
+@pytest.mark.skipif(not EXACT, reason='NumPy samples landmarks up to a 64th of a pixel beside')
+@pytest.mark.parametrize('name', ['best', 'fast', 'paper'])
+def test_a_track_differs_by_less_than_it_is_unsure_of(frames: list[Frame], name: str) -> None:
+    # Where a step of the flow is the last one hangs on the last digit of where it began.
+    for ours, numpys in zip(*both(lambda: motions(frames, name))):
+        assert ours.status == numpys.status
+        if ours.status == Status.OK:
+            # Preset paper goes without the flow.
+            assert apart_by(ours, numpys) < (1e-3 if name == 'paper' else 0.5)
+
+
+def test_who_wants_to_can_do_without() -> None:
+    answers = [subprocess.run(
+        [sys.executable, '-c', 'from djet_ros import compiled; print(compiled.library is None)'],
+        env={**os.environ, 'DJET_COMPILED': told}, capture_output=True, text=True, check=True
+    ).stdout.strip() for told in ('0', '1')]
+    assert answers == ['True', 'False']
