@@ -12,8 +12,8 @@ enum { LANES = 8 };
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
 typedef int32_t Whole __attribute__((vector_size(LANES * sizeof(int32_t))));
 
-/* Numbers of two places, one after the other, to those of one axis; of few, the last stands in for
-   those that are lacking. */
+/* Numbers that lie so far apart, side by side. Where there are fewer than lanes, the last one stands
+   in for those that are lacking. */
 INLINE Lanes gathered(const float *values, int apart, int count)
 {
     Lanes lanes = {0};

@@ -5,8 +5,8 @@
 #include <math.h>
 #include <stdint.h>
 
-/* Of functions that are worth it there are two, and the machine takes what it can. Neither sums up
-   in another order, nor rounds otherwise. */
+/* Functions that are built twice, the second time for wider instructions: a machine that has them
+   takes that one. Both sum up in one order, and round alike. */
 #if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
 #define WIDE __attribute__((target_clones("avx2", "default")))
 #else

@@ -2,10 +2,11 @@
    and core/hamming.py. */
 #include "between.h"
 
-/* Ends of tests, and pixels from the middle of a window to the farthest of them, at most. */
+/* What there is at most: ends of tests, tests, pixels from the middle of a window to the farthest
+   end, and the side of all that is looked at. */
 enum { MOST_ENDS = 512, MOST_TESTS = 256, FARTHEST = 13 + 7, MOST_SIDE = 2 * FARTHEST + 1 };
 
-/* Points whose windows are worked on side by side, with an image in steps of a gray level. */
+/* Points whose windows are worked on side by side, and the largest of these. */
 enum { POINTS = 16, MOST_WINDOW = 15 };
 typedef int16_t Grades __attribute__((vector_size(POINTS * sizeof(int16_t))));
 typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
@@ -19,7 +20,7 @@ WIDE void djet_grades_through(const float *image, int height, int width, int n,
                               const float (*ends)[2], int T, const int64_t *of_tests, int reach,
                               int16_t *grades)
 {
-    /* Of numbers that are far below it, this leaves nothing behind the point. */
+    /* Added and taken away again, it leaves whole numbers of all that are far below it. */
     const float whole = 3 << 22;
     for (int first = 0; first < n; first += LANES) {
         const int count = n - first < LANES ? n - first : LANES;
