@@ -63,7 +63,7 @@ pages: $(VENV)/.installed-test,peers
 	$(VENV)/bin/python doc/pages.py
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info
+	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info djet_ros/compiled/*.so
 
 $(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .

@@ -36,22 +36,22 @@ library = _loaded()
 
 
 def place(there: Gray, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
-          tuning: Array, near: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+          inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """
     Find N patches of one gray image (H, W) in another one: `core.patches.Expected.stepped`.
 
     points: (N, 2) in `there`; inverse: (N, 2, 2) of their warps; began: (N, 2) in `here`, with
-    room for the patches and all steps; tuning: (4,) least slope, least noise, steps and the
-    farthest; near: (N,) which may move at all, and then which did not go too far. Gives places
-    (N, 2), variances (N,) of a pixel, and inverses (N, 2, 2).
+    room for the patches and all steps; inside: (N,) those that may move; tuning: (4,) least slope,
+    least noise, steps and the farthest. Gives places (N, 2), variances (N,) of a pixel, and
+    inverses (N, 2, 2).
     """
     n = len(points)
     places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
     given = _Given()
     _call('djet_place', given(there, np.float32), c_int(there.shape[0]), c_int(there.shape[1]),
           given(here, np.uint8), c_int(here.shape[1]), c_int(n), given(points, np.float32),
-          given(inverse, np.float32), given(began), given(tuning), given(places),
-          given(variances), given(inverses), given(near, np.bool_))
+          given(inverse, np.float32), given(began), given(inside, np.bool_), given(tuning),
+          given(places), given(variances), given(inverses))
     return places, variances, inverses
 
 
@@ -94,21 +94,23 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
 
 
 def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
-             limits: Array, R: Array, t: Array
+             damping: float, limits: Array, R: Array, t: Array
              ) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:
     """
     Minimise the summed loss from a pose: `core.jet.minimise`.
 
     matches: a JetProblem's rays_x, rays_y, spread (3, N) and blur (N,); loss: which of none,
-    huber, cauchy, geman_mcclure, and where it bends; limits: (4,) of steps, of gains, of the
-    damping, and the least share of curvature. Gives R, t, and the residuals' fields.
+    huber, cauchy, geman_mcclure, and where it bends; damping: that of the first step; limits: (4,)
+    of steps, of gains, of the damping, and the least share of curvature. Gives R, t, and the
+    residuals' fields.
     """
     n = len(matches[3])
     R, t = np.array(R, float, order='C'), np.array(t, float)
     left = np.empty(n), np.empty(n), np.empty((5, n)), np.empty((2, 3))
     given = _Given()
     _call('djet_minimise', c_int(n), *map(given, matches), c_int(loss[0]), c_double(loss[1]),
-          c_int(steps), given(limits), given(R), given(t), *map(given, left), given(_memory(n)))
+          c_int(steps), c_double(damping), given(limits), given(R), given(t), *map(given, left),
+          given(_memory(n)))
     return R, t, (*left[:3], left[3].T)
 
 
@@ -117,7 +119,7 @@ def refine_all(matches: tuple[Array, Array, Array, Array], loss: tuple[int, floa
     """
     Make some steps from each of S poses R (S, 3, 3), t (S, 3): `core.sketch.refine_all`.
 
-    As in `minimise`; damping: that of the first step. Gives a Sketch's fields.
+    As in `minimise`. Gives a Sketch's fields.
     """
     n, starts = len(matches[3]), len(R)
     R, t = np.array(R, float, order='C'), np.array(t, float, order='C')

@@ -88,8 +88,8 @@ INLINE void eliminate(int size, const double *C, const double *variances, const 
 }
 
 /* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark.
-   Gives H (6F, 6F), g (6F,), coupling (N, 3, 6F), variances (N, 3, 3) and slopes (N, 3), all of
-   which have to be zeros; gain: (3, 6F) of memory. */
+   Adds to H (6F, 6F), g (6F,), coupling (N, 3, 6F) and slopes (N, 3); gives variances (N, 3, 3);
+   gain: (3, 6F) of memory. */
 WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
                          const int64_t *anchor, const double *residuals, const double *R,
                          const double *t, const double *ray, const double *rho,

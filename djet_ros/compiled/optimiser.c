@@ -321,45 +321,63 @@ static void swap(Place *one, Place *other)
     *other = kept;
 }
 
-/* Minimise the summed loss by Levenberg-Marquardt steps: jet.minimise.
-   R (3, 3) and t (3,) are moved; r, sign (n,), J (5, n) and tangents (2, 3): those at the end;
-   limits: of steps, of gains, of the damping, and the least share of curvature;
-   memory: (28, m) with m = n rounded up to LANES. */
-WIDE void djet_minimise(int n, const double *x, const double *y, const double *spread,
-                        const double *blur, int kind, double scale, int most_steps,
-                        const double *limits, double *R, double *t, double *r, double *sign,
-                        double *J, double *tangents, double *memory)
+/* Steps that end it when they are as small, a gain as small a share, a damping as large; and the
+   least share of a match's weight that it curves by. */
+typedef struct {
+    double step, gain, damping, curved;
+} Limits;
+
+/* Levenberg-Marquardt steps from a place, which is moved; `there` is for trials. `exact` as in
+   look, and a match curves as its loss does then. */
+INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps, Limits limits,
+                    double damping, Place *here, Place *there)
 {
-    const int m = (n + LANES - 1) / LANES * LANES;
-    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
-    const Loss loss = {kind, scale};
-    Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
-    Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
-    memcpy(here.pose.R, R, sizeof here.pose.R);
-    memcpy(here.pose.t, t, sizeof here.pose.t);
-    arrive(&problem, loss, 1, &here);
-    double damping = 1e-4;
+    arrive(problem, loss, exact, here);
     for (int number = 0; number < most_steps; number++) {
         double H[5][5], gradient[5], step[5], length = 0;
-        sum_up(m, &here.left, 1, limits[3], H, gradient);
+        sum_up(problem->m, &here->left, exact, limits.curved, H, gradient);
         if (!damped_step(H, gradient, damping, step))
             break;
         for (int i = 0; i < 5; i++)
             length += step[i] * step[i];
-        const int is_small = sqrt(length) < limits[0];
-        move(&here.pose, (const double (*)[3])here.tangents, step, &there.pose);
-        arrive(&problem, loss, 1, &there);
-        if (there.cost < here.cost) {
-            swap(&here, &there);
+        const int is_small = sqrt(length) < limits.step;
+        move(&here->pose, (const double (*)[3])here->tangents, step, &there->pose);
+        arrive(problem, loss, exact, there);
+        if (there->cost < here->cost) {
+            swap(here, there);
             damping = fmax(damping / 10, 1e-9);
-            if (is_small || there.cost - here.cost < limits[1] * fabs(there.cost))
+            if (is_small || there->cost - here->cost < limits.gain * fabs(here->cost))
                 break;
         } else {
             damping *= 10;
-            if (damping > limits[2] || is_small)
+            if (damping > limits.damping || is_small)
                 break;
         }
     }
+}
+
+static int filled_to(int n)
+{
+    return (n + LANES - 1) / LANES * LANES;
+}
+
+/* Minimise the summed loss from a pose: jet.minimise.
+   R (3, 3) and t (3,) are moved; limits: those of above, in their order; r, sign (n,), J (5, n)
+   and tangents (2, 3): those at the end; memory: (28, m) with m = n rounded up to LANES. */
+WIDE void djet_minimise(int n, const double *x, const double *y, const double *spread,
+                        const double *blur, int kind, double scale, int most_steps,
+                        double damping, const double *limits, double *R, double *t, double *r,
+                        double *sign, double *J, double *tangents, double *memory)
+{
+    const int m = filled_to(n);
+    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
+    const Loss loss = {kind, scale};
+    const Limits of = {limits[0], limits[1], limits[2], limits[3]};
+    Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
+    Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
+    memcpy(here.pose.R, R, sizeof here.pose.R);
+    memcpy(here.pose.t, t, sizeof here.pose.t);
+    descend(&problem, loss, 1, most_steps, of, damping, &here, &there);
     memcpy(R, here.pose.R, sizeof here.pose.R);
     memcpy(t, here.pose.t, sizeof here.pose.t);
     memcpy(tangents, here.tangents, sizeof here.tangents);
@@ -373,34 +391,20 @@ WIDE void djet_minimise(int n, const double *x, const double *y, const double *s
    sketch.refine_all. R: (S, 3, 3) and t: (S, 3) are moved; costs: (S,); r, sign: (S, n);
    memory: as above. */
 WIDE void djet_refine_all(int n, const double *x, const double *y, const double *spread,
-                          const double *blur, int kind, double scale, int steps,
-                          double first_damping, int S, double *R, double *t, double *costs,
-                          double *r, double *sign, double *memory)
+                          const double *blur, int kind, double scale, int most_steps,
+                          double damping, int S, double *R, double *t, double *costs, double *r,
+                          double *sign, double *memory)
 {
-    const int m = (n + LANES - 1) / LANES * LANES;
+    const int m = filled_to(n);
     const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
     const Loss loss = {kind, scale};
+    const Limits none = {0, 0, INFINITY, 0};
     for (int start = 0; start < S; start++) {
         Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
         Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
         memcpy(here.pose.R, R + 9 * start, sizeof here.pose.R);
         memcpy(here.pose.t, t + 3 * start, sizeof here.pose.t);
-        arrive(&problem, loss, 0, &here);
-        double damping = first_damping;
-        for (int number = 0; number < steps; number++) {
-            double H[5][5], gradient[5], step[5];
-            sum_up(m, &here.left, 0, 0, H, gradient);
-            if (!damped_step(H, gradient, damping, step))
-                break;
-            move(&here.pose, (const double (*)[3])here.tangents, step, &there.pose);
-            arrive(&problem, loss, 0, &there);
-            if (there.cost < here.cost) {
-                swap(&here, &there);
-                damping = fmax(damping / 10, 1e-9);
-            } else {
-                damping *= 10;
-            }
-        }
+        descend(&problem, loss, 0, most_steps, none, damping, &here, &there);
         memcpy(R + 9 * start, here.pose.R, sizeof here.pose.R);
         memcpy(t + 3 * start, here.pose.t, sizeof here.pose.t);
         costs[start] = here.cost;

@@ -147,14 +147,14 @@ INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double 
 }
 
 /* Find n patches of a gray image `there` in another one, next to `began` (n, 2), where there is
-   room for the steps. tuning: least slope and noise, how many steps, and the farthest.
-   near: (n,) which may move, and then which did not go too far; places: (n, 2);
-   variances: (n,) of a pixel; inverses: (n, 2, 2). */
+   room for the steps. tuning: least slope and noise, how many steps, and the farthest;
+   inside: (n,) those that may move. Gives places (n, 2), variances (n,) of a pixel, and
+   inverses (n, 2, 2). */
 WIDE void djet_place(const float *there, int there_height, int there_width, const uint8_t *here,
                      int here_width, int n, const float (*points)[2],
-                     const float (*inverse)[2][2], const double (*began)[2], const double *tuning,
-                     double (*places)[2], double *variances, double (*inverses)[2][2],
-                     uint8_t *near)
+                     const float (*inverse)[2][2], const double (*began)[2],
+                     const uint8_t *inside, const double *tuning, double (*places)[2],
+                     double *variances, double (*inverses)[2][2])
 {
     const double least_noise = tuning[1], steps = tuning[2], farthest = tuning[3], fitted = 4;
     for (int first = 0; first < n; first += LANES) {
@@ -192,11 +192,10 @@ WIDE void djet_place(const float *there, int there_height, int there_width, cons
             }
         }
         for (int l = 0; l < count; l++) {
-            near[first + l] &= fabs(at[l][0] - at_first[l][0]) < farthest
-                               && fabs(at[l][1] - at_first[l][1]) < farthest;
+            const int near = inside[first + l] && fabs(at[l][0] - at_first[l][0]) < farthest
+                             && fabs(at[l][1] - at_first[l][1]) < farthest;
             for (int axis = 0; axis < 2; axis++)
-                places[first + l][axis] = at[l][axis] =
-                    near[first + l] ? at[l][axis] : at_first[l][axis];
+                places[first + l][axis] = at[l][axis] = near ? at[l][axis] : at_first[l][axis];
         }
         follow(here, here_width, (const double (*)[2])at, &expected, &seen);
         const Lanes left = left_over(&expected, &seen, (const double (*)[2])at);

@@ -81,7 +81,7 @@ def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading:
             _reach(grading), MOST_NEARER)
 
     none = np.empty((len(tests), 0), np.int16)
-    return np.concatenate([none, *each(look, blocks(images, max(len(points), 1)))], axis=1)
+    return np.concatenate([none, *each(look, blocks(images))], axis=1)
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,

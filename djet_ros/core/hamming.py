@@ -142,19 +142,14 @@ def looks_through(warp: Array, tests: Tests
     return inverse.astype(np.float32), nearer.astype(np.float32), bend > _BENT
 
 
-def blocks(images: Sequence[Shown], at_once: int = _WARPED_BLOCK
-           ) -> list[tuple[NDArray[np.float32], slice]]:
-    """
-    Give passes over the points of some images: each an image in float32, and which points.
-
-    at_once: so many of them at most.
-    """
+def blocks(images: Sequence[Shown]) -> list[tuple[NDArray[np.float32], slice]]:
+    """Give passes over the points of some images: each an image in float32, and which points."""
     passes, end = [], 0
     for image, count in images:
         # OpenCV is three times as fast on floating point numbers as on short ones.
         floating, begin, end = image.astype(np.float32, copy=False), end, end + count
-        passes += [(floating, slice(start, min(start + at_once, end)))
-                   for start in range(begin, end, at_once)]
+        passes += [(floating, slice(start, min(start + _WARPED_BLOCK, end)))
+                   for start in range(begin, end, _WARPED_BLOCK)]
     return passes
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_STEPS = 30
+DAMPING_AT_FIRST = 1e-4
 _STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good for
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
@@ -230,11 +231,12 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
     where they are known.
     """
     if compiled.library is not None:
-        R, t, left = compiled.minimise(problem.matches, loss.numbers, max_steps, _LIMITS, R, t)
+        R, t, left = compiled.minimise(problem.matches, loss.numbers, max_steps,
+                                       DAMPING_AT_FIRST, _LIMITS, R, t)
         return Solution(R, t, Residuals(*left))
     residuals = residuals or epipolar_residuals(problem, R, t)
     cost, weights = _cost(residuals, loss)
-    damping = 1e-4
+    damping = DAMPING_AT_FIRST
     for _ in range(max_steps):
         step = _step(residuals, weights, loss, damping)
         if step is None:

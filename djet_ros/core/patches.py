@@ -116,12 +116,8 @@ def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began:
     """Take the steps of `Expected.stepped`, compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
     tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _FARTHEST], float)
-    parts, start = [], 0
-    for image, count in images:
-        some = slice(start, start + count)
-        parts.append(compiled.place(image, here, points[some], inverse[some], began[some], tuning,
-                                    inside[some]))
-        start += count
+    parts = [compiled.place(image, here, points[some], inverse[some], began[some], inside[some],
+                            tuning) for image, some in blocks(images)]
     places, noise, spread = (np.concatenate(values) for values in zip(*parts))
     return places, noise, spread
 

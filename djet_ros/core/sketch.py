@@ -21,12 +21,10 @@ from djet_ros.core.geometry import (
     sphere_tangents,
     unit,
 )
-from djet_ros.core.jet import JetProblem, Loss, robust_scales
+from djet_ros.core.jet import DAMPING_AT_FIRST, JetProblem, Loss, robust_scales
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
-
-_DAMPING_AT_FIRST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -98,10 +96,10 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
     if compiled.library is not None and held is None:
         return Sketch(*compiled.refine_all(problem.matches, loss.numbers, steps,
-                                           _DAMPING_AT_FIRST, R, t))
+                                           DAMPING_AT_FIRST, R, t))
     products = _products(problem)
     here = _look(problem, products, R, t, loss, held)
-    damping = np.full(len(R), _DAMPING_AT_FIRST)
+    damping = np.full(len(R), DAMPING_AT_FIRST)
     for _ in range(steps):
         tangents, H, gradient = _slopes(products, R, t, here, held)
         R_new, t_new = _moved(R, t, tangents, _damped_steps(H, gradient, damping))
