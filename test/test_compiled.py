@@ -236,6 +236,12 @@ def test_a_track_differs_by_less_than_it_is_unsure_of(frames: list[Frame], name:
             assert apart_by(ours, numpys) < (1e-3 if name == 'paper' else 0.5)
 
 
+def test_what_was_built_of_other_sources_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, '_INTERFACE', compiled._INTERFACE + 1)
+    with pytest.warns(UserWarning, match='of other sources, and left out; install djet_ros anew'):
+        assert compiled._loaded() is None
+
+
 def test_who_wants_to_can_do_without() -> None:
     answers = [subprocess.run(
         [sys.executable, '-c', 'from djet_ros import compiled; print(compiled.library is None)'],

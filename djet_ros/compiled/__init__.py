@@ -13,12 +13,16 @@ from ctypes import c_double, c_float, c_int, c_void_p
 from importlib.util import find_spec
 import os
 from typing import Any
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
+
+# That of what is built, see interface.c: sources in place may be newer than it.
+_INTERFACE = 1
 
 # Rows of memory that the optimiser asks for, and by how much these may be longer than others.
 _ROWS, _FILLED_UP = 28, 3
@@ -29,7 +33,12 @@ def _loaded() -> ctypes.CDLL | None:
     if found is None or found.origin is None or os.environ.get('DJET_COMPILED') == '0':
         return None
     # It has no Python in it, and so lets others run meanwhile.
-    return ctypes.CDLL(found.origin)
+    built = ctypes.CDLL(found.origin)
+    if not hasattr(built, 'djet_interface') or built.djet_interface() != _INTERFACE:
+        warn(f'{found.origin} is of other sources, and left out; install djet_ros anew',
+             stacklevel=2)
+        return None
+    return built
 
 
 library = _loaded()
