@@ -144,7 +144,8 @@ class Camera:
         if self._undistorting is None or self._undistorting.shape != shape:
             height, width = shape
             model, D = self.distortion
-            self._check_distortion(width, height)
+            folded = self._folded(width, height)
+            self._check_distortion(folded)
             module = cv2.fisheye if model == 'equidistant' else cv2
             maps, (x, y) = (module.initUndistortRectifyMap(
                 self.raw_K, D, np.eye(3), self.K, (width, height), kind)
@@ -152,7 +153,7 @@ class Camera:
             # Up to half a pixel beyond the middles of the outermost ones something is seen.
             seen = (np.abs(x - (width - 1) / 2) <= width / 2) \
                 & (np.abs(y - (height - 1) / 2) <= height / 2)
-            unseen = ~seen | self._folded(width, height)
+            unseen = ~seen | folded
             self._undistorting = _Undistortion(shape, maps, unseen if unseen.any() else None)
         return self._undistorting
 
@@ -178,14 +179,16 @@ class Camera:
         fold = folded[0] * step if len(folded) else np.inf
         return np.asarray(away.reshape(height, width) > fold)
 
-    def _check_distortion(self, width: int, height: int) -> None:
+    def _check_distortion(self, folded: NDArray[np.bool_]) -> None:
         """Refuse a distortion by which hardly anything of the image would be seen."""
+        height, width = folded.shape
         x, y = np.meshgrid(*((np.arange(_GRID) + 0.5) * side / _GRID for side in (width, height)))
         rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
         # What is too far off for a number is not seen.
         with np.errstate(all='ignore'):
             seen, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
         inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
+        inside &= ~folded[y.astype(int), x.astype(int)].ravel()
         if inside.mean() < _LEAST_SEEN:
             coefficients = ' '.join(f'{value:g}' for value in self.distortion[1])
             raise BadMessage('bad_calibration', (
