@@ -59,6 +59,32 @@ def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
     assert camera.undistort(gray) is gray
 
 
+@pytest.mark.parametrize('rectified, d', [(True, DISTORTIONS['plumb_bob']), (False, np.zeros(5)),
+                                          (False, np.empty(0))])
+@pytest.mark.parametrize('k1', [-0.6, 0.05])
+def test_images_without_a_distortion_by_their_calibration_have_the_residual_one(rectified, d, k1):
+    camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel(), d=d), rectified, k1)
+    same = Camera(P[:, :3] if rectified else K, np.array([k1, 0, 0, 0, 0]), SIZE)
+    gray = draw_blob(100, 30)
+    assert np.array_equal(camera.K, same.K) and camera.k1 == k1
+    assert np.array_equal(camera.undistort(gray), same.undistort(gray))
+    assert camera.unseen(gray.shape).any()
+    assert np.array_equal(camera.unseen(gray.shape), same.unseen(gray.shape))
+
+
+def test_a_residual_distortion_beside_that_of_the_calibration_is_refused():
+    info = camera_info(K, SIZE, d=DISTORTIONS['plumb_bob'])
+    with pytest.raises(BadMessage, match=r'residual_k1 is 0\.02, but .* -0\.28 0\.09 .* to 0'):
+        Camera.from_info(info, False, 0.02)
+
+
+@pytest.mark.parametrize('k1', [-1000.0, -50.0, 500.0])
+def test_a_residual_distortion_that_shows_next_to_nothing_is_the_parameters_fault(k1):
+    camera = Camera.from_info(camera_info(K, SIZE), True, k1)
+    with pytest.raises(BadMessage, match=r'leaves \d% .* odometry.residual_k1; .* or to 0'):
+        camera.undistort(np.zeros(SIZE[::-1], np.uint8))
+
+
 @pytest.mark.parametrize('model', DISTORTIONS)
 def test_points_are_seen_where_undistortion_takes_them_from(model):
     D = DISTORTIONS[model]

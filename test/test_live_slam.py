@@ -5,11 +5,12 @@ import gc
 from itertools import pairwise, permutations
 
 from cards import Cards, K, pose, REST, SIZE
-from djet_ros.config.flat import from_flat
+from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config, OdometryConfig, SlamConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
+from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, pose_of
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
@@ -294,6 +295,16 @@ class Drive:
         pairs = [pose_of(one) for one in self.path.poses]
         return [np.array([np.linalg.norm((poses[stamp] - self.true[stamp])[:3, 3])
                           for stamp, _ in pairs]) for poses in (self.told, dict(pairs))]
+
+
+def test_keyframes_of_a_live_map_are_without_the_residual_distortion(live):
+    gray, k1 = Cards().gray(REST), -0.05
+    slam = live(with_values(FEW_FEATURES, {'odometry.residual_k1': k1}), message_type,
+                'image_rect')
+    slam.camera_info(camera_info(K, SIZE))
+    slam.image(image(gray, stamp_ns=START))
+    undone = Camera(K, np.array([k1, 0, 0, 0, 0]), SIZE).undistort(gray)
+    assert np.array_equal(slam._frame(START).gray, undone)
 
 
 def test_keyframes_of_a_live_map_have_the_masks_of_their_images(live):

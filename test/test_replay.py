@@ -19,6 +19,7 @@ from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.sequence import render_sequence
+from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import Step
@@ -124,6 +125,14 @@ def test_images_of_keyframes_have_the_masks_that_the_odometry_had(tmp_path):
         for i in (0, 1, 3, 5):
             left_out = frame_at(SECOND + i * SECOND // 10).left_out
             assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
+
+
+def test_images_of_keyframes_are_without_the_residual_distortion(tmp_path):
+    k1 = -0.05
+    with open_recording(record(tmp_path / 'bag', drive()), IMAGE_TOPIC) as recording:
+        frame = frame_finder(recording, from_flat({'odometry.residual_k1': k1}))(SECOND)
+    camera = Camera(K, np.array([k1, 0, 0, 0, 0]), SIZE)
+    assert np.array_equal(frame.gray, camera.undistort(Cards().gray(np.eye(4))))
 
 
 # Of the vehicle

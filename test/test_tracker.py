@@ -270,6 +270,18 @@ def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
     assert not np.array_equal(poses[RAW], plain.last.pose)
 
 
+def test_a_residual_distortion_gives_what_the_same_one_of_the_calibration_gives(drive):
+    told = []
+    for topic, k1, D in ((RAW, 0.0, [0.05, 0, 0, 0, 0]), (RAW, 0.05, []),
+                         ('/camera/image_rect', 0.05, [])):
+        one = tracker(info=False, topic=topic, **{'odometry.residual_k1': k1})
+        one.camera_info(camera_info(K, SIZE, d=np.array(D)))
+        told.append([serialised(message) for out in play(one, drive[:3])
+                     for name, message in out.items() if name != '/diagnostics'])
+    assert len(told[0]) > 6
+    assert told[0] == told[1] == told[2]
+
+
 # What a backend needs
 
 def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
@@ -710,6 +722,30 @@ def test_a_switch_to_rectified_images_takes_the_other_camera(drive):
     one.configure(with_values(one.config, {'odometry.rectified': 'true'}))
     play(one, drive[1:2], start=0.1)
     assert one.last.status is Status.SIZE_CHANGED
+
+
+def test_another_residual_distortion_makes_another_camera(drive):
+    one = tracker()
+    play(one, drive[:2])
+    for k1 in (0.05, 0.0):
+        one.configure(with_values(one.config, {'odometry.residual_k1': k1}))
+        assert one.camera.k1 == k1
+    same = one.camera
+    one.configure(with_values(one.config, {'odometry.max_lost': 5}))
+    assert one.camera is same
+
+
+def test_a_residual_distortion_that_makes_no_sense_is_said_until_it_is_taken_back(drive):
+    one = tracker(info=False)
+    one.camera_info(camera_info(K, SIZE, d=np.array([-0.2, 0.05, 0, 0, 0])))
+    play(one, drive[:1])
+    one.configure(with_values(one.config, {'odometry.residual_k1': 0.02}))
+    play(one, drive[1:2], start=0.1)
+    assert (one.counts.processed, one.diagnosis().level) == (1, 'ERROR')
+    assert 'odometry.residual_k1 is 0.02' in str(one.problem)
+    one.configure(with_values(one.config, {'odometry.residual_k1': 0.0}))
+    play(one, drive[2:3], start=0.2)
+    assert (one.counts.processed, one.diagnosis().level) == (2, 'OK')
 
 
 # Diagnostics as a pure function

@@ -33,9 +33,9 @@ is told per 100 m, as the KITTI benchmark has it, where the way is that long.
 
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
           'odometry.camera_height', 'odometry.camera_pitch', 'odometry.scale_uncertainty',
-          'odometry.rectified', 'odometry.gray_range', 'odometry.frame_convention',
-          'odometry.base_frame', 'odometry.imu', 'odometry.guess', 'odometry.guess_frame',
-          'odometry.mask', 'odometry.mask_file')
+          'odometry.rectified', 'odometry.residual_k1', 'odometry.gray_range',
+          'odometry.frame_convention', 'odometry.base_frame', 'odometry.imu', 'odometry.guess',
+          'odometry.guess_frame', 'odometry.mask', 'odometry.mask_file')
 
 
 # By what parameters that is asked for of which an option names the topic.

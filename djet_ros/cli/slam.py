@@ -35,8 +35,8 @@ the odometry's own lengths are known (--scale, --scale-uncertainty) decides what
 
 _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
                  'odometry.camera_height', 'odometry.camera_pitch',
-                 'odometry.scale_uncertainty', 'odometry.gray_range', 'odometry.mask',
-                 'odometry.mask_file')
+                 'odometry.scale_uncertainty', 'odometry.residual_k1', 'odometry.gray_range',
+                 'odometry.mask', 'odometry.mask_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

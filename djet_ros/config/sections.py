@@ -81,6 +81,10 @@ class OdometryConfig:
         "(true where the image topic's last name, or else the one before it, has the word 'rect' "
         "or 'rectified', as image_rect_color and rect/image do, else false)",
         choices=('auto', 'true', 'false'))
+    residual_k1: float = parameter(
+        0.0, 'radial distortion (k1 of a CameraInfo) that images still have where they have none '
+        'by their calibration, such as rectified ones; djet lens finds it, and it is undone',
+        minimum=-1e3, maximum=1e3)
     gray_range: str = parameter(
         '0 65535', "'low high': of images of 16 bits, the values that become black and white; all "
         'others go in equal steps between them. A camera of 12 bits wants 0 4095. Images of 8 '

@@ -17,9 +17,9 @@ FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.que
 
 # Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
 SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
-          'odometry.gray_range', 'odometry.frame_convention', 'odometry.camera_frame',
-          'odometry.base_frame', 'odometry.mask', 'odometry.mask_file', 'ros.image_transport',
-          'ros.qos_reliability', 'ros.queue_policy')
+          'odometry.residual_k1', 'odometry.gray_range', 'odometry.frame_convention',
+          'odometry.camera_frame', 'odometry.base_frame', 'odometry.mask', 'odometry.mask_file',
+          'ros.image_transport', 'ros.qos_reliability', 'ros.queue_policy')
 
 # What the odometry goes by; what belongs to another node is no unknown name.
 ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')

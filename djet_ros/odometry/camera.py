@@ -3,7 +3,8 @@ sensor_msgs CameraInfo to the camera matrix of an undistorted image, and the und
 
 Which part of a CameraInfo holds depends on whether the images come rectified: P for rectified
 ones, K and D for raw ones. Nothing in a message tells; the parameter ``odometry.rectified`` does,
-and its value ``auto`` goes by the name of the image topic: see ``means_rectified``.
+and its value ``auto`` goes by the name of the image topic: see ``means_rectified``. Where the
+images have no distortion by that, ``odometry.residual_k1`` says what they still have.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ _SHORTEST, _LONGEST, _FARTHEST = 1e-2, 1e3, 10.0
 # Share of the undistorted image that must be seen in the image that comes, and the points on
 # either of its sides by which that is told.
 _LEAST_SEEN, _GRID = 0.1, 16
+
+# What mends a distortion that leaves hardly anything.
+_ANEW = 'calibrate the camera anew'
+_OF_PARAMETER = 'it is odometry.residual_k1; set that to what djet lens finds, or to 0'
 
 # Directions from the optical axis, and places along each, by which a fold is found.
 _DIRECTIONS, _ALONG = 32, 1000
@@ -57,21 +62,28 @@ class Camera:
     """
 
     def __init__(self, K: Array, D: Array, size: tuple[int, int] | None,
-                 model: str = 'plumb_bob', pinhole: Array | None = None) -> None:
+                 model: str = 'plumb_bob', pinhole: Array | None = None,
+                 remedy: str = _ANEW) -> None:
         """
         Take the camera matrix K (3, 3) of the images as they come, and their distortion.
 
         D: as OpenCV has it for the model, zeros or none without distortion; pinhole: (3, 3)
-        camera matrix of the undistorted images, by default K. Raises BadMessage.
+        camera matrix of the undistorted images, by default K; remedy: what to do where D leaves
+        hardly anything of an image, for people. Raises BadMessage.
         """
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
         self._distortion = _distortion(model, D) if D.any() else None
+        self._remedy = remedy
         self._undistorting: _Undistortion | None = None
 
     @classmethod
-    def from_info(cls, info: Any, rectified: bool) -> Camera:
-        """Make the camera that a CameraInfo describes; raises BadMessage."""
+    def from_info(cls, info: Any, rectified: bool, residual_k1: float = 0.0) -> Camera:
+        """
+        Make the camera that a CameraInfo describes; raises BadMessage.
+
+        residual_k1: distortion of images that have none by it. With another one it is refused.
+        """
         K = _numbers(info, 'k', 9).reshape(3, 3)
         projection = _numbers(info, 'p', 12).reshape(3, 4)[:, :3]
         D, size = _numbers(info, 'd', None), _image_size(info)
@@ -81,7 +93,13 @@ class Camera:
         _check_camera(K)
         check_lens(K, _whole_size(info))
         if rectified or not D.any():
-            return cls(_of_image(K, info), np.empty(0), size)
+            return cls(_of_image(K, info), np.array([residual_k1, 0, 0, 0, 0]), size,
+                       remedy=_OF_PARAMETER)
+        if residual_k1:
+            raise BadMessage('bad_calibration', (
+                f'odometry.residual_k1 is {residual_k1:g}, but the calibration has a distortion '
+                f'of its own, {_words(D)}; set the parameter to 0 and put what is left into that, '
+                'as lens.yaml of djet lens does, or odometry.rectified to true where images are'))
         pinhole = K
         if projection.any() and not _turned(info):
             _check_camera(projection)
@@ -190,10 +208,10 @@ class Camera:
         inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
         inside &= ~folded[y.astype(int), x.astype(int)].ravel()
         if inside.mean() < _LEAST_SEEN:
-            coefficients = ' '.join(f'{value:g}' for value in self.distortion[1])
             raise BadMessage('bad_calibration', (
-                f'the distortion {coefficients} ({self.distortion[0]}) leaves {inside.mean():.0%} '
-                f'of an image of {width}x{height} pixels to be seen; calibrate the camera anew'))
+                f'the distortion {_words(self.distortion[1])} ({self.distortion[0]}) leaves '
+                f'{inside.mean():.0%} of an image of {width}x{height} pixels to be seen; '
+                f'{self._remedy}'))
 
 
 def means_rectified(rectified: str, image_topic: str) -> bool:
@@ -281,6 +299,11 @@ def _distortion(model: str, D: Array) -> tuple[str, Array]:
         raise BadMessage('unknown_distortion', f"distortion model '{model:.40}' with {len(D)} "
                          f'numbers is not known; {", ".join(_MODELS)} are')
     return model, D
+
+
+def _words(D: Array) -> str:
+    """Coefficients for people."""
+    return ' '.join(f'{value:g}' for value in D)
 
 
 def _binning(info: Any) -> tuple[int, int]:

@@ -157,7 +157,8 @@ class Tracker:
         self._health.configure(after)
         self._path = deque(self._path if before == after else (),
                            maxlen=config.ros.path_length)
-        if before.rectified != after.rectified and self._info is not None:
+        if self._info is not None and (before.rectified, before.residual_k1) != (
+                after.rectified, after.residual_k1):
             info, self._info = self._info, None
             self.camera_info(info)
 
@@ -167,8 +168,10 @@ class Tracker:
             return []
         self._info = message
         try:
-            self._camera = Camera.from_info(message, means_rectified(
-                self.config.odometry.rectified, self._image_topic))
+            config = self.config.odometry
+            self._camera = Camera.from_info(
+                message, means_rectified(config.rectified, self._image_topic),
+                config.residual_k1)
         except BadMessage as problem:
             self._camera = None
             self.counts.rejected_infos[problem.reason] += 1

@@ -117,7 +117,9 @@ class LiveSlam:
         if self._info is None or not same_camera(self._info, message):
             self._info = message
             try:
-                self._camera, self.problem = Camera.from_info(message, self._rectified), None
+                self._camera = Camera.from_info(message, self._rectified,
+                                                self.config.odometry.residual_k1)
+                self.problem = None
             except BadMessage as problem:
                 self._camera = None
                 self._reject('camera_info', problem)

@@ -49,7 +49,7 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
     for topic, recorded, message in recording.messages(
             {recording.image_topic, recording.info_topic, mask_topic}):
         if topic == recording.info_topic:
-            camera = Camera.from_info(message, rectified)
+            camera = Camera.from_info(message, rectified, config.odometry.residual_k1)
         elif topic == recording.image_topic and camera is not None:
             waiting.append((recorded, camera, message))
         elif topic == mask_topic:
