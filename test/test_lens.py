@@ -10,7 +10,7 @@ import cv2
 from djet_ros.cli.main import main
 from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.core.covariance import LARGE_CELLS, SHIFT
-from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.geometry import rotation_exp, rotation_log, unit
 from djet_ros.core.lens import (
     by_radius,
     fit_lens,
@@ -24,9 +24,10 @@ from djet_ros.errors import DjetError
 from djet_ros.lab import lens
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.datasets import open_sequence
-from djet_ros.recordings.decoding import MAKE
+from djet_ros.recordings.decoding import MAKE, message_type
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import SequenceRecording
 import numpy as np
@@ -162,11 +163,10 @@ def with_row(sequence: Path, folder: Path, row: str) -> Path:
     return folder
 
 
-@pytest.fixture(scope='module')
-def distorted(whip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def through_a_lens(original: Path, place: Path) -> Path:
     """Show the same frames through a lens with k1 = -0.02, which the calibration leaves out."""
-    sequence = open_sequence(whip)
-    folder = like(whip, tmp_path_factory.mktemp('distorted'))
+    sequence = open_sequence(original)
+    folder = like(original, place)
     width, height = sequence.size
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
     D = np.array([-0.02, 0, 0, 0, 0])
@@ -177,6 +177,11 @@ def distorted(whip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                          borderMode=cv2.BORDER_REPLICATE)
         cv2.imwrite(str(folder / 'image_0' / path.name), seen)
     return folder
+
+
+@pytest.fixture(scope='module')
+def distorted(whip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return through_a_lens(whip, tmp_path_factory.mktemp('distorted'))
 
 
 def examined(sequence: Path, config: Config | None = None) -> lens.LensReport:
@@ -202,17 +207,62 @@ def test_a_wrong_calibration_is_told_and_corrected(
     output = tmp_path / 'lens'
     assert main(['lens', str(distorted), '--output', str(output)]) == 0
     said = capsys.readouterr().out
-    row = row_of(said)
-    k1 = float(row.split()[1])
-    assert k1 == pytest.approx(-0.02, abs=1e-3)
-    # The row is one of a calib.txt, with which next to nothing is left.
-    assert 'calib.txt' in said
-    corrected = with_row(distorted, tmp_path, row)
-    assert open_sequence(corrected).distortion.tolist() == [k1, 0, 0, 0, 0]
-    assert not examined(corrected).worth_correcting
+    flag, k1 = said.splitlines()[-1 - said.count('plot: ')].split()
+    assert float(k1) == pytest.approx(-0.02, abs=1e-3)
+    assert 'raw images anew' in said and 'odometry.residual_k1' in said
+    # With that flag next to nothing is left.
+    assert main(['lens', str(distorted), flag, k1]) == 0
+    again = capsys.readouterr().out
+    assert f'({float(k1):.4g} so far)' in again and 'not worth correcting' in again
     # A driver's images are raw, and these are not.
     assert [path.name for path in output.iterdir()] == ['lens.png']
     assert (output / 'lens.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_wrong_row_of_a_calib_txt_is_told_by_the_right_one(
+        distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong = with_row(distorted, tmp_path, 'D: 0.01 0 0 0 0')
+    assert main(['lens', str(wrong)]) == 0
+    said = capsys.readouterr().out
+    assert 'row of its calib.txt' in said and '--residual-k1' not in said
+    assert float(row_of(said).split()[1]) == pytest.approx(-0.02, abs=1e-3)
+    # The parameter is for images that have none by their calibration.
+    assert main(['lens', str(wrong), '--residual-k1', '0.01']) == 2
+    assert 'odometry.residual_k1 is 0.01, but' in capsys.readouterr().err
+
+
+def tracked(sequence: Path, k1: float = 0.0) -> Array:
+    """Poses (N, 4, 4) that the odometry tells of a sequence."""
+    recording = SequenceRecording(open_sequence(sequence))
+    tracker = Tracker(Config(odometry=OdometryConfig(residual_k1=k1)), message_type,
+                      image_topic=recording.image_topic)
+    poses = []
+    for topic, _, message in recording.messages():
+        if topic == recording.info_topic:
+            tracker.camera_info(message)
+        elif topic == recording.image_topic:
+            tracker.image(message)
+            assert tracker.last is not None
+            poses.append(tracker.last.pose)
+    return np.array(poses)
+
+
+def test_without_what_the_calibration_left_poses_are_right_and_keep_their_scale(
+        tmp_path: Path) -> None:
+    walk = render_sequence('handheld', tmp_path, 16, size=(480, 360))
+    seen = through_a_lens(walk, tmp_path / 'seen')
+    truth = open_sequence(walk).poses
+    assert truth is not None
+    turned, grown = {}, {}
+    for name, poses in (('plain', tracked(walk)), ('seen', tracked(seen)),
+                        ('undone', tracked(seen, -0.02))):
+        off = np.linalg.inv(truth) @ poses
+        turned[name] = np.degrees(np.linalg.norm(rotation_log(off[:, :3, :3]), axis=1).max())
+        lengths, steps = (np.linalg.norm(np.diff(some[:, :3, 3], axis=0), axis=1)
+                          for some in (poses, truth))
+        grown[name] = abs(np.log((lengths / steps)[-4:].mean() / (lengths / steps)[:4].mean()))
+    assert max(turned['plain'], turned['undone']) < 0.05 and turned['seen'] > 0.1
+    assert max(grown['plain'], grown['undone']) < 0.01 and grown['seen'] > 0.02
 
 
 @pytest.fixture(scope='module')
@@ -228,7 +278,7 @@ def test_a_driver_gets_a_file_where_its_images_are_raw(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lens', str(raw_bag), '--output', str(tmp_path / 'out')]) == 0
     said = capsys.readouterr().out
-    assert '(0.01 by the calibration)' in said
+    assert '(0.01 so far)' in said
     assert 'camera_info_manager' in said and 'calib.txt' not in said
     written = yaml.safe_load((tmp_path / 'out' / 'lens.yaml').read_text())
     D = written['distortion_coefficients']['data']
@@ -242,7 +292,7 @@ def test_of_rectified_images_a_driver_gets_no_file(
     # As if somebody had rectified them, by whatever there was.
     assert main(['lens', str(raw_bag), '--rectified', 'true', '--output', str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    assert 'the images are rectified' in said and 'lens.yaml' not in said
+    assert '--residual-k1 -0.0' in said and 'lens.yaml' not in said
     assert [path.name for path in tmp_path.iterdir()] == ['lens.png']
 
 

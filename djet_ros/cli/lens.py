@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameters as YAML, plain or in the layout of ROS; flags come on '
                         'top')
-    add_flags(parser, ('odometry.rectified', 'odometry.mask_file'))
+    add_flags(parser, ('odometry.rectified', 'odometry.residual_k1', 'odometry.mask_file'))
     add_topics(parser, 'image', 'info')
 
 
@@ -67,24 +67,24 @@ def _write(folder: Path, report: LensReport, args: argparse.Namespace) -> None:
 def _found(report: LensReport, source: Path) -> str:
     fit, k1 = report.fit, report.camera.k1
     pixels, spread = (report.moved_pixels(value) for value in (fit.k1, k1 + fit.sigma))
-    before = f' ({k1:.4g} by the calibration)' if k1 else ''
+    before = f' ({k1:.4g} so far)' if k1 else ''
     said = (f'k1 = {fit.k1:.4f} +- {fit.sigma:.4f}{before}, by {len(fit.linearised)} of '
             f'{report.pairs} pairs, which turn by {report.turned_deg:.0f} degrees\n'
             f'that moves the outermost matches by {pixels:.1f} +- {spread:.1f} pixels: ')
     if not report.worth_correcting:
         return said + 'not worth correcting'
-    row = ' '.join(f'{value:.4g}' for value in report.coefficients)
-    return f'{said}worth correcting, {_remedy(report, source)}:\nD: {row}'
+    return f'{said}worth correcting, {_remedy(report, source)}'
 
 
 def _remedy(report: LensReport, source: Path) -> str:
     """Say where the coefficients belong: nothing reads all of a driver, a calib.txt, a folder."""
-    if not is_bag(source):
-        return ('by this row of its calib.txt' if (source / 'calib.txt').is_file() else
-                'by these coefficients where the folder describes its camera')
-    if not report.rectified:
+    if report.rectified:
+        return ('by calibrating the raw images anew, or by this flag of djet replay '
+                f'(odometry.residual_k1 of a node):\n--residual-k1 {report.fit.k1:.5f}')
+    row = ' '.join(f'{value:.4g}' for value in report.coefficients)
+    if is_bag(source):
         return (f'by {YAML} (--output), which camera_info_manager loads, or such a d of the '
-                'CameraInfo')
-    return ('and the images are rectified: calibrate the raw ones anew, for this is what their '
-            'calibration leaves; or replay these with a CameraInfo whose k is the camera of p and '
-            'whose d is this, and odometry.rectified false')
+                f'CameraInfo:\nD: {row}')
+    if (source / 'calib.txt').is_file():
+        return f'by this row of its calib.txt:\nD: {row}'
+    return f'by these coefficients where the folder describes its camera:\nD: {row}'

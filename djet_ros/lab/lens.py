@@ -55,8 +55,9 @@ class LensReport:
     """
     What was found of a camera's distortion.
 
-    info: its CameraInfo; rectified: whether its images come rectified, so that they have no
-    distortion by it; pairs: how many were tracked in all; the fit is that of the informative ones.
+    info: its CameraInfo; rectified: whether its images come rectified, so that what distortion
+    they have is that of odometry.residual_k1 alone; pairs: how many were tracked in all; the fit
+    is that of the informative ones.
     """
 
     camera: Camera
@@ -220,7 +221,7 @@ def plot_lens(path: Path, title: str, report: LensReport) -> None:
     k1, sigma = by_radius(fit, edges)
     with figure(path, 6.4, 4.2) as drawing:
         axes = drawing.subplots()
-        axes.axhline(0, color='black', lw=0.8, label='as calibrated')
+        axes.axhline(0, color='black', lw=0.8, label='so far')
         axes.plot(_radius(camera, fine), _outwards(camera, fine, fit.k1), color=COLOURS['rpe'],
                   label=f'k1 = {fit.k1:.4f} ± {fit.sigma:.4f}')
         off, width = (np.concatenate([_outwards(camera, at, one)
