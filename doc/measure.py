@@ -20,7 +20,6 @@ import json
 import os
 from pathlib import Path
 import platform
-import shutil
 import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -78,7 +77,8 @@ DRIVE = 100.0
 ALONE = 'images alone'
 REPLAYED = {ALONE: {},
             '`camera_height`': {'odometry.scale': 'camera_height', 'odometry.camera_height': 1.65}}
-# Standard errors beside the distortion that is found by which it is taken too.
+# What undoes the distortion that is found, and standard errors beside it by which it is taken too.
+RESIDUAL = 'odometry.residual_k1'
 BESIDE = (-2, -1, 1, 2)
 BENCH_PAIRS = 40
 # An error that a true covariance of five degrees of freedom allows in one pair of a thousand.
@@ -388,11 +388,11 @@ def drive(folder: Path) -> dict[str, Any]:
         found = {'frames': datasets[0].pairs + 1, 'length': rounded(length(folder)),
                  'chained': by_method(datasets, chained, estimated(datasets, chained)),
                  'replays': {how: replayed(folder, values) for how, values in REPLAYED.items()},
-                 **lens(folder, Path(name))}
+                 **lens(folder)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
-def lens(folder: Path, place: Path) -> dict[str, Any]:
+def lens(folder: Path) -> dict[str, Any]:
     """Replay a drive without the distortion that it tells itself, if it is worth correcting."""
     with closing(open_recording(folder)) as recording:
         try:
@@ -403,24 +403,12 @@ def lens(folder: Path, place: Path) -> dict[str, Any]:
     if not report.worth_correcting:
         return {}
     k1, sigma = report.fit.k1, report.fit.sigma
-    undone = with_distortion(folder, k1, place)
     return {'lens': {
         'k1': rounded(k1), 'sigma': rounded(sigma),
-        'replays': {how: replayed(undone, values) for how, values in REPLAYED.items()},
-        'beside': {str(off): replayed(with_distortion(folder, k1 + off * sigma, place),
-                                      REPLAYED[ALONE]) for off in BESIDE}}}
-
-
-def with_distortion(folder: Path, k1: float, place: Path) -> Path:
-    """Give a KITTI sequence whose calib.txt says what its images have of distortion."""
-    copied = place / f'{k1:.9f}' / 'sequences' / folder.name
-    copied.mkdir(parents=True)
-    (copied / 'image_0').symlink_to(folder.resolve() / 'image_0')
-    shutil.copy(folder / 'times.txt', copied)
-    (copied / 'calib.txt').write_text(
-        f'{(folder / "calib.txt").read_text("utf-8").rstrip()}\nD: {k1:.9f} 0 0 0 0\n', 'utf-8')
-    (copied.parents[1] / 'poses').symlink_to(folder.resolve().parents[1] / 'poses')
-    return copied
+        'replays': {how: replayed(folder, {**values, RESIDUAL: k1})
+                    for how, values in REPLAYED.items()},
+        'beside': {str(off): replayed(folder, {**REPLAYED[ALONE], RESIDUAL: k1 + off * sigma})
+                   for off in BESIDE}}}
 
 
 def replayed(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
