@@ -96,6 +96,18 @@ def test_points_are_seen_where_undistortion_takes_them_from(model):
     assert not np.allclose(camera.pixels(PLACES, camera.k1 + 0.1)[0], seen, atol=0.1)
 
 
+def test_a_fisheye_whose_coefficients_are_zeros_has_angles_in_equal_steps():
+    camera = Camera.from_info(camera_info(K, SIZE, d=np.zeros(4), distortion_model='equidistant'),
+                              False)
+    angle = np.radians(20)
+    image = camera.undistort(draw_blob(K[0, 2] + K[0, 0] * angle, K[1, 2]))
+    x, y = K[0, 2] + K[0, 0] * np.tan(angle), K[1, 2]
+    assert np.allclose(blob_near(image, x, y), (x, y), atol=0.15)
+    with pytest.raises(BadMessage, match='residual_k1 is 0.01, but .* of its own, 0 0 0 0'):
+        Camera.from_info(camera_info(K, SIZE, d=np.zeros(4), distortion_model='equidistant'),
+                         False, 0.01)
+
+
 @pytest.mark.parametrize('model', [*DISTORTIONS, ''])
 def test_how_points_move_in_the_image_is_the_derivative_of_where_they_are_seen(model):
     camera = Camera(K, DISTORTIONS.get(model, np.empty(0)), SIZE, model or 'plumb_bob')

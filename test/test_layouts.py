@@ -1,6 +1,7 @@
 """Layouts as they are downloaded: OpenCV's YAML, JPEG, TUM-VI, 7-Scenes, KITTI raw, and IMUs."""
 
 from pathlib import Path
+import re
 import shutil
 
 import cv2
@@ -10,7 +11,7 @@ from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.datasets import euroc, open_sequence, seven_scenes, tum_rgbd
 from djet_ros.recordings.kitti_raw import clock_nanoseconds
-from djet_ros.recordings.recording import open_recording
+from djet_ros.recordings.recording import open_recording, RAW_IMAGE_TOPIC, SequenceRecording
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -166,6 +167,10 @@ def test_tum_vi_has_its_camera_from_kalibr_and_its_truth_from_mocap(asl: Path) -
     columns = sequence.image(0).astype(float).sum(0)
     assert np.average(np.arange(SIZE[0]), weights=columns) == pytest.approx(
         79 + 60 * np.tan(theta), abs=0.7)
+    # As it is with coefficients that are zeros.
+    (asl / 'dso' / 'camchain.yaml').write_text(re.sub(
+        'distortion_coeffs: .*', 'distortion_coeffs: [0, 0, 0, 0]', KALIBR))
+    assert SequenceRecording(euroc(asl)).image_topic == RAW_IMAGE_TOPIC
     (asl / 'dso' / 'camchain.yaml').write_text(KALIBR.replace('T_cam_imu', 'T_imu_cam'))
     with pytest.raises(DjetError, match=r'no camera chain of Kalibr \(cam0'):
         euroc(asl)

@@ -67,13 +67,13 @@ class Camera:
         """
         Take the camera matrix K (3, 3) of the images as they come, and their distortion.
 
-        D: as OpenCV has it for the model, zeros or none without distortion; pinhole: (3, 3)
-        camera matrix of the undistorted images, by default K; remedy: what to do where D leaves
-        hardly anything of an image, for people. Raises BadMessage.
+        D: as OpenCV has it for the model, see ``distorts``; pinhole: (3, 3) camera matrix of the
+        undistorted images, by default K; remedy: what to do where D leaves hardly anything of an
+        image, for people. Raises BadMessage.
         """
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
-        self._distortion = _distortion(model, D) if D.any() else None
+        self._distortion = _distortion(model, D) if distorts(model, D) else None
         self._remedy = remedy
         self._undistorting: _Undistortion | None = None
 
@@ -92,7 +92,8 @@ class Camera:
             K = projection if projection.any() else K
         _check_camera(K)
         check_lens(K, _whole_size(info))
-        if rectified or not D.any():
+        model = info.distortion_model or 'plumb_bob'
+        if rectified or not distorts(model, D):
             return cls(_of_image(K, info), np.array([residual_k1, 0, 0, 0, 0]), size,
                        remedy=_OF_PARAMETER)
         if residual_k1:
@@ -105,8 +106,7 @@ class Camera:
             _check_camera(projection)
             check_lens(projection, _whole_size(info))
             pinhole = projection
-        return cls(_of_image(K, info), D, size, info.distortion_model or 'plumb_bob',
-                   _of_image(pinhole, info))
+        return cls(_of_image(K, info), D, size, model, _of_image(pinhole, info))
 
     def undistort(self, gray: Gray) -> Gray:
         """Image (H, W) without its distortion; BadMessage where its size is not the camera's."""
@@ -231,6 +231,15 @@ def means_rectified(rectified: str, image_topic: str) -> bool:
             # Drivers have image_rect_raw, which is rectified.
             return bool(words & _RECTIFIED)
     return False
+
+
+def distorts(model: str, D: Array) -> bool:
+    """
+    Tell whether coefficients D of a model make images other than those of a pinhole.
+
+    Zeros do so for a fisheye: it has angles in equal steps, r = f theta, and not r = f tan(theta).
+    """
+    return bool(D.any()) or (model == 'equidistant' and len(D) > 0)
 
 
 def same_camera(a: Any, b: Any) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, check_lens
+from djet_ros.odometry.camera import Camera, check_lens, distorts
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, narrowed
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
@@ -57,6 +57,11 @@ class FrameSequence:
     def __len__(self) -> int:
         """Count the frames."""
         return len(self.stamps_ns)
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the files show what a pinhole would not."""
+        return distorts(self.model, self.distortion)
 
     def raw(self, index: int) -> NDArray[Any]:
         """Gray pixels (H, W) of a frame as its file has them, uint8 or uint16."""

@@ -92,7 +92,7 @@ class SequenceRecording(Recording):
         self._sequence = sequence
         self._imu = sequence.imu if imu else None
         # By the name everybody knows whether images are rectified.
-        self.image_topic = RAW_IMAGE_TOPIC if sequence.distortion.any() else IMAGE_TOPIC
+        self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
         self.ground_truth_topic = None if sequence.poses is None else GROUND_TRUTH_TOPIC
         self.beside = {} if self._imu is None else {'imu': IMU_TOPIC,
