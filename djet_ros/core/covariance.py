@@ -236,7 +236,24 @@ def spanning(covariance: Array, t: Array, apart: Array, probability: float
     Gives it with that over (rotation vector, t), (6, 6): C + p a a^T, the expected square of the
     error of the pose at hand.
     """
-    covariance = covariance + probability * np.outer(apart, apart)
+    return _lifted(covariance + probability * np.outer(apart, apart), t)
+
+
+def widened(covariance: Array, t: Array, other: Array) -> tuple[Array, Array]:
+    """
+    Widen a covariance (5, 5) by that of another pose (6, 6), over (rotation vector, t).
+
+    Where that may as well be the true one, which is spanned, the truth is as far from it as it
+    says. Gives it as ``spanning`` does; as it was where the other is not determined.
+    """
+    if np.isfinite(other).all():
+        basis = lift(sphere_tangents(t))
+        covariance = covariance + basis.T @ other @ basis
+    return _lifted(covariance, t)
+
+
+def _lifted(covariance: Array, t: Array) -> tuple[Array, Array]:
+    """Give a covariance (5, 5), and the same over (rotation vector, t), (6, 6)."""
     basis = lift(sphere_tangents(t))
     return covariance, basis @ covariance @ basis.T
 

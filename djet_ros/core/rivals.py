@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 from djet_ros.core.covariance import summed_by_cell
 from djet_ros.core.geometry import facing, inverse_depths
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
@@ -42,6 +43,10 @@ _DIRECTIONS = 10
 
 # A second motion is looked for among so many strays at most.
 _STRAYS = 150
+
+# chosen: share of the matches that may stray from a plane which is all there is; next to none did
+# from rendered ones.
+_OFF_PLANE = 0.1
 
 # Shares of a body's points before its far and its near end; chosen: some are not of it.
 _FAR_END, _NEAR_END = 0.1, 0.95
@@ -120,6 +125,20 @@ def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> l
     """Bring rivals to the minima of their basins, on some of the matches."""
     some = problem.subset(thinned(len(problem.blur), _REFINED_ON))
     return refine_all(some, rivals, loss, _STEPS).poses()
+
+
+def lie_on_a_plane(x: Array, y: Array, noise: float) -> bool:
+    """
+    Tell whether nearly all matches x, y (N, 2), in pixels, are seen as those of one plane are.
+
+    noise: robust standard deviation in pixels.
+    """
+    some = thinned(len(x), _REFINED_ON)
+    H, _ = cv2.findHomography(x[some], y[some], cv2.USAC_MAGSAC, _MEMBER * noise)
+    if H is None or not np.isfinite(H).all():
+        return False
+    off = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
+    return bool((off > _STRAY * noise).mean() < _OFF_PLANE)
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,

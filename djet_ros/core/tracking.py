@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from djet_ros.core.basins import (
     Ahead,
@@ -46,11 +47,14 @@ from djet_ros.core.rivals import (
     change,
     DECIDED,
     goes_on,
+    lie_on_a_plane,
     preferences,
+    refined_rivals,
     Rival,
     second_motion,
     SecondMotion,
 )
+from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.starts import Known
 from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
@@ -88,7 +92,8 @@ class Track:
     """
     Where Algorithm 1 ended.
 
-    pose; loss: the robust loss in force; residuals: those of the voting matches at the pose;
+    pose; problem: of the voting matches, at the end; loss: the robust loss in force; residuals:
+    those of the problem at the pose;
     voting: (N,) bool, matches that took part; placed: where gray levels have y (N, 2), through the
     last warp, or y itself where that was not asked; minima: (N, 2) the surfaces' own minima y*,
     joined with these for matches that voted; y_opt: (N, 2) the final step onto the epipolar line;
@@ -98,6 +103,7 @@ class Track:
     """
 
     pose: Pose
+    problem: JetProblem
     loss: Loss
     residuals: Residuals
     voting: NDArray[np.bool_]
@@ -147,6 +153,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     first = algorithm.first
     untold = replace(pair, known=Known())
     algorithm, track = _contested(algorithm, track, pair, surface, config, ahead)
+    track = replace(track, rivals=_of_one_plane(track, first, surface.x))
     if turn is not None and not turn.may_be(track.pose.R):
         for rival in first.rivals:
             led = _Algorithm(untold, surface, config, everything).run([rival])
@@ -197,6 +204,29 @@ def _contested(algorithm: _Algorithm, track: Track, pair: Pair, surface: Residua
     return algorithm, replace(track, rivals=tuple(rivals))
 
 
+def _of_one_plane(track: Track, first: _Optimised, x: Array) -> tuple[Rival, ...]:
+    """
+    Prefer a pose to its rivals by no more than chirality does, where all is one plane.
+
+    x: (N, 2) pixels of the matches. The lines of two motions go through all that one plane shows
+    (Longuet-Higgins, Proc. R. Soc. B 1986), and which are nearer is noise; the other motion may
+    only have part of it behind a camera. That is asked of the first round, where both are held
+    against the same places: later ones lie, and patches are warped, as the pose that was led on
+    has them, and it makes itself sure.
+    """
+    agree = track.inliers()
+    if not (first.rivals and any(rival.preference >= DECIDED for rival in track.rivals)
+            and lie_on_a_plane(x[agree], track.placed.places[agree], track.scale())):
+        return track.rivals
+    ours = first.nearest(track.pose)
+    preferred = preferences(first.losses_behind(), first.places, ours)
+    # What was in the same basin then is not held against it.
+    preferred[ours] = np.inf
+    return tuple(replace(rival, preference=min(
+        rival.preference, float(preferred[first.nearest(rival.pose)])))
+        for rival in track.rivals)
+
+
 @dataclass(frozen=True)
 class _Optimised:
     """
@@ -213,6 +243,21 @@ class _Optimised:
     solution: Solution
     converged: bool
     rivals: tuple[Pose, ...]
+
+    @cached_property
+    def basins(self) -> list[Pose]:
+        """Give the poses of all basins, its own first, each where its own matches have it."""
+        return [self.solution.pose, *refined_rivals(self.problem, self.rivals, self.loss)]
+
+    def losses_behind(self) -> Array:
+        """Losses (S, M) of matches for lying behind a camera, by the poses of all basins."""
+        lines = refine_all(self.problem, self.basins, self.loss, 0)
+        on_lines = lines.sign * self.loss(lines.r**2)[0]
+        return losses_in_front(self.problem, lines, self.loss) - on_lines
+
+    def nearest(self, pose: Pose) -> int:
+        """Tell the number of the basin that a pose is next to."""
+        return int(np.argmin([apart(one, pose) for one in self.basins]))
 
 
 class _Algorithm:
@@ -253,7 +298,9 @@ class _Algorithm:
                                     TRACK_TUNING.steps_by_places if by_places else MAX_STEPS)
             if number == 1:
                 self.first = found
-            last = found.converged or number == most
+            # A pose is not at rest before surfaces are seen as it has them.
+            seen = self._warp is not None or not self._config.warp_reference
+            last = (seen and found.converged) or number == most
             if last:
                 found, placed, rivals = self._concluded(found)
             # Keypoints go towards their optimum on the epipolar line of the new pose.
@@ -268,8 +315,8 @@ class _Algorithm:
             poses, by_places = [pose], False
         minima = paraboloids.minima()
         minima[voting] = (self._K @ found.problem.rays_y)[:2].T
-        return Track(pose, found.loss, found.solution.residuals, voting, minima, placed, optimum,
-                     self._losses, no_minimum, tuple(rounds), rivals)
+        return Track(pose, found.problem, found.loss, found.solution.residuals, voting, minima,
+                     placed, optimum, self._losses, no_minimum, tuple(rounds), rivals)
 
     def _fits(self, by_places: bool) -> Paraboloids:
         """Fit surfaces around the keypoints, or take these as they are."""
@@ -348,10 +395,11 @@ def hold(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     """Take a pose as it is, and look at the surfaces there: the 5-point method's last word."""
     paraboloids = surface.around(y)
     voting = paraboloids.usable
-    residuals = epipolar_residuals(jet_problem(K, surface.x, paraboloids), pose.R, pose.t)
+    problem = jet_problem(K, surface.x, paraboloids)
+    residuals = epipolar_residuals(problem, pose.R, pose.t)
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-    return Track(pose, Loss(), residuals, voting, paraboloids.minima(), as_matched(y), optimum,
-                 paraboloids.values(optimum), 0)
+    return Track(pose, problem, Loss(), residuals, voting, paraboloids.minima(), as_matched(y),
+                 optimum, paraboloids.values(optimum), 0)
 
 
 def _of_the_camera(second: SecondMotion, prior: Pose | None, turn: Turn | None

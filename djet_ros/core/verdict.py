@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from djet_ros.core.covariance import difference, pose_covariance, spanning, squared_distance
+from djet_ros.core.covariance import (
+    difference,
+    pose_covariance,
+    spanning,
+    squared_distance,
+    widened,
+)
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     epipolar_lines,
@@ -14,6 +20,7 @@ from djet_ros.core.geometry import (
     sides,
 )
 from djet_ros.core.hamming import match_distances
+from djet_ros.core.jet import epipolar_residuals
 from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import quantile
 from djet_ros.core.rivals import change, DECIDED, false_alarms, goes_on, preferences
@@ -74,7 +81,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
                 covariances = spanning(covariances[0], t, bent, 1.0)
             status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
-            status, covariances = _judged(Pose(R, t), covariances, track, pair.before, other_way)
+            status, covariances = _judged(Pose(R, t), covariances, track, x[track.voting],
+                                          pair.before, other_way)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
         status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,
@@ -120,7 +128,7 @@ def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
     return false_alarms(agreeing, len(track.voting), chance) > 0
 
 
-def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
+def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: Array,
             before: Pose | None, other_way: bool) -> tuple[Status, tuple[Array, Array]]:
     """
     Tell whether rivals leave a pose unsure, and widen its covariances to span them.
@@ -139,12 +147,21 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track,
             status = Status.AMBIGUOUS
         covariances = spanning(covariances[0], pose.t, off,
                                float(ndtr(-_TRUSTED * rival.preference)))
+        if undecided:
+            covariances = widened(covariances[0], pose.t,
+                                  _covariance_of(rival.pose, track, places))
     if other_way:
         status = status if track.guess else Status.AMBIGUOUS
         # It lies 2 away by its chord, to no side more than to another.
         for off in np.sqrt(2) * np.eye(5)[3:]:
             covariances = spanning(covariances[0], pose.t, off, 0.5)
     return status, covariances
+
+
+def _covariance_of(pose: Pose, track: Track, places: Array) -> Array:
+    """Covariance (6, 6) of a rival, by the matches as they lie for the pose that was taken."""
+    residuals = epipolar_residuals(track.problem, pose.R, pose.t)
+    return pose_covariance(residuals, track.loss, places, pose.t, flipped=False)[1]
 
 
 def _goes_on(before: Pose | None, pose: Pose, rival: Pose) -> bool:
