@@ -58,6 +58,16 @@ def test_lengths_that_err_as_they_say_have_the_squares_of_chance() -> None:
         assert np.median(squares) / chi2.median(1) == pytest.approx(1 / claimed**2, rel=0.1)
 
 
+@pytest.mark.parametrize('stays', [0.3, 0.6])
+def test_what_stays_of_an_error_is_in_the_neighbours_too(stays: float) -> None:
+    rng = np.random.default_rng(2)
+    errors = rng.normal(0, 0.001, 4000)
+    told = np.exp(errors + stays * np.append(0.0, np.cumsum(errors)[:-1]))
+    results = results_of(told, 0.001 * told, (stays * 0.001)**2 * np.arange(1, len(told) + 1))
+    squares = step_squares(straight(np.ones(len(told))), results)
+    assert np.median(squares) / chi2.median(1) == pytest.approx(1, rel=0.1)
+
+
 @pytest.mark.parametrize('claimed', [1.0, 0.5])
 def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: float) -> None:
     rng = np.random.default_rng(1)

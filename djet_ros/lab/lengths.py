@@ -26,6 +26,7 @@ from djet_ros.odometry.uncertainty import PathCovariance
 from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
 from djet_ros.replay.drift import drift, one_factor, scale_change
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -142,7 +143,13 @@ def step_squares(truth: Array, results: Sequence[OdometryResult]) -> Array:
     Squared errors of lengths over their variances, (M,), each against its neighbours.
 
     What the scale has drifted by before is no error of a step, so the factor between lengths and
-    the truth is that of the steps before and after.
+    the truth is that of the steps before and after. A part of a step's error is in all later
+    steps too: by that the scale wanders, as is told (see ``Common``), and where it is in
+    neighbours it cancels. With errors x_j, of which w_j stays, the logarithm of a length is off by
+    x_i + sum_(j<i) w_j, and what is weighed by c_i, one for the step and sharing out minus one
+    among its neighbours, by
+
+        sum_j (c_j x_j + (sum_(i>j) c_i) w_j) .
     """
     moved = [(index, result) for index, result in enumerate(results)
              if index and result.status in TRACKED and result.motion[:3, 3].any()]
@@ -150,16 +157,18 @@ def step_squares(truth: Array, results: Sequence[OdometryResult]) -> Array:
         return np.empty(0)
     true = np.array([np.linalg.norm(truth[index, :3, 3] - truth[index - 1, :3, 3])
                      for index, _ in moved])
-    lengths = np.array([np.linalg.norm(result.motion[:3, 3]) for _, result in moved])
-    ways = np.array([result.motion[:3, 3] for _, result in moved]) / lengths[:, None]
-    variances = np.einsum('ni,nij,nj->n', ways, np.array(
-        [result.motion_covariance[:3, :3] for _, result in moved]), ways) / lengths**2
-    ratios = np.log(lengths / true)
-    kernel = np.ones(2 * _NEIGHBOURS + 1) / (2 * _NEIGHBOURS)
-    kernel[_NEIGHBOURS] = 0.0
-    inner = slice(_NEIGHBOURS, -_NEIGHBOURS)
-    off = ratios[inner] - np.convolve(ratios, kernel, 'valid')
-    return np.asarray(off**2 / (variances[inner] + np.convolve(variances, kernel**2, 'valid')))
+    ratios = np.log(np.array([_length(result) for _, result in moved]) / true)
+    sigmas = np.array([_own_sigma(result) for _, result in moved])
+    wandered = np.array([_wandered(result) for _, result in moved])
+    stay = np.sqrt(np.maximum(np.diff(wandered, prepend=0.0), 0.0))
+    weights = np.full(2 * _NEIGHBOURS + 1, -1 / (2 * _NEIGHBOURS))
+    weights[_NEIGHBOURS] = 1.0
+    after = np.cumsum(weights[::-1])[::-1] - weights
+    ratios, sigmas, stay = (sliding_window_view(values, len(weights))
+                            for values in (ratios, sigmas, stay))
+    # An error and what stays of it are one and the same, so that they add up before the square.
+    variances = ((weights * sigmas + after * stay)**2).sum(1)
+    return np.asarray((ratios @ weights)**2 / variances)
 
 
 def stretch_squares(truth: Array, results: Sequence[OdometryResult], metres: float

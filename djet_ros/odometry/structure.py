@@ -28,7 +28,8 @@ _LOST = 0.35
 
 # By how much the factor wanders in a step, as a share of how unsure the step's own length is: from
 # 25 to 100 steps on, on rendered streets, its variance is a third of what it were if each step
-# were held against the one before alone, since landmarks outlast steps.
+# were held against the one before alone, since landmarks outlast steps. It is the step's own error
+# that stays by that share.
 _WANDERING = 0.6
 
 # Single metric lengths differ from one another by this at least (bumps, time stamps).
