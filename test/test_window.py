@@ -158,6 +158,17 @@ def test_a_track_turns_astray_by_less_than_half_of_what_its_pairs_do(seed: int) 
     assert told < 0.5 * by_pairs
 
 
+@pytest.mark.parametrize('seed', range(2))
+def test_a_track_goes_on_by_as_much_as_a_step_is_long_however_far_it_has_come(seed: int) -> None:
+    window, off, sigmas = NumbersWindow(Street(seed, 160, 0.2, turned=1e-3)), [], []
+    for _ in range(160):
+        window.go()
+        window.tell(window.added.onward)
+        off.append(np.linalg.norm(window.added.onward[:3, 3]) - window.added.length)
+        sigmas.append(window.added.sigma)
+    assert np.std(off[-50:]) < np.median(sigmas)
+
+
 def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
     window, here = NumbersWindow(Street(0, 40, 0.02)), np.eye(4)
     ways = []

@@ -163,7 +163,8 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
-        # The newest camera as it was told; its pose may have been refined since.
+        # The newest camera as it was told, seen from the oldest keyframe; its pose may have been
+        # refined since.
         self._told = np.eye(4)
         # The newest pair and its length, where it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
@@ -195,7 +196,12 @@ class Window:
         if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
             self._found(relative, length)
         self._measure()
+        stood = self._poses.camera(0)[:3, 3]
         H = self._refine()
+        # How far the window slid as a whole says nothing of the step. No frame tells where it
+        # lies; what frames that are gone told is known to first order alone, and what that leaves
+        # over pushes the window along, the farther from its start, the less holds it there.
+        self._told[:3, 3] += self._poses.camera(0)[:3, 3] - stood
         addition = self._addition(H)
         if first:  # by definition
             addition = replace(addition, length=length)
