@@ -426,6 +426,26 @@ def test_a_speed_is_held_for_half_a_second_and_then_only_guessed():
     assert late.value == pytest.approx(0.2)
 
 
+def test_speeds_once_a_second_tell_all_between_them_and_none_tell_nothing_of_a_hole():
+    scale = SpeedScale()
+    for second in (10, 11, 12, 20):
+        scale.add_speed(second * 10**9, float(second))
+    for start, end in ((10.5, 10.6), (10.8, 10.9), (10.2, 11.7)):
+        length = scale.between(round(start * 1e9), round(end * 1e9))
+        assert length.known and length.value == pytest.approx((end**2 - start**2) / 2)
+    for start, end in ((9, 10), (12, 20), (15, 20), (19, 20)):
+        assert not scale.between(start * 10**9, end * 10**9).known
+
+
+def test_what_is_forgotten_leaves_no_length_to_the_next_track():
+    scale = SpeedScale()
+    scale.add_speed(0, 2.0)
+    odometry = VisualOdometry(scale=scale)
+    assert scale.between(0, 10**8).known  # came before
+    odometry.reset()
+    assert not scale.between(0, 10**8).known
+
+
 def test_senseless_speeds_are_ignored():
     scale = SpeedScale()
     for stamp, speed in ((0, 1.0), (1, np.nan), (2, np.inf), (0, 9.0), (-5, 9.0)):

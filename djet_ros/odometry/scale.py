@@ -12,6 +12,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum, unique
+from itertools import pairwise
 from typing import Protocol
 
 from djet_ros.config.sections import OdometryConfig
@@ -179,9 +180,9 @@ class SpeedScale(ScaleSource):
     """
     Speed times time, from stamped speeds that come in as the camera moves.
 
-    The speed between two stamps is their linear interpolation, and the nearest one is held for
-    at most half a second beyond the last; after that the length is unknown, and the last known
-    speed remains the guess.
+    The speed between two stamps is their linear interpolation, and that of the outermost ones
+    holds beyond them. Where the nearest one is more than half a second away, the length is
+    unknown, and what that makes is the guess.
     """
 
     def __init__(self, uncertainty: float = 0.05) -> None:
@@ -217,8 +218,9 @@ class SpeedScale(ScaleSource):
                            [(stamp - start_ns) * 1e-9 for stamp in known],
                            [self._speeds[stamp] for stamp in known])
         metres = float(np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times) * 1e-9))
-        nearest = stamps[max(bisect_right(stamps, end_ns) - 1, 0)]
-        if abs(end_ns - nearest) > _LONGEST_HOLD_NS:
+        middles = [(one + next_one) // 2 for one, next_one in pairwise(known)]
+        asked = [start_ns, end_ns, *(time for time in middles if start_ns < time < end_ns)]
+        if any(min(abs(time - stamp) for stamp in known) > _LONGEST_HOLD_NS for time in asked):
             return unknown(metres)
         return Length(metres, max(metres * self._uncertainty, 1e-3), True)
 

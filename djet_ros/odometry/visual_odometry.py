@@ -124,7 +124,7 @@ class VisualOdometry:
         self._turned: tuple[int, Array, Array] = 0, np.eye(3), np.zeros((3, 3))
         self.configure(estimator or EstimatorConfig(), odometry, scale or scale_source(odometry))
         self.listen_to(gyro, guess)
-        self.reset()
+        self._begin()
 
     def listen_to(self, gyro: Gyro | None, guess: Guess | None) -> None:
         """Go by what a gyro and another odometry tell, from the next frame on."""
@@ -152,7 +152,11 @@ class VisualOdometry:
         return self._one_scale.landmarks(settled)
 
     def reset(self) -> None:
-        """Forget everything; the next frame is the first."""
+        """Forget everything, of the scale's source too; the next frame is the first."""
+        self._scale.reset()
+        self._begin()
+
+    def _begin(self) -> None:
         self._last = None
         self._one_scale.reset()
         self._prior: RelativePose | None = None
