@@ -672,6 +672,14 @@ def test_the_twin_motion_of_a_plane_is_not_taken_for_the_cameras(goes):
         assert errors_of(result, true[:3, :3], true[:3, 3])[1] < 10
 
 
+def test_views_of_two_cameras_are_no_pair():
+    view = uniform_view()
+    for other in (replace(view, K=np.diag([1, 1.5, 1]) @ view.K),
+                  replace(view, gray=view.gray[:-1])):
+        with pytest.raises(ValueError, match='a pair is of one camera'):
+            TwoViewEstimator().estimate(view, other)
+
+
 def test_a_plane_starts_from_its_motion_among_others():
     rng = np.random.default_rng(58)
     x = rng.uniform((0, 0), SIZE, (200, 2))

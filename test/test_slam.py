@@ -317,6 +317,15 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
         assert np.array_equal(edge.covariance, other.covariance)
 
 
+def test_no_loop_is_sought_between_images_of_two_sizes():
+    cards, finder = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25, loop_votes=1))
+    frames = [cards.frame(1 + i, pose(), noise=i) for i in range(2)]
+    for frame in (*frames, replace(frames[0], stamp_ns=5 * 10**9, gray=frames[0].gray[:-6, :-10])):
+        finder.add(frame, None)
+    assert any(edge.kind == 'loop' for edge in finder.loops(1))
+    assert not any(edge.kind == 'loop' for edge in finder.loops(2))
+
+
 def bonneted(frame, mask):
     """Give the frame of a car whose own bonnet hides the lower third, and its mask or None."""
     gray = frame.gray.copy()

@@ -81,9 +81,12 @@ class TwoViewEstimator:
 
         prior: the motion before this one, as one more starting pose; known: what others than the
         images tell of this one. Never raises on image content: what can't be estimated comes back
-        with a status that says why.
+        with a status that says why. ValueError where the views are not of one camera.
         """
         known, timings = known or Known(), dict[str, float]()
+        if previous.gray.shape != current.gray.shape or not np.array_equal(previous.K, current.K):
+            raise ValueError(f'views of {previous.gray.shape} and {current.gray.shape} pixels, or '
+                             'their camera matrices, differ; a pair is of one camera')
 
         # Where the motion before foresees them, matches are near, and so is the pose.
         with _timed(timings, 'matching'):

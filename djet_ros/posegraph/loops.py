@@ -116,8 +116,7 @@ class EdgeFinder:
 
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
         view, other = self._view(current), self._view(place)
-        # The estimator takes both views to be of one camera.
-        if not np.array_equal(view.K, other.K):
+        if view.gray.shape != other.gray.shape or not np.array_equal(view.K, other.K):
             return
         relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_sure(relative):
