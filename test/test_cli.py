@@ -94,7 +94,9 @@ def test_an_option_is_what_it_is_called_and_no_beginning_of_another(words: tuple
                                                                     ) -> None:
     answer = djet(*words)
     assert answer.returncode == 2
-    assert answer.stderr.startswith(f'djet: error: unrecognized arguments: {" ".join(words[-2:])}')
+    command = ' '.join(words[:2] if words[0] == 'lab' else words[:1])
+    assert answer.stderr == (f'djet: error: unrecognized arguments: {" ".join(words[-2:])} '
+                             f'(see djet {command} --help)\n')
 
 
 @pytest.mark.parametrize(('body', 'code', 'line'), [

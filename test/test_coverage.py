@@ -155,6 +155,7 @@ def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path
 @pytest.mark.parametrize(('arguments', 'said'), [
     ((), 'nothing to measure'), (('--scenes', 'moon'), "'moon'"),
     (('--scenes', 'road', '--seeds', 'x'), "'x'"),
+    (('--scenes', 'road', '--seeds', '5-3'), "'5-3'"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
         tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:

@@ -20,6 +20,7 @@ from dds_graph import (
 )
 from djet_ros.cli.main import main
 from djet_ros.dds.names import Names
+from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.live.middleware import Profile
 from djet_ros.odometry.messages import stamp_ns
@@ -438,6 +439,16 @@ def test_names_are_resolved_and_remapped_as_in_ros():
     assert names.resolve('~/relative_pose') == '/robot/vo_node/relative_pose'
     assert names.resolve('/diagnostics') == '/diagnostics'
     assert Names('vo_node', ['__node:=front']).resolve('~/path') == '/front/path'
+    assert Names('vo_node', ['__ns:=/']).full_node == '/vo_node'
+
+
+@pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',
+                                  '__node:=a/b', '__node:='])
+def test_names_that_ros_refuses_are_refused(rule):
+    with pytest.raises(DjetError, match='is no remapping|is no name of a node'):
+        Names('vo_node', [rule])
+    with pytest.raises(DjetError, match='is no name of a node'):
+        Names('vö')
 
 
 @pytest.mark.parametrize(('words', 'environment', 'reason'), [

@@ -44,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--diagnostics', action='store_true',
                         help='state, rate, latency and path length instead of poses')
     parser.add_argument('--node', default=NODE_NAME, metavar='NAME',
-                        help='name of the node (default: %(default)s)')
+                        help='name of the node, with its namespace if it has one '
+                        '(default: %(default)s)')
     add_remappings(parser)
 
 
@@ -54,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
 
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.names import Names
-    names = Names(args.node, args.remap)
+    namespace, _, node = args.node.strip('/').rpartition('/')
+    names = Names(node, [*args.remap, *([f'__ns:=/{namespace}'] if namespace else [])])
     view, topic = Monitor(names.full_node.strip('/')), names.resolve('~/odometry')
 
     def pose(message: Any) -> None:

@@ -16,8 +16,9 @@ from djet_ros.live.parameters import with_live_values
 
 DESCRIPTION = f"""\
 Do on a ROS 2 graph, where no ROS is installed, what 'ros2 run djet_ros vo_node' does where it is:
-the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/odometry, ~/path,
-~/debug_image, /diagnostics, /tf), services (~/reset, ~/pause, ~/resume) and parameters.
+the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/relative_pose_status,
+~/odometry, ~/path, ~/landmarks, ~/debug_image, /diagnostics, /tf), services (~/reset, ~/pause,
+~/resume) and parameters.
 {ENVIRONMENT}"""
 
 

@@ -86,7 +86,9 @@ def run(argv: Sequence[str]) -> int:
     parser = _Parser(prog='djet', description='Visual odometry by D-JET, from bags and datasets.')
     parser.add_argument('--version', action='version', version=f'djet_ros {__version__}')
     _add_commands(parser, COMMANDS, argv)
-    args = parser.parse_args(argv)
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     code: int = args.run(args)
     return code
 
@@ -107,7 +109,7 @@ def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, str],
             module = import_module(f"{package}.{name.replace('-', '_')}")
             command.description = module.DESCRIPTION
             module.add_arguments(command)
-            command.set_defaults(run=module.run)
+            command.set_defaults(run=module.run, parser=command)
 
 
 def _first_plain(words: Sequence[str]) -> int | None:

@@ -105,7 +105,8 @@ def _seeds(text: str) -> list[int]:
     """Give the numbers of a text such as 0,3-5."""
     try:
         ends = [[int(end) for end in part.split('-')] for part in split(text)]
-        return [seed for end in ends for seed in range(end[0], end[-1] + 1)]
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is no list of seeds such as 0,3 or 0-9") from error
+    except ValueError:
+        ends = []
+    if not ends or any(end[0] > end[-1] for end in ends):
+        raise argparse.ArgumentTypeError(f"'{text}' is no list of seeds such as 0,3 or 0-9")
+    return [seed for end in ends for seed in range(end[0], end[-1] + 1)]

@@ -7,7 +7,9 @@ import re
 
 from djet_ros.errors import DjetError
 
-_NAME = re.compile(r'~?[A-Za-z_/][A-Za-z0-9_/]*')
+# What ROS takes as the name of a node, and of anything.
+_TOKEN = r'[A-Za-z_][A-Za-z0-9_]*'
+_NAME = re.compile(rf'(~?/)?{_TOKEN}(/{_TOKEN})*|/')
 
 
 class Names:
@@ -22,6 +24,9 @@ class Names:
         pairs = [_parse(rule) for rule in rules]
         special = dict(pairs)
         self.node = special.get('__node', node)
+        if not re.fullmatch(_TOKEN, self.node):
+            raise DjetError(f"'{self.node}' is no name of a node; give letters, digits and _, as "
+                            'in left_vo, and its namespace by -r __ns:=/NAMESPACE')
         self.namespace = '/' + special.get('__ns', '').strip('/')
         self._rules = [(self.expand(old), self.expand(new)) for old, new in pairs
                        if not old.startswith('__')]
