@@ -569,7 +569,7 @@ def test_a_frame_that_tf_does_not_know_is_said_with_its_names(drive: Drive) -> N
 
 
 def test_our_own_echo_is_refused_as_a_guess() -> None:
-    with pytest.raises(DjetError, match="guess_frame is 'odom'"):
+    with pytest.raises(DjetError, match="^odometry.guess_frame is 'odom'"):
         from_flat({'odometry.guess_frame': 'odom', 'ros.publish_tf': True})
 
 

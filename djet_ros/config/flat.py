@@ -69,7 +69,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
             changes = {name.removeprefix(mark): value for name, value in checked.items()
                        if name.startswith(mark)}
             if changes:
-                config = replace(config, **{part: replace(getattr(config, part), **changes)})
+                section = replace(getattr(config, part), **changes)
+                mark = ''  # what sections have to do with one another is said by full names
+                config = replace(config, **{part: section})
     except ValueError as error:
         raise DjetError(f'{mark}{error}') from None
     return config

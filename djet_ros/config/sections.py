@@ -106,6 +106,9 @@ class OdometryConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""
         check(self)
+        if not self.odom_frame or self.odom_frame.startswith('/'):
+            raise ValueError(f"odom_frame is '{self.odom_frame:.80}'; name a frame, as tf does, "
+                             'without a slash before it')
         self.imu_quaternion()
         self.gray_limits()
 
@@ -258,9 +261,9 @@ class Config:
         """Refuse an unknown preset, and a guess that would be our own echo."""
         check(self)
         if self.ros.publish_tf and self.odometry.guess_frame == self.odometry.odom_frame:
-            raise ValueError(f"guess_frame is '{self.odometry.guess_frame}', which is what this "
-                             'odometry publishes on tf itself; give it another odom_frame, or '
-                             'no ros.publish_tf')
+            raise ValueError(f"odometry.guess_frame is '{self.odometry.guess_frame}', which is "
+                             'what this odometry publishes on tf itself; give it another '
+                             'odometry.odom_frame, or no ros.publish_tf')
 
 
 SECTIONS = ('estimator', 'odometry', 'slam', 'ros')

@@ -85,6 +85,8 @@ class GraphSession:
     def relative_pose(self, message: Any) -> None:
         """Take a PoseWithCovarianceStamped."""
         self._take('relative_pose_cov', lambda: self._slam.relative_pose(message))
+        # There is none while the odometry is lost, and its other topics tell of that.
+        self._heard['relative_pose_cov'] = np.inf
 
     def relative_pose_status(self, message: Any) -> None:
         """Take the DiagnosticArray that says of a frame what its poses do not."""

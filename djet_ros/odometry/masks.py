@@ -54,8 +54,7 @@ class Masks:
         found = [message for one, message in self._waiting if one == stamp]
         while self._waiting and self._waiting[0][0] <= stamp:
             self._waiting.popleft()
-        moving = None if not found else _undistorted(left_out(gray_image(found[-1])), shape,
-                                                     camera, 'mask')
+        moving = None if not found else _undistorted(_gray(found[-1]), shape, camera, 'mask')
         parts = [part for part in (moving, self._of_camera(shape, camera), camera.unseen(shape))
                  if part is not None]
         return reduce(np.logical_or, parts) if parts else None
@@ -69,6 +68,14 @@ class Masks:
             self._undistorted = camera, shape, _undistorted(self._still, shape, camera,
                                                             'odometry.mask_file')
         return self._undistorted[2]
+
+
+def _gray(message: Any) -> NDArray[np.bool_]:
+    """(H, W) bool of a mask's message; BadMessage that says whose fault it is."""
+    try:
+        return left_out(gray_image(message))
+    except BadMessage as problem:
+        raise BadMessage(problem.reason, f'mask: {problem}') from None
 
 
 def _undistorted(mask: NDArray[np.bool_], shape: tuple[int, ...], camera: Camera, what: str
