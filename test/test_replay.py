@@ -656,6 +656,42 @@ def test_a_bad_image_in_the_middle_is_named_and_the_rest_is_tracked(
     assert sum(row['status'] == 'UNUSED' for row in rows) == FRAMES - frames
 
 
+@pytest.mark.parametrize('bad', [{'data': np.zeros(9, np.uint8)}, {'height': 0, 'width': 0}])
+def test_a_bad_first_image_is_named_and_the_rest_has_the_poses_that_are_without_it(bad, tmp_path):
+    def damage(i, message):
+        return image(np.zeros(SIZE[::-1], np.uint8), **bad) if i == 0 else message
+
+    said = djet('replay', record(tmp_path / 'bad', drive(damage)), '--output', tmp_path / 'r',
+                expect=2).stderr
+    assert said.count('\n') == 1
+    assert f'1 of {FRAMES} images could not be used; image 0: ' in said
+    djet('replay', record(tmp_path / 'good', drive(lambda i, message: message if i else None)),
+         '--output', tmp_path / 'without')
+    assert summary(tmp_path / 'r')['complete'] is True
+    assert summary(tmp_path / 'r')['frames'] == FRAMES - 1
+    assert (tmp_path / 'r' / 'trajectory_tum.txt').read_bytes() == (
+        tmp_path / 'without' / 'trajectory_tum.txt').read_bytes()
+
+
+@pytest.mark.parametrize('at', [0, 3])
+def test_a_camera_info_of_zeros_costs_the_images_up_to_the_next_one(at, tmp_path):
+    messages, zero = list(drive()), camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
+    messages.insert(2 * at + 1, (INFO_TOPIC, zero, messages[2 * at][2]))
+    path = record(tmp_path / 'bag', messages)
+    said = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
+    assert said.count('\n') == 1
+    assert ': 1 CameraInfo could not be used; ' in said
+    assert 'all zeros' in said
+    told = summary(tmp_path / 'r')
+    assert (told['complete'], told['frames']) == (True, FRAMES - 1)
+    assert told['dropped'] == {'waiting_for_camera_info': 1}
+    assert sum(told['rejected_infos'].values()) == 1
+    # What goes through the recording again has the cameras that the odometry had.
+    with open_recording(path) as recording:
+        frame = frame_finder(recording, Config())(SECOND + 5 * SECOND // 10)
+    assert frame.gray.shape == SIZE[::-1]
+
+
 def test_another_image_size_in_the_middle_is_named(tmp_path):
     messages = list(drive())
     for i, (topic, message, _) in enumerate(messages):

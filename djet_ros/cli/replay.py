@@ -130,9 +130,10 @@ def _table(summary: dict[str, Any]) -> Table:
     table.add_row('frames', f"{summary['frames']} in {seconds:.1f} s ({rate:.1f}/s)")
     for status, count in sorted(summary['status'].items()):
         table.add_row(f'  {status}', str(count))
-    for what in ('dropped', 'rejected'):
+    for what, name in (('dropped', 'dropped'), ('rejected', 'rejected'),
+                       ('rejected_infos', 'rejected CameraInfo')):
         for reason, count in sorted(summary[what].items()):
-            table.add_row(f'{what}: {reason}', str(count))
+            table.add_row(f'{name}: {reason}', str(count))
     if 'compared_pairs' in summary:
         table.add_row('pairs with ground truth', str(summary['compared_pairs']))
         table.add_row('  failures (rotation / direction)',

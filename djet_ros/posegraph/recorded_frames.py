@@ -10,7 +10,7 @@ from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.images import gray_image
+from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.mask_files import still_mask
@@ -49,7 +49,7 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
     for topic, recorded, message in recording.messages(
             {recording.image_topic, recording.info_topic, mask_topic}):
         if topic == recording.info_topic:
-            camera = Camera.from_info(message, rectified, config.odometry.residual_k1)
+            camera = _camera(message, rectified, config)
         elif topic == recording.image_topic and camera is not None:
             waiting.append((recorded, camera, message))
         elif topic == mask_topic:
@@ -59,3 +59,11 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
             yield waiting.popleft()[1:]
     for _, of_image, message in waiting:
         yield of_image, message
+
+
+def _camera(info: Any, rectified: bool, config: Config) -> Camera | None:
+    """Give the camera of a CameraInfo; None where it makes none, and the odometry had none."""
+    try:
+        return Camera.from_info(info, rectified, config.odometry.residual_k1)
+    except BadMessage:
+        return None

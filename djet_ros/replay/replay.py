@@ -178,13 +178,15 @@ class Replay:
 
     def _info(self, message: BagMessage) -> None:
         tracker = self._tracker
+        rejected = tracker.counts.rejected_infos.total()
         self._publish(tracker.camera_info(message.message), message.stamp_ns)
-        if tracker.counts.rejected_infos and tracker.problem:
-            raise tracker.problem
+        if tracker.counts.rejected_infos.total() > rejected:
+            self._log.first_problem = self._log.first_problem or str(tracker.problem)
 
     def _image(self, message: BagMessage) -> None:
         tracker, log = self._tracker, self._log
         number, processed = tracker.counts.received, tracker.counts.processed
+        rejected = tracker.counts.rejected.total()
         frame = message.message.header.frame_id
         for what, (parent, child) in tracker.wanted_mountings(frame).items():
             if (mounting := self._frames.transform(parent, child)) is not None:
@@ -207,10 +209,7 @@ class Replay:
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
         self._publish(outgoing, message.stamp_ns)
-        if tracker.problem is not None:
-            if not tracker.counts.processed:
-                # The first image that could be used decides whether any can.
-                raise tracker.problem
+        if tracker.counts.rejected.total() > rejected:
             log.first_problem = log.first_problem or f'image {number}: {tracker.problem}'
 
     def _mount(self, image_frame: str) -> None:
@@ -230,13 +229,15 @@ class Replay:
     def _complaint(self) -> str:
         """Say what was wrong with a recording that was read to its end."""
         counts, log = self._tracker.counts, self._log
+        if not counts.processed and log.first_problem:
+            return (f'{self._name}: none of {counts.received} images could be used; '
+                    f'{log.first_problem}')
         if not counts.processed:
             return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
                     f'{self._recording.info_topic}; record it too, or choose one with '
                     '--info-topic')
         if log.first_problem:
-            return (f'{self._name}: {counts.rejected.total()} of {counts.received} images could '
-                    f'not be used; {log.first_problem}')
+            return f'{self._name}: {_unusable(counts)} could not be used; {log.first_problem}'
         if changes := counts.status[Status.SIZE_CHANGED.value]:
             return (f'{self._name}: the image size or the camera changes {changes} times; each '
                     'time the motion is unknown and the trajectory has a hole')
@@ -254,7 +255,8 @@ class Replay:
             'frames': counts.processed, 'pairs': len(self._log.pairs()),
             'seconds': round(seconds, 3),
             'images': counts.received, 'dropped': dict(counts.dropped),
-            'rejected': dict(counts.rejected), 'status': dict(counts.status),
+            'rejected': dict(counts.rejected), 'rejected_infos': dict(counts.rejected_infos),
+            'status': dict(counts.status),
             'versions': {'djet_ros': __version__, 'numpy': np.__version__,
                          'opencv': cv2.__version__},
         }
@@ -400,6 +402,13 @@ class _Log:
             poses.append(pose)
             at[step.stamp_ns] = i
         return np.array(poses)
+
+
+def _unusable(counts: Counts) -> str:
+    """Say how many images, and how many CameraInfo, were rejected."""
+    images, infos = counts.rejected.total(), counts.rejected_infos.total()
+    return ' and '.join([*([f'{images} of {counts.received} images'] if images else []),
+                         *([f'{infos} CameraInfo'] if infos else [])])
 
 
 def _static_frames(recording: Recording) -> StaticFrames:
