@@ -705,6 +705,33 @@ def test_another_image_size_in_the_middle_is_named(tmp_path):
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
 
 
+def shifted(frames, seconds):
+    """Messages of a drive, of which some frames have other stamps."""
+    for i, (topic, message, stamp) in enumerate(drive()):
+        stamp += round(seconds * SECOND) if i // 2 in frames else 0
+        message.header = header(stamp)
+        yield topic, message, SECOND + i
+
+
+def test_stamps_that_go_back_are_said_with_where_poses_begin_again(tmp_path):
+    path = record(tmp_path / 'bag', shifted(range(3), 10))
+    said = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
+    assert said == (f'djet: error: {path}: the stamps go back 1 times; poses begin at the origin '
+                    'again from stamp 1.300000000 on\n')
+    assert summary(tmp_path / 'r')['complete'] is True
+    _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
+    assert np.array_equal(poses[3], np.eye(4))
+
+
+def test_a_gap_over_which_the_motion_is_missing_is_said_with_its_length(tmp_path):
+    path = record(tmp_path / 'bag', shifted(range(3, FRAMES), 5))
+    said = djet('replay', path, '--output', tmp_path / 'r').stderr
+    assert said == (
+        'djet: warning: 1 times there is no image for longer than odometry.max_gap, at most '
+        '5.100 s, up to stamp 6.300000000; the trajectory goes on at the last pose, and the '
+        'motion in between is missing\n')
+
+
 @pytest.mark.parametrize('sign, code', [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
     endless = tmp_path / 'sequences' / '01'

@@ -60,6 +60,12 @@ def seconds_and_rest(stamp: int) -> tuple[int, int]:
     return divmod(int(stamp), 10**9)
 
 
+def seconds_text(stamp: int) -> str:
+    """Write a stamp in nanoseconds as seconds with all of their nine decimals."""
+    seconds, rest = divmod(abs(int(stamp)), 10**9)
+    return f'{"-" if stamp < 0 else ""}{seconds}.{rest:09d}'
+
+
 def pose_of(message: Any) -> tuple[int, Array]:
     """
     Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.

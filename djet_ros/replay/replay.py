@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.diagnostics import Counts
-from djet_ros.odometry.messages import mounted_frame, pose_of, stamp_ns
+from djet_ros.odometry.messages import mounted_frame, pose_of, seconds_text, stamp_ns
 from djet_ros.odometry.scale import Scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
@@ -236,12 +237,16 @@ class Replay:
             return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
                     f'{self._recording.info_topic}; record it too, or choose one with '
                     '--info-topic')
+        found = []
         if log.first_problem:
-            return f'{self._name}: {_unusable(counts)} could not be used; {log.first_problem}'
+            found.append(f'{_unusable(counts)} could not be used; {log.first_problem}')
         if changes := counts.status[Status.SIZE_CHANGED.value]:
-            return (f'{self._name}: the image size or the camera changes {changes} times; each '
-                    'time the motion is unknown and the trajectory has a hole')
-        return ''
+            found.append(f'the image size or the camera changes {changes} times; each time the '
+                         'motion is unknown and the trajectory has a hole')
+        if back := [after for before, after in log.jumps() if after < before]:
+            found.append(f'the stamps go back {len(back)} times; poses begin at the origin again '
+                         f'from stamp {", ".join(map(seconds_text, back[:3]))} on')
+        return f'{self._name}: {"; ".join(found)}' if found else ''
 
     def _summary(self, seconds: float) -> dict[str, Any]:
         counts: Counts = self._tracker.counts
@@ -330,8 +335,27 @@ class _Log:
     def pairs(self) -> list[Step]:
         return [step for step in self.steps if step.previous_stamp_ns is not None]
 
+    def jumps(self) -> list[tuple[int, int]]:
+        """Stamps between which the odometry jumped in time, backwards or over a gap."""
+        return [(before.stamp_ns, after.stamp_ns) for before, after in pairwise(self.steps)
+                if after.status is Status.TIME_JUMP]
+
     def advice(self) -> list[str]:
-        """Say what a run that ended well keeps quiet: nothing was tracked, or nothing moved."""
+        """Say what a run that ended well keeps quiet."""
+        return [*self._of_gaps(), *self._of_pairs()]
+
+    def _of_gaps(self) -> list[str]:
+        """Say where the images leave out more than a pair may bridge."""
+        gaps = [(after - before, after) for before, after in self.jumps() if after > before]
+        if not gaps or not self.pairs():
+            return []
+        longest, after = max(gaps)
+        return [f'{len(gaps)} times there is no image for longer than odometry.max_gap, at most '
+                f'{longest * 1e-9:.3f} s, up to stamp {seconds_text(after)}; the trajectory goes '
+                'on at the last pose, and the motion in between is missing']
+
+    def _of_pairs(self) -> list[str]:
+        """Say that nothing was tracked, or that nothing moved."""
         pairs = self.pairs()
         statuses = Counter(step.status for step in pairs)
         if not pairs:
