@@ -803,21 +803,43 @@ def test_poses_are_read_from_every_kind_of_message():
     assert np.isnan(pose_of(message_type('geometry_msgs/msg/PoseStamped')(head, posed))[1]).all()
 
 
-def test_a_speed_topic_gives_metres(tmp_path):
-    messages = []
+def with_speeds(late=0):
+    """Messages of a drive with speeds, whose stamps are late by some seconds."""
     vector = message_type('geometry_msgs/msg/Vector3')
     for topic, message, stamp in drive():
         if topic == INFO_TOPIC:
             twist = message_type('geometry_msgs/msg/Twist')(
                 linear=vector(x=2.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
-            messages.append(('/wheel', message_type('geometry_msgs/msg/TwistStamped')(
-                header=header(stamp), twist=twist), stamp))
-        messages.append((topic, message, stamp))
-    djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
-         '--scale', 'speed')
+            yield '/wheel', message_type('geometry_msgs/msg/TwistStamped')(
+                header=header(stamp + late * SECOND), twist=twist), stamp
+        yield topic, message, stamp
+
+
+def test_a_speed_topic_gives_metres(tmp_path):
+    said = djet('replay', record(tmp_path / 'bag', with_speeds()), '--output', tmp_path / 'r',
+                '--scale', 'speed')
+    assert re.search(r'lengths\W+metric', said.stdout)
+    assert said.stderr == ''
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
     # Speeds are weighed with what landmarks tell of the lengths.
     assert np.allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 0.2, rtol=0.01)
+
+
+def test_a_source_of_metres_that_measured_nothing_is_said(tmp_path):
+    source = record(tmp_path / 'bag', with_speeds(late=3600))
+    poses = tmp_path / 'another_day.txt'
+    with TumWriter(poses) as truth:
+        for i in range(FRAMES):
+            truth.write((5000 + i) * SECOND, np.linalg.matrix_power(STEP, i))
+    for words, why in (
+            (('speed',), 'the newest speed is stamped 3600.0 s after the newest image; give speeds'
+             ' that are stamped by the clock of the images'),
+            (('camera_height', '--camera-height', '1.5'), 'the images show no level ground'),
+            (('ground_truth', '--poses', poses), 'the ground truth does not cover the time')):
+        done = djet('replay', source, '--output', tmp_path / words[0], '--scale', *words)
+        assert ('djet: warning: no metric length: odometry.scale is '
+                f'{words[0]}, and no length was measured: {why}') in done.stderr
+        assert re.search(r'lengths\W+relative, in units of the first step', done.stdout)
 
 
 def test_topics_are_for_bags(folder):

@@ -17,7 +17,9 @@ from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 from djet_ros.config.yaml_files import load_yaml
+from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
+from djet_ros.odometry.scale import Scale
 from djet_ros.recordings.recording import BESIDE, open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import PLOT, ResultsFolder
@@ -42,6 +44,10 @@ _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value'
 _ASKED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true',
              'guess': 'odometry.guess to true or odometry.scale to guess, without a guess_frame',
              'mask': 'odometry.mask to true'}
+
+# What the table says of the lengths of a trajectory.
+_LENGTHS = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the first step',
+            Scale.UNKNOWN: 'unknown'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,6 +140,8 @@ def _table(summary: dict[str, Any]) -> Table:
                        ('rejected_infos', 'rejected CameraInfo')):
         for reason, count in sorted(summary[what].items()):
             table.add_row(f'{name}: {reason}', str(count))
+    if summary['status'].get(Status.OK.value):
+        table.add_row('lengths', _LENGTHS[summary['scale_kind']])
     if 'compared_pairs' in summary:
         table.add_row('pairs with ground truth', str(summary['compared_pairs']))
         table.add_row('  failures (rotation / direction)',

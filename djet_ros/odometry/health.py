@@ -28,6 +28,12 @@ _REMEDIES = {
     'camera_height': 'check odometry.camera_height and odometry.camera_pitch, or choose another '
                      'odometry.scale'}
 
+# The same for a recording.
+_REMEDIES_RECORDED = {
+    **_REMEDIES,
+    'speed': 'give speeds that are stamped by the clock of the images, or choose another '
+             'odometry.scale'}
+
 
 class Complaint(NamedTuple):
     """Something to mend: a short name of it, level WARN or ERROR, and what is seen and helps."""
@@ -45,6 +51,7 @@ class Health:
         self._speed_topics = speed_topics
         self._fates: deque[str] = deque(maxlen=_WINDOW)
         self._equal = self._unknown_lengths = self._coarse_images = 0
+        self._ways, self._measured = False, False
         self._coarse: Coarse | None = None
         self._last: OdometryResult | None = None
         self._stamp_ns = 0
@@ -67,6 +74,8 @@ class Health:
         """Take the result of an image."""
         self._fates.append('')
         self._equal, self._last = 0, result
+        self._ways = self._ways or result.status is Status.OK
+        self._measured = self._measured or (result.scale_kind is Scale.METRIC and result.measured)
         if self._config.scale in ('none', 'structure') or (
                 result.scale_kind is Scale.METRIC and result.measured):
             self._unknown_lengths = 0
@@ -133,6 +142,17 @@ class Health:
             f'odometry.scale is {self._config.scale}, and no length is measured: '
             f'{scale.why_unknown(self._last.stamp_ns)}; '
             + remedy.format(topics=self._speed_topics)))
+
+    def never_measured(self, scale: ScaleSource) -> Complaint | None:
+        """Say that of a whole recording no length was measured, though that was asked for."""
+        asked = self._config.scale
+        if asked in ('none', 'structure') or self._measured or not self._ways \
+                or self._last is None:
+            return None
+        remedy = _REMEDIES_RECORDED.get(asked, 'choose another odometry.scale')
+        return Complaint('no metric length', 'WARN', (
+            f'odometry.scale is {asked}, and no length was measured: '
+            f'{scale.why_unknown(self._last.stamp_ns)}; {remedy}'))
 
     def _share(self, reason: str) -> float:
         few = len(self._fates) < _FEW

@@ -346,8 +346,9 @@ class Tracker:
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
-        """Say what there is to mend of what messages hold, whoever sends or records them."""
-        found = (self._health.few_levels(), *self.complaints_beside)
+        """Say what there is to mend of what a whole recording holds."""
+        found = (self._health.few_levels(), self._health.never_measured(self._scale),
+                 *self.complaints_beside)
         return [one for one in found if one is not None]
 
     @property
