@@ -732,6 +732,20 @@ def test_a_gap_over_which_the_motion_is_missing_is_said_with_its_length(tmp_path
         'motion in between is missing\n')
 
 
+@pytest.mark.parametrize('goes_on', [False, True])
+def test_stamps_that_stand_still_are_said(goes_on, tmp_path):
+    def messages():
+        yield INFO_TOPIC, camera_info(K, SIZE, SECOND), SECOND
+        stamps = [1] * 8 + [2] * goes_on
+        for i, stamp in enumerate(stamps):
+            yield IMAGE_TOPIC, image(Cards().gray(), stamp_ns=stamp * SECOND), SECOND + i
+
+    said = djet('replay', record(tmp_path / 'bag', messages()), '--output', tmp_path / 'r').stderr
+    assert ('djet: warning: stamps stand still: 7 images in a row have the stamp 1.000000000 and '
+            'are dropped; ') in said
+    assert summary(tmp_path / 'r')['dropped'] == {'equal_stamp': 7}
+
+
 @pytest.mark.parametrize('sign, code', [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
     endless = tmp_path / 'sequences' / '01'

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.images import Coarse
-from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_and_rest
+from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
 from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.visual_odometry import OdometryResult
 
@@ -52,6 +52,8 @@ class Health:
         self._fates: deque[str] = deque(maxlen=_WINDOW)
         self._equal = self._unknown_lengths = self._coarse_images = 0
         self._ways, self._measured = False, False
+        # The most images in a row that ever had one stamp, and which.
+        self._most_equal, self._stood_ns = 0, 0
         self._coarse: Coarse | None = None
         self._last: OdometryResult | None = None
         self._stamp_ns = 0
@@ -64,6 +66,8 @@ class Health:
         """Take images that were dropped for a reason."""
         self._fates.extend([reason] * min(number, _WINDOW))
         self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
+        if self._equal > self._most_equal and self._last is not None:
+            self._most_equal, self._stood_ns = self._equal, self._last.stamp_ns
 
     def gray(self, coarse: Coarse | None) -> None:
         """Take how few gray levels an image of 16 bits became, or that it is none of them."""
@@ -90,12 +94,11 @@ class Health:
             self._way(), self._order()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
-        if self._equal < _IN_A_ROW or self._last is None:
-            return None
-        seconds, rest = seconds_and_rest(self._last.stamp_ns)
-        return Complaint('stamps stand still', 'ERROR', (
-            f'{self._equal} images in a row have the stamp {seconds}.{rest:09d} and are dropped; '
-            'the camera driver has to stamp each image with the time of its exposure'))
+        return None if self._last is None else _still(self._equal, self._last.stamp_ns)
+
+    def stamps_stood(self) -> Complaint | None:
+        """Say that stamps stood still at some time, though they may have gone on."""
+        return _still(self._most_equal, self._stood_ns)
 
     def few_levels(self) -> Complaint | None:
         """Say that images of 16 bits become next to nothing."""
@@ -179,6 +182,15 @@ class Health:
         return Complaint('images out of order', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
             'and dropped; do two cameras publish on one topic?'))
+
+
+def _still(images: int, stamp_ns: int) -> Complaint | None:
+    """Say that images in a row had a stamp, if they were many."""
+    if images < _IN_A_ROW:
+        return None
+    return Complaint('stamps stand still', 'ERROR', (
+        f'{images} images in a row have the stamp {seconds_text(stamp_ns)} and are dropped; the '
+        'camera driver has to stamp each image with the time of its exposure'))
 
 
 def has_frame(config: OdometryConfig, image_frame: str) -> bool:

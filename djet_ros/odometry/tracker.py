@@ -347,8 +347,8 @@ class Tracker:
     @property
     def complaints_of_content(self) -> list[Complaint]:
         """Say what there is to mend of what a whole recording holds."""
-        found = (self._health.few_levels(), self._health.never_measured(self._scale),
-                 *self.complaints_beside)
+        found = (self._health.stamps_stood(), self._health.few_levels(),
+                 self._health.never_measured(self._scale), *self.complaints_beside)
         return [one for one in found if one is not None]
 
     @property
