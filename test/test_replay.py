@@ -796,6 +796,23 @@ def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
         assert np.allclose([p for _, p in found], sequence.poses, atol=1e-12)
 
 
+@pytest.mark.parametrize('first, apart, why', [
+    (5000, 1, 'no image lies within the stamps of {}, 5000.000000000 to 5005.000000000; those of '
+     'the images are 1.000000000 to 1.500000000, and nothing was compared'),
+    (0.95, 0.2, 'no image lies between two poses of {} that are at most 0.1 s apart; nothing was '
+     'compared')])
+def test_ground_truth_of_another_time_is_said_in_a_line(first, apart, why, tmp_path):
+    poses = tmp_path / 'poses.txt'
+    with TumWriter(poses) as truth:
+        for i in range(FRAMES):
+            truth.write(round((first + i * apart) * SECOND), np.linalg.matrix_power(STEP, i))
+    said = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
+                tmp_path / 'r').stderr
+    assert said == f'djet: warning: {why.format(poses)}\n'
+    assert summary(tmp_path / 'r')['compared_pairs'] == 0
+    assert summary(tmp_path / 'r')['drift'] is None
+
+
 def test_poses_are_read_from_every_kind_of_message():
     quaternion = message_type('geometry_msgs/msg/Quaternion')(x=0.0, y=0.0, z=1.0, w=0.0)
     point = message_type('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)

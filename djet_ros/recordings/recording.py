@@ -62,13 +62,15 @@ class Recording(Closing):
     Images, CameraInfo, perhaps ground truth and what else was recorded, as messages in order.
 
     ``len()`` is the number of images, as far as it is known beforehand. ground_truth_topic is
-    None where there is none. beside: topics of what else is wanted, by names in BESIDE, and
-    under 'frames' that of the static frames, which tell how an IMU is mounted.
+    None where there is none; ground_truth_file: where it comes from instead of the recording.
+    beside: topics of what else is wanted, by names in BESIDE, and under 'frames' that of the
+    static frames, which tell how an IMU is mounted.
     """
 
     image_topic: str
     info_topic: str
     ground_truth_topic: str | None
+    ground_truth_file: Path | None = None
     beside: dict[str, str]
 
     @abstractmethod
@@ -160,6 +162,7 @@ class BagRecording(Recording):
             self.ground_truth_topic = (self._ground_truth_topic() if poses is None
                                        else GROUND_TRUTH_TOPIC)
             self.beside = dict(self._beside(beside or {}, strict))
+            self.ground_truth_file = poses
             self._poses = None if poses is None else _read_truth(poses, self._count)
         except BaseException:
             self.close()

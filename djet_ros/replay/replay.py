@@ -23,6 +23,7 @@ from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.posegraph.steps import scale_of, Step
 from djet_ros.recordings.bags import BagMessage
+from djet_ros.recordings.datasets import LONGEST_GAP_NS
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
@@ -145,8 +146,9 @@ class Replay:
             self._folder.finish(summary)
         self._evaluate(summary)
         self._folder.finish(summary)
-        return Outcome(summary, problem or None, (*self._log.advice(), *(
-            f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
+        return Outcome(summary, problem or None, (
+            *self._log.advice(), *self._of_truth(), *(
+                f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> int:
         """Hand one message on; give how many images were worked on."""
@@ -247,6 +249,21 @@ class Replay:
             found.append(f'the stamps go back {len(back)} times; poses begin at the origin again '
                          f'from stamp {", ".join(map(seconds_text, back[:3]))} on')
         return f'{self._name}: {"; ".join(found)}' if found else ''
+
+    def _of_truth(self) -> list[str]:
+        """Say that there is ground truth, and none of it at the images."""
+        images = np.array([step.stamp_ns for step in self._log.steps], np.int64)
+        if not len(self._truth) or not images.size \
+                or np.isfinite(self._truth.at(images)).any():
+            return []
+        name = self._recording.ground_truth_file or self._recording.ground_truth_topic
+        known, _ = self._truth.known()
+        if ((known[0] <= images) & (images <= known[-1])).any():
+            return [f'no image lies between two poses of {name} that are at most '
+                    f'{LONGEST_GAP_NS * 1e-9:g} s apart; nothing was compared']
+        ends = [seconds_text(stamp) for stamp in (*known[[0, -1]], images.min(), images.max())]
+        return [f'no image lies within the stamps of {name}, {ends[0]} to {ends[1]}; those of the '
+                f'images are {ends[2]} to {ends[3]}, and nothing was compared']
 
     def _summary(self, seconds: float) -> dict[str, Any]:
         counts: Counts = self._tracker.counts
@@ -379,6 +396,8 @@ class _Log:
         relative scale takes the one factor that serves the whole path best.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
+        if not known.any():
+            return None
         poses = np.array([step.pose for step in self.steps])[known]
         if self.scale is Scale.RELATIVE:
             poses[:, :3, 3] *= one_factor(poses[:, :3, 3], truth[known][:, :3, 3])
