@@ -270,6 +270,29 @@ def test_the_commands_say_so_in_a_line_and_write_nothing(results, tmp_path):
     assert not out.exists()
 
 
+def test_results_of_a_killed_replay_give_the_graph_up_to_the_break(results, tmp_path):
+    killed, whole = tmp_path / 'killed', read_results(results)
+    shutil.copytree(results, killed)
+    file, = (killed / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:file.stat().st_size * 4 // 10])
+    (killed / 'bag' / 'metadata.yaml').unlink()
+    with pytest.raises(DjetError, match='cut short'):
+        read_results(killed)
+    said = []
+    graph = read_results(killed, said.append)
+    assert 2 <= len(graph.poses) < FRAMES
+    assert np.array_equal(graph.stamps_ns, whole.stamps_ns[:len(graph.poses)])
+    assert np.array_equal(graph.poses, whole.poses[:len(graph.poses)])
+    assert f'of {FRAMES} frames the first {len(graph.poses)} are taken' in said[0]
+    done = djet('export', killed, '--output', tmp_path / 'graph.g2o')
+    assert done.stderr == f'djet: warning: {said[0]}\n'
+    assert f'{len(graph.poses)} poses' in done.stdout
+    # Of a bag that holds no motion at all there is no graph.
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(DjetError):
+        read_results(killed, said.append)
+
+
 # Files
 
 def test_the_files_read_back_to_the_graph(results, tmp_path):

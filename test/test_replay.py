@@ -767,6 +767,7 @@ def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path
     assert 'Traceback' not in process.stderr.read()
     told = summary(results)
     assert told['complete'] is False
+    assert (told['source'], told['image_topic']) == (str(endless), IMAGE_TOPIC)
     poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
     assert len(poses) > 5
     found = []

@@ -599,6 +599,10 @@ def test_the_command_takes_results_too_and_wherever_their_recording_went(
     (moved / 'summary.json').write_text(json.dumps({**summary, 'source': '/gone'}))
     refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
     assert '--source' in refused.stderr
+    # Whatever a killed replay of an earlier version may say of its recording.
+    (moved / 'summary.json').write_text('{}')
+    refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
+    assert 'say it with --source' in refused.stderr
     djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from djet_ros.cli.options import add_output
+from djet_ros.cli.terminal import warn
 from djet_ros.posegraph.graph_files import FORMATS, write_graph
 from djet_ros.replay.graph_of_results import read_results
 
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
-    graph = read_results(args.results)
+    graph = read_results(args.results, warn)
     if args.chained:
         graph = replace(graph, edges=tuple(edge.in_graph() for edge in graph.edges))
     write_graph(graph, args.output, args.format, args.overwrite)

@@ -8,11 +8,10 @@ from contextlib import contextmanager
 from functools import partial
 import math
 from pathlib import Path
-import sys
 from typing import Any
 
 from djet_ros.cli.options import add_output, add_topics
-from djet_ros.cli.terminal import console, new_table, progress_bar, spread
+from djet_ros.cli.terminal import console, new_table, progress_bar, spread, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
@@ -81,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         if (args.output / PLOT).exists():
             print(f'plot: {args.output / PLOT}')
     for line in outcome.advice:
-        print(f'djet: warning: {line}', file=sys.stderr)
+        warn(line)
     if outcome.problem:
         raise DjetError(outcome.problem)
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 
 from djet_ros.cli.options import add_output
 from djet_ros.cli.replay import add_replay_options, check_topics, configured, prepared
-from djet_ros.cli.terminal import console, new_table, progress_bar
+from djet_ros.cli.terminal import console, new_table, progress_bar, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     config = with_values(load_yaml(results / 'config.yaml'), of_slam)
     source, name = _source(results, args, config)
     try:
-        steps = read_steps(results)
+        steps = read_steps(results, warn)
         make_folder(args.output)
         with progress_bar('frames') as progress:
             slam = run_slam(steps, source, config, progress, args.output)
@@ -89,17 +89,23 @@ def run(args: argparse.Namespace) -> int:
 def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Recording, str]:
     """Open the recording that results are of, and give its name too."""
     summary = read_yaml(results / REPLAY_SUMMARY)
-    if not isinstance(summary, dict) or not isinstance(summary.get('source'), str):
-        raise DjetError(f'{results / REPLAY_SUMMARY} does not say which recording was replayed')
+    replayed, topic = (summary.get(what) if isinstance(summary, dict) else None
+                       for what in ('source', 'image_topic'))
+    name = replayed if isinstance(replayed, str) else args.source and str(args.source)
+    if name is None:
+        raise DjetError(f'{results / REPLAY_SUMMARY} does not say which recording was replayed; '
+                        'say it with --source')
     beside = {'mask': args.mask_topic} if config.odometry.mask else {}
     if results == args.input:
         check_topics(args, beside)
-    path = args.source or Path(summary['source'])
+    path = args.source or Path(name)
     if not path.exists():
         raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
                         '--source where it is')
-    topic = args.image_topic or (str(summary.get('image_topic')) if is_bag(path) else None)
-    return (open_recording(path, topic, args.info_topic, args.poses, beside), summary['source'])
+    if not is_bag(path) or not isinstance(topic, str):
+        topic = None
+    return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, beside),
+            name)
 
 
 def _table(summary: dict[str, Any]) -> Table:

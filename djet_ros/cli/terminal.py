@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 import os
+import sys
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -34,6 +35,11 @@ def console() -> Console:
     found = Console(markup=False)
     return (found if found.is_terminal or 'COLUMNS' in os.environ
             else Console(markup=False, width=_FILE_WIDTH))
+
+
+def warn(line: str) -> None:
+    """Say in a line on stderr what did not keep a command from its end."""
+    print(f'djet: warning: {line}', file=sys.stderr)
 
 
 class _Rate(ProgressColumn):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import csv
 import io
 from pathlib import Path
@@ -24,12 +24,16 @@ from djet_ros.replay.results import BAG
 import numpy as np
 
 
-def read_steps(folder: Path) -> list[Step]:
+Warn = Callable[[str], None]
+
+
+def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
     """
     Read the steps of a results folder of ``djet replay``.
 
     They are those of the frames to or from which a motion was estimated, and of those at which the
-    odometry restarted. Raises DjetError.
+    odometry restarted. warn: told where the bag is cut short, as a kill leaves it, and the steps
+    end there; without it that is a DjetError, as all else is that can't be read.
     """
     if not (folder / 'frames.csv').is_file():
         raise DjetError(f"{folder} holds no results; give a folder that 'djet replay' wrote")
@@ -39,7 +43,16 @@ def read_steps(folder: Path) -> list[Step]:
     rows = rows[:len(stamps)]
     if [row.stamp_ns for row in rows] != stamps[:len(rows)].tolist():
         raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run')
-    motions = _motions(folder / BAG, load_yaml(folder / 'config.yaml'))
+    motions: dict[int, tuple[Array, Array]] = {}
+    try:
+        for stamp, motion in _motions(folder / BAG, load_yaml(folder / 'config.yaml')):
+            motions[stamp] = motion
+    except DjetError as error:
+        if warn is None or not motions:
+            raise
+        whole = _whole(rows, motions)
+        warn(f'{error}; of {len(rows)} frames the first {len(whole)} are taken')
+        rows = whole
     steps = list(_steps(rows, poses, motions, folder))
     if len(steps) < 2:
         raise DjetError(f'{folder}: no motion was estimated between any two frames; there is no '
@@ -47,9 +60,9 @@ def read_steps(folder: Path) -> list[Step]:
     return steps
 
 
-def read_results(folder: Path) -> PoseGraph:
+def read_results(folder: Path, warn: Warn | None = None) -> PoseGraph:
     """Read the graph of a results folder; see ``read_steps`` and ``graph_of``."""
-    return graph_of(read_steps(folder))
+    return graph_of(read_steps(folder, warn))
 
 
 class _Row(NamedTuple):
@@ -79,19 +92,24 @@ def _rows(path: Path) -> list[_Row]:
     return rows
 
 
-def _motions(bag: Path, config: Config) -> dict[int, tuple[Array, Array]]:
-    """Motion (4, 4) and covariance (6, 6), along optical axes, by the stamp of the frame."""
+def _motions(bag: Path, config: Config) -> Iterator[tuple[int, tuple[Array, Array]]]:
+    """Stamp of each frame, with motion (4, 4) and covariance (6, 6) along optical axes."""
     topic = f'/{NODE_NAME}/relative_pose_cov'
     turn = np.eye(4)
     if config.odometry.frame_convention == 'body':
         turn[:3, :3] = OPTICAL_TO_BODY.T
-    motions = {}
     with Bag(bag) as opened:
         for _, _, message in opened.messages({topic}):
             stamp, motion = pose_of(message)
             covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
-            motions[stamp] = turn @ motion @ turn.T, rotated(turn[:3, :3], covariance)
-    return motions
+            yield stamp, (turn @ motion @ turn.T, rotated(turn[:3, :3], covariance))
+
+
+def _whole(rows: list[_Row], motions: dict[int, tuple[Array, Array]]) -> list[_Row]:
+    """Rows up to the first whose motion the bag has lost."""
+    lost = (i for i, row in enumerate(rows)
+            if row.status in TRACKED and row.stamp_ns not in motions)
+    return rows[:next(lost, len(rows))]
 
 
 def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array]],

@@ -31,7 +31,7 @@ from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, one_factor, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
-from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder
+from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder, UNFINISHED
 import numpy as np
 
 # Recorded nanoseconds for which an image waits for what belongs to it.
@@ -124,6 +124,8 @@ class Replay:
     def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
         """Run to the end, calling progress after each image; an interrupt is passed on."""
         self._folder = folder
+        # A run that is killed leaves it: what it was of is to be known.
+        folder.finish({**self._what(), **UNFINISHED})
         started = perf_counter()
         complete, problem = False, 'broken off'
         try:
@@ -265,13 +267,17 @@ class Replay:
         return [f'no image lies within the stamps of {name}, {ends[0]} to {ends[1]}; those of the '
                 f'images are {ends[2]} to {ends[3]}, and nothing was compared']
 
+    def _what(self) -> dict[str, Any]:
+        """Tell what is replayed, and how."""
+        config = self._config
+        return {'source': self._name, 'image_topic': self._recording.image_topic,
+                'method': config.estimator.method, 'preset': config.preset,
+                'scale': config.odometry.scale}
+
     def _summary(self, seconds: float) -> dict[str, Any]:
         counts: Counts = self._tracker.counts
-        config = self._config
         return {
-            'source': self._name, 'image_topic': self._recording.image_topic,
-            'method': config.estimator.method, 'preset': config.preset,
-            'scale': config.odometry.scale, 'scale_kind': self._log.scale.value,
+            **self._what(), 'scale_kind': self._log.scale.value,
             'pairs_of_known_scale': sum(step.tracked and step.scale_known
                                         for step in self._log.steps),
             'frames': counts.processed, 'pairs': len(self._log.pairs()),

@@ -43,6 +43,9 @@ LANDMARKS = 'landmarks.ply'
 _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
           'errors.csv', 'config.yaml')
 
+# What a summary says until the run comes to its end.
+UNFINISHED = {'complete': False, 'error': 'the run did not come to its end'}
+
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
            'keyframe', 'ms')
@@ -67,7 +70,7 @@ class ResultsFolder(Closing):
         except OSError as error:
             raise DjetError(f'{path} could not be begun: {error.strerror or error}; make room, or '
                             'choose another --output') from error
-        self.finish({'complete': False, 'error': 'the run did not come to its end'})
+        self.finish(UNFINISHED)
         self._rows = csv.writer(self._table, lineterminator='\n')
         self._row(COLUMNS)
         self._trajectories = [TumWriter(path / 'trajectory_tum.txt'),
