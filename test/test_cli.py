@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import djet_ros
-from djet_ros.cli.main import COMMANDS, LAB
+from djet_ros.cli.main import COMMANDS, LAB, main
 import pytest
 
 # The command as pip's script calls it, and the same with one more subcommand.
@@ -136,13 +136,22 @@ def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
     assert probe.returncode == 1
 
 
-def test_an_interrupt_gives_one_line_and_exit_code_130() -> None:
+@pytest.mark.parametrize(('number', 'said', 'code'), [
+    (signal.SIGINT, 'interrupted', 130), (signal.SIGTERM, 'terminated', 143)])
+def test_an_interrupt_gives_one_line_and_the_exit_code_of_a_shell(
+        number: signal.Signals, said: str, code: int) -> None:
     probe = start_probe("import time; print('ready', flush=True); time.sleep(60)")
     assert probe.stdout is not None
     assert probe.stdout.readline() == 'ready\n'
-    probe.send_signal(signal.SIGINT)
-    assert probe.communicate(timeout=60) == ('', 'djet: interrupted\n')
-    assert probe.returncode == 130
+    probe.send_signal(number)
+    assert probe.communicate(timeout=60) == ('', f'djet: {said}\n')
+    assert probe.returncode == code
+
+
+def test_who_calls_the_command_from_python_keeps_the_handler_of_sigterm(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(['replay', str(tmp_path / 'absent'), '--output', str(tmp_path / 'out')]) == 2
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize('body', ["print('x' * 1_000_000)", "sys.stdin.read(); print('x')"])

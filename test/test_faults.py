@@ -215,6 +215,17 @@ def test_a_second_run_changes_nothing_and_says_how_to(tmp_path, capsys, name):
     assert main([*words, '--overwrite']) == 0
 
 
+def test_sigterm_leaves_nothing_of_a_bag_that_is_half_made(drive, tmp_path):
+    place = tmp_path / 'place'
+    process = subprocess.Popen([*DJET, 'kitti-to-bag', drive, place / 'bag'], env=ONE_THREAD,
+                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: any(place.rglob('*.mcap')))
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (143, 'djet: terminated\n')
+    assert list(place.iterdir()) == []
+
+
 def test_other_programs_read_the_bag_of_an_interrupted_run(drive, tmp_path):
     results = tmp_path / 'results'
     process = subprocess.Popen([*DJET, 'replay', drive, '--output', results], env=ONE_THREAD,

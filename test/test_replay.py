@@ -746,7 +746,8 @@ def test_stamps_that_stand_still_are_said(goes_on, tmp_path):
     assert summary(tmp_path / 'r')['dropped'] == {'equal_stamp': 7}
 
 
-@pytest.mark.parametrize('sign, code', [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize('sign, code', [
+    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
     endless = tmp_path / 'sequences' / '01'
     shutil.copytree(folder, endless)
@@ -768,6 +769,7 @@ def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path
     told = summary(results)
     assert told['complete'] is False
     assert (told['source'], told['image_topic']) == (str(endless), IMAGE_TOPIC)
+    assert ('images' in told) == (results / 'bag' / 'metadata.yaml').exists() == (code > 0)
     poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
     assert len(poses) > 5
     found = []

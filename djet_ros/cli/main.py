@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 import os
+import signal
 import sys
+from threading import current_thread, main_thread
 from typing import Any, NoReturn
 
 from djet_ros import __version__
@@ -58,10 +61,23 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'djet: error: {message} (see {self.prog} --help)\n')
 
 
+class _Terminated(KeyboardInterrupt):
+    """What SIGTERM raises, so that a command ends as by Ctrl-C: nothing is left half done."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; the exit code is 2 for what the user can mend, 130 for Ctrl-C."""
+    """
+    Run a command line; the exit code is 2 for what the user can mend.
+
+    It is 130 for Ctrl-C and 143 for SIGTERM, as a shell would have it.
+    """
     one_blas_thread()
     sleep_while_waiting()
+    with _heeding_sigterm():
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     try:
         code = run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()
@@ -70,6 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except ModuleNotFoundError as error:
         return _fail(_how_to_install(error))
+    except _Terminated:
+        print('djet: terminated', file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print('djet: interrupted', file=sys.stderr)
         return 130
@@ -79,6 +98,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 141
     except OSError as error:
         return _fail(f'{error.filename}: {error.strerror}' if error.filename else str(error))
+
+
+@contextmanager
+def _heeding_sigterm() -> Iterator[None]:
+    """Let SIGTERM interrupt, unless the command or who started it has something else in mind."""
+    if current_thread() is not main_thread() \
+            or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGTERM) is _terminate:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _terminate(*_: object) -> NoReturn:
+    raise _Terminated
 
 
 def run(argv: Sequence[str]) -> int:

@@ -135,19 +135,21 @@ class _Pool(ProcessPoolExecutor):
 
 @contextmanager
 def _interrupt_after() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of this block."""
+    """Let Ctrl-C, and SIGTERM, wait for the end of this block."""
     if current_thread() is not main_thread():
         # Python interrupts no other.
         yield
         return
     seen: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: seen.append(number))
+    before = {number: signal.signal(number, lambda number, _: seen.append(number))
+              for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if seen:
-        raise KeyboardInterrupt
+        signal.raise_signal(seen[0])
 
 
 class _Worker(SpawnProcess):
