@@ -10,6 +10,7 @@ from djet_ros.recordings.datasets import euroc, LONGEST_GAP_NS, open_sequence, t
 from djet_ros.recordings.frame_sequence import from_first
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import BagRecording, open_recording
+from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -158,6 +159,36 @@ def test_tum_ground_truth_is_interpolated_to_the_images(tum):
         [15 * 0.033333, 0, 0]), atol=1e-6)
     turn = Rotation.from_matrix(poses[15][:3, :3]).as_rotvec()
     assert np.allclose(turn, [0, 15 * 0.0099999, 0], atol=1e-6)
+
+
+def poses_of(folder, file):
+    """Stamps and poses of the ground truth that a file gives a folder."""
+    recording = open_recording(folder, poses=file)
+    assert recording.ground_truth_topic is not None
+    return GroundTruth.of(recording).known()
+
+
+def test_a_file_of_poses_of_either_form_serves_a_folder_of_either_layout(
+        tum, small_kitti, tmp_path):
+    kitti = small_kitti(frames=40)
+    rows = (kitti / '../../poses/07.txt').read_text()
+    stamps, found = poses_of(tum, tum / 'groundtruth.txt')
+    assert len(stamps) == 140
+    assert np.allclose(found[:, 0, 3], 0.01 * np.arange(140))
+    # Rows belong to the images, one to each.
+    (tmp_path / 'rows.txt').write_text(rows)
+    stamps, found = poses_of(tum, tmp_path / 'rows.txt')
+    assert stamps.tolist() == tum_rgbd(tum).stamps_ns.tolist()
+    assert np.allclose(found[:, 2, 3], 0.5 * np.arange(40))
+    # What lies beside a sequence may be of others.
+    (kitti / '../../poses/07.txt').write_text(rows * 2)
+    stamps, found = poses_of(kitti, tum / 'groundtruth.txt')
+    assert len(stamps) == 140
+    stamps, found = poses_of(kitti, tmp_path / 'rows.txt')
+    assert np.allclose(found[:, 2, 3], 0.5 * np.arange(40))
+    for folder in (tum, kitti):
+        with pytest.raises(DjetError, match='07.txt has 80 poses, the recording has 40 images'):
+            open_recording(folder, poses=kitti / '../../poses/07.txt')
 
 
 def test_a_gap_in_the_ground_truth_is_not_bridged():

@@ -116,8 +116,12 @@ def euroc(folder: Path) -> FrameSequence:
                          model, _asl_imu(mav / 'imu0', camera_in_body))
 
 
-def open_sequence(path: Path) -> FrameSequence:
-    """Open a folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, EuRoC, TUM-VI or VAROS."""
+def open_sequence(path: Path, own_poses: bool = True) -> FrameSequence:
+    """
+    Open a folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, EuRoC, TUM-VI or VAROS.
+
+    own_poses: whether the file of poses beside a KITTI sequence is its, which may be of others.
+    """
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
     if varos_camera(path) is not None:
@@ -133,7 +137,7 @@ def open_sequence(path: Path) -> FrameSequence:
         raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0, or raw: '
                         'image_00/data), TUM RGB-D (rgb.txt), 7-Scenes (frame-*.color.png), EuRoC '
                         'or TUM-VI (mav0), or VAROS (vehicle0)')
-    return KittiSequence(path)
+    return KittiSequence(path, own_poses=own_poses)
 
 
 def _seven_scenes_images(folder: Path) -> list[Path]:

@@ -33,13 +33,13 @@ class KittiSequence(FrameSequence):
     The left gray camera, already rectified; what that left of distortion may stand in calib.txt,
     in a row ``D: k1 k2 p1 p2 k3`` as OpenCV has them. Stamps are those of times.txt
     plus STAMP_OFFSET_NS. Rendered sequences may have an ``imu.csv`` as EuRoC has it, and a row
-    ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, where it exists, from
-    ``../../poses/NN.txt``, and expressed in the first camera of the range start <= i < end.
-    Raises DjetError where the folder does not keep to the layout.
+    ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, where it exists and
+    own_poses is true, from ``../../poses/NN.txt``, and expressed in the first camera of the range
+    start <= i < end. Raises DjetError where the folder does not keep to the layout.
     """
 
     def __init__(self, folder: Path, poses: Path | None = None, start: int = 0,
-                 end: int | None = None) -> None:
+                 end: int | None = None, own_poses: bool = True) -> None:
         """Read everything but the images, and check that it belongs together."""
         self.folder = folder.resolve()
         paths = _image_paths(self.folder)
@@ -49,8 +49,10 @@ class KittiSequence(FrameSequence):
         stamps = _stamps(self.folder / 'times.txt', len(paths))[chosen]
         images = ImageFiles(paths[chosen])
         truth = None
-        if (file := _poses_file(self.folder, poses)) is not None:
-            truth = from_first(_poses(file, len(paths))[chosen])
+        if own_poses and poses is None:
+            poses = _poses_beside(self.folder)
+        if poses is not None:
+            truth = from_first(_poses(poses, len(paths))[chosen])
         super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth, distortion,
                          imu=_imu(self.folder))
 
@@ -155,9 +157,9 @@ def _stamps(path: Path, count: int) -> NDArray[np.int64]:
     return increasing(stamps, path) + STAMP_OFFSET_NS
 
 
-def _poses_file(folder: Path, given: Path | None) -> Path | None:
+def _poses_beside(folder: Path) -> Path | None:
     beside = folder.parent.parent / 'poses' / f'{folder.name}.txt'
-    return given if given is not None else beside if beside.exists() else None
+    return beside if beside.exists() else None
 
 
 def _poses(path: Path, count: int) -> Array:

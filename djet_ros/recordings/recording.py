@@ -23,7 +23,7 @@ from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.imu import ImuTrack
-from djet_ros.recordings.kitti import KittiSequence, read_poses
+from djet_ros.recordings.kitti import read_poses
 from djet_ros.recordings.text import lines
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np
@@ -89,14 +89,29 @@ class Recording(Closing):
 class SequenceRecording(Recording):
     """A sequence of image files as the messages of the bag that would be made of it."""
 
-    def __init__(self, sequence: FrameSequence, imu: bool = False) -> None:
-        """Take a sequence; imu: whether what its IMU felt is wanted too, where it has one."""
+    def __init__(self, sequence: FrameSequence, imu: bool = False, poses: Path | None = None
+                 ) -> None:
+        """
+        Take a sequence; DjetError where a file of poses is none.
+
+        imu: whether what its IMU felt is wanted too, where it has one; poses: ground truth instead
+        of its own, see ``open_recording``.
+        """
         self._sequence = sequence
+        # Poses with stamps of their own, and a pose for each image or None.
+        self._stamped: tuple[NDArray[np.int64], Array] | None = None
+        self._poses = sequence.poses
+        if poses is not None:
+            stamps, truth = _read_truth(poses, len(sequence))
+            self._stamped = None if stamps is None else (stamps, truth)
+            self._poses = truth if stamps is None else None
+        self.ground_truth_file = poses
         self._imu = sequence.imu if imu else None
         # By the name everybody knows whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
-        self.ground_truth_topic = None if sequence.poses is None else GROUND_TRUTH_TOPIC
+        known = self._poses is not None or self._stamped is not None
+        self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
         self.beside = {} if self._imu is None else {'imu': IMU_TOPIC,
                                                     'frames': STATIC_FRAMES_TOPIC}
 
@@ -112,6 +127,7 @@ class SequenceRecording(Recording):
         first sample of the IMU beyond it.
         """
         sequence, felt = self._sequence, 0
+        yield from _stamped_poses(self._stamped)
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
             if self._imu is not None and (
                     topics is None or not set(topics).isdisjoint(self.beside.values())):
@@ -120,8 +136,8 @@ class SequenceRecording(Recording):
                 for sample in self._imu.until(felt, stamp):
                     yield _imu_message(self._imu, sample)
                     felt = sample + 1
-            if sequence.poses is not None and np.isfinite(sequence.poses[index]).all():
-                yield _ground_truth(stamp, sequence.poses[index])
+            if self._poses is not None and np.isfinite(self._poses[index]).all():
+                yield _ground_truth(stamp, self._poses[index])
             if topics is None or self.image_topic in topics:
                 yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
                     stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion,
@@ -185,8 +201,7 @@ class BagRecording(Recording):
         if stamps is None:
             yield from self._each_with_its_pose(wanted, poses)
             return
-        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
-            yield _ground_truth(stamp, pose)
+        yield from _stamped_poses((stamps, poses))
         yield from self.bag.messages(wanted)
 
     def _each_with_its_pose(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
@@ -287,11 +302,11 @@ def open_recording(path: Path, image_topic: str | None = None, info_topic: str |
     if strict and (image_topic or info_topic or beside.keys() - {'imu'} or any(beside.values())):
         raise DjetError(f'{path} is a folder of images; topics, speeds, guesses and masks by '
                         'stamp are for bags')
-    sequence = KittiSequence(path, poses) if poses is not None else open_sequence(path)
+    sequence = open_sequence(path, own_poses=poses is None)
     if strict and 'imu' in beside and sequence.imu is None:
         raise DjetError(f'{path} holds nothing of an IMU; leave odometry.imu out, or give a '
                         'recording that has one')
-    return SequenceRecording(sequence, 'imu' in beside)
+    return SequenceRecording(sequence, 'imu' in beside, poses)
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
@@ -304,6 +319,13 @@ def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Arra
         raise DjetError(f'{path} has {len(poses)} poses, the recording has {images} images; give '
                         'the file that belongs to it')
     return None, poses
+
+
+def _stamped_poses(known: tuple[NDArray[np.int64], Array] | None) -> Iterator[BagMessage]:
+    """Make messages of poses with stamps of their own, if there are any."""
+    if known is not None:
+        for stamp, pose in zip(known[0].tolist(), known[1], strict=True):
+            yield _ground_truth(stamp, pose)
 
 
 def _ground_truth(stamp: int, pose: Array) -> BagMessage:
