@@ -39,6 +39,18 @@ def test_a_tum_file_gives_back_stamps_exactly_and_poses_to_the_last_digits(tmp_p
     assert np.abs(read - poses).max() < 1e-14
 
 
+def test_stamps_before_zero_are_written_with_their_sign_and_read_back(tmp_path):
+    stamps = [-1_000_000_001, -1_000_000_000, -900_000_000, -1, 0, 1]
+    path = written(TumWriter, tmp_path / 'a.tum', stamps, some_poses(6))
+    assert [line.partition(' ')[0] for line in path.read_text().splitlines()] == [
+        '-1.000000001', '-1.000000000', '-0.900000000', '-0.000000001', '0.000000000',
+        '0.000000001']
+    assert read_tum(path)[0].tolist() == stamps
+    path.write_text('--1 0 0 0 0 0 0 1\n')
+    with pytest.raises(DjetError, match='is not a number'):
+        read_tum(path)
+
+
 def test_a_kitti_file_gives_back_the_same_doubles(tmp_path):
     poses = some_poses()
     assert (read_poses(written(KittiWriter, tmp_path / 'a.txt', range(20), poses)) == poses).all()
@@ -87,7 +99,7 @@ def test_an_existing_file_is_kept(tmp_path):
 @pytest.mark.parametrize(('line', 'said'), [
     ('1.0 0 0 0 0 0 0', 'has 7 numbers, 8 belong there'),
     ('x 0 0 0 0 0 0 1', "'x' is not a number"),
-    ('-1.0 0 0 0 0 0 0 1', "'-1.0' is no stamp"),
+    ('-3e9 0 0 0 0 0 0 1', "'-3e9' is no stamp"),
     ('1.0 0 0 inf 0 0 0 1', "'inf' is not a finite number"),
     ('1.0 0 0 0 0 0 0 0', 'quaternion of pose 0 has length 0'),
 ])

@@ -130,12 +130,22 @@ def nanoseconds(text: str) -> int:
     """
     Nanoseconds of a decimal number of seconds, rounded half to even, without passing a float.
 
-    Raises ValueError for anything that isn't a number of seconds that a message stamp can hold.
+    Raises ValueError for anything that isn't a number of seconds that a message stamp can hold,
+    and for one before zero.
     """
+    return _nanoseconds(text, 0)
+
+
+def signed_nanoseconds(text: str) -> int:
+    """Read a stamp as ``nanoseconds`` does, also one before zero."""
+    return _nanoseconds(text, -LATEST_SECOND)
+
+
+def _nanoseconds(text: str, least: int) -> int:
     try:
         seconds = Decimal(text)
     except InvalidOperation:
         raise ValueError(f"'{text[:40]}' is not a number of seconds") from None
-    if not seconds.is_finite() or not 0 <= seconds < LATEST_SECOND:
-        raise ValueError(f"'{text[:40]}' is no stamp between 0 and {LATEST_SECOND} s")
+    if not seconds.is_finite() or not least <= seconds < LATEST_SECOND:
+        raise ValueError(f"'{text[:40]}' is no stamp between {least} and {LATEST_SECOND} s")
     return int(seconds.scaleb(9).to_integral_value())

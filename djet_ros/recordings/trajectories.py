@@ -14,9 +14,9 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import seconds_and_rest
+from djet_ros.odometry.messages import seconds_text
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.text import check_positions, LineFile, nanoseconds, stamped_rows
+from djet_ros.recordings.text import check_positions, LineFile, signed_nanoseconds, stamped_rows
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -57,8 +57,7 @@ class TumWriter(TrajectoryWriter):
     @staticmethod
     def line(stamp_ns: int, pose: Array) -> str:
         """Text of one pose (4, 4)."""
-        seconds, rest = seconds_and_rest(stamp_ns)
-        return f'{seconds}.{rest:09d} {digits(position_and_quaternion(pose))}'
+        return f'{seconds_text(stamp_ns)} {digits(position_and_quaternion(pose))}'
 
 
 class KittiWriter(TrajectoryWriter):
@@ -72,7 +71,7 @@ class KittiWriter(TrajectoryWriter):
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], Array]:
     """Stamps (N,) in nanoseconds and poses (N, 4, 4) of a TUM file, else DjetError."""
-    stamps, rows = stamped_rows(path, 8, nanoseconds)
+    stamps, rows = stamped_rows(path, 8, signed_nanoseconds)
     return stamps, poses_from_quaternions(rows[:, :3], rows[:, 3:], path)
 
 
