@@ -152,14 +152,18 @@ def test_a_bag_on_a_full_disk_leaves_nothing(drive, disk):
     assert list(place.iterdir()) == []
 
 
-def test_a_disk_that_is_full_from_the_start_is_named(drive, disk):
+@pytest.mark.parametrize('free', [0, 4, 8, 12, 16, 20])
+def test_a_disk_that_is_full_from_the_start_is_named_and_bars_no_retry(drive, disk, free):
     place = disk('size=64k')
-    (place / 'ballast').write_bytes(bytes(64 << 10))
+    (place / 'ballast').write_bytes(bytes((64 - free) << 10))
     done = djet('replay', drive, '--output', place / 'results')
     assert done.returncode == 2
     assert done.stderr.count('\n') == 1
     assert 'No space left on device' in done.stderr
     assert str(place / 'results') in done.stderr
+    (place / 'ballast').unlink()
+    djet('replay', drive, '--output', place / 'results', '--overwrite')
+    assert read_back(place / 'results')[0] > 5
 
 
 @pytest.mark.parametrize('command', [

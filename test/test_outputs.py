@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 import os
 from pathlib import Path
+import resource
 import stat
 
 from djet_ros.cli.main import main
+from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.store import FILE_NAME, RecordStore
 from djet_ros.recordings.outputs import write_whole
+from djet_ros.replay.results import ResultsFolder
 import pytest
 
 
@@ -52,6 +55,24 @@ def test_a_file_that_can_not_be_written_leaves_nothing_behind(tmp_path: Path) ->
     with pytest.raises(OSError):
         write_whole(tmp_path / 'folder', 'x')
     assert [path.name for path in tmp_path.iterdir()] == ['folder']
+
+
+@pytest.mark.parametrize('present', [False, True])
+def test_results_that_can_not_be_begun_leave_the_place_as_it_was(
+        present: bool, tmp_path: Path) -> None:
+    place = tmp_path / 'results'
+    if present:
+        place.mkdir()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # As on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        with pytest.raises(DjetError, match='results could not be begun: File too large'):
+            ResultsFolder(place, Config())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.rglob('*')) == ([place] if present else [])
+    ResultsFolder(place, Config()).close()
 
 
 @pytest.mark.parametrize('verb', [('bench', 'sequence'), ('closure', 'sequence'), ('soak',)])

@@ -13,9 +13,12 @@ The results folder of a replay: everything is written as it comes, so that nothi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 import csv
 import json
 from pathlib import Path
+import shutil
 from typing import Any
 
 from djet_ros.config.sections import Config, NODE_NAME
@@ -63,20 +66,45 @@ class ResultsFolder(Closing):
     def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
         """Make room, create the files, and write the parameters."""
         self.path = path
-        try:
+        present = path.exists()
+        with self._beginning():
             make_room(path, (*_FILES, BAG), overwrite, marks=(SUMMARY, 'config.yaml'))
-            (path / 'config.yaml').write_text(dump_yaml(config), 'utf-8')
-            self._table = LineFile(path / 'frames.csv')
-        except OSError as error:
-            raise DjetError(f'{path} could not be begun: {error.strerror or error}; make room, or '
-                            'choose another --output') from error
-        self.finish(UNFINISHED)
+        try:
+            with self._beginning():
+                self._begin(config)
+        except BaseException:
+            # Without both of its marks it would be taken for somebody else's.
+            self._remove(present)
+            raise
+
+    def _begin(self, config: Config) -> None:
+        write_whole(self.path / 'config.yaml', dump_yaml(config))
+        self._table = LineFile(self.path / 'frames.csv')
+        self._summarise(UNFINISHED)
         self._rows = csv.writer(self._table, lineterminator='\n')
-        self._row(COLUMNS)
-        self._trajectories = [TumWriter(path / 'trajectory_tum.txt'),
-                              KittiWriter(path / 'trajectory_kitti.txt')]
-        self._bag = ResultBag(path / BAG)
+        self._rows.writerow(COLUMNS)
+        self._trajectories = [TumWriter(self.path / 'trajectory_tum.txt'),
+                              KittiWriter(self.path / 'trajectory_kitti.txt')]
+        self._bag = ResultBag(self.path / BAG)
         self._landmarks: PointFile | None = None
+
+    @contextmanager
+    def _beginning(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DjetError(f'{self.path} could not be begun: {error.strerror or error}; make '
+                            'room, or choose another --output') from error
+
+    def _remove(self, keep_folder: bool) -> None:
+        """Remove what a beginning that failed has made."""
+        for name in _FILES:
+            (self.path / name).unlink(missing_ok=True)
+        shutil.rmtree(self.path / BAG, ignore_errors=True)
+        if not keep_folder:
+            # What others have put there meanwhile stays.
+            with suppress(OSError):
+                self.path.rmdir()
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
         """Write what became of a processed image, and how long it took; counted from 0."""
@@ -125,9 +153,12 @@ class ResultsFolder(Closing):
     def finish(self, summary: dict[str, Any]) -> None:
         """Put a summary in the place of the one before, all or nothing."""
         try:
-            write_whole(self.path / SUMMARY, json.dumps(summary, indent=2) + '\n')
+            self._summarise(summary)
         except OSError as error:
             raise _blame(self.path, error) from error
+
+    def _summarise(self, summary: dict[str, Any]) -> None:
+        write_whole(self.path / SUMMARY, json.dumps(summary, indent=2) + '\n')
 
     def close(self) -> None:
         """Complete the bag and close the files."""
