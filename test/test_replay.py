@@ -674,6 +674,23 @@ def test_a_bad_first_image_is_named_and_the_rest_has_the_poses_that_are_without_
 
 
 @pytest.mark.parametrize('at', [0, 3])
+def test_a_damaged_file_of_a_folder_is_counted_as_a_bad_image_of_a_bag_is(at, folder, tmp_path):
+    shutil.copytree(folder, tmp_path / '00')
+    cut = tmp_path / '00' / 'image_0' / f'{at:06d}.png'
+    cut.write_bytes(cut.read_bytes()[:500])
+    said = djet('replay', tmp_path / '00', '--output', tmp_path / 'r', expect=2).stderr
+    assert said == (
+        f'djet: error: {tmp_path / "00"}: 1 of {FRAMES} images could not be used; image {at}: '
+        'PNG image of 500 bytes is cut short\n')
+    told = summary(tmp_path / 'r')
+    assert (told['complete'], told['frames']) == (True, FRAMES - 1)
+    assert told['rejected'] == {'undecodable': 1}
+    # The commands that make something of each image go no further.
+    done = djet('kitti-to-bag', tmp_path / '00', tmp_path / 'bag', expect=2)
+    assert f'{cut} is a damaged image' in done.stderr
+
+
+@pytest.mark.parametrize('at', [0, 3])
 def test_a_camera_info_of_zeros_costs_the_images_up_to_the_next_one(at, tmp_path):
     messages, zero = list(drive()), camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
     messages.insert(2 * at + 1, (INFO_TOPIC, zero, messages[2 * at][2]))

@@ -104,8 +104,8 @@ def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Re
                         '--source where it is')
     if not is_bag(path) or not isinstance(topic, str):
         topic = None
-    return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, beside),
-            name)
+    return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, beside,
+                           damaged=True), name)
 
 
 def _table(summary: dict[str, Any]) -> Table:

@@ -199,6 +199,11 @@ class MessageFactory:
             encoding=gray if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
             step=len(data) // height, data=data)
 
+    def compressed(self, stamp: int, frame_id: str, data: bytes) -> Any:
+        """Make the CompressedImage of the bytes of a PNG or JPEG file."""
+        return self._type('sensor_msgs/msg/CompressedImage')(
+            header=self.header(stamp, frame_id), format='', data=np.frombuffer(data, np.uint8))
+
     def cloud(self, stamp: int, frame_id: str, places: Array) -> Any:
         """Make the PointCloud2 of places (M, 3), float32 x, y and z."""
         cloud_type = self._type('sensor_msgs/msg/PointCloud2')

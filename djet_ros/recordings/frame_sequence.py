@@ -23,6 +23,15 @@ _LONGEST_JPEG_HEADER = 1 << 20
 _JPEG_START = b'\xff\xd8'
 
 
+class DamagedImage(DjetError):
+    """A file that began like an image, and can't be decoded; path: of the file."""
+
+    def __init__(self, path: Path, why: BadMessage) -> None:
+        """Keep the path beside the text."""
+        super().__init__(f'{path} is a damaged image ({why}); replace it, or leave its frame out')
+        self.path = path
+
+
 class FrameSequence:
     """
     Images of one moving camera in files, with stamps and perhaps ground truth.
@@ -64,7 +73,7 @@ class FrameSequence:
         return distorts(self.model, self.distortion)
 
     def raw(self, index: int) -> NDArray[Any]:
-        """Gray pixels (H, W) of a frame as its file has them, uint8 or uint16."""
+        """Gray pixels (H, W) of a frame as its file has them, uint8 or uint16; DamagedImage."""
         return self._images.pixels(index)
 
     def image(self, index: int) -> NDArray[np.uint8]:
@@ -123,8 +132,7 @@ class ImageFiles:
         except OSError as error:
             raise DjetError(f'{path} could not be read: {error.strerror}') from error
         except BadMessage as error:
-            raise DjetError(f'{path} is a damaged image ({error}); replace it or leave its frame '
-                            'out with --start and --end') from error
+            raise DamagedImage(path, error) from error
         if image.shape != self.size[::-1]:
             raise DjetError(f'{path} has changed its size since the work began')
         return image

@@ -21,7 +21,7 @@ from djet_ros.recordings.bags import Bag, BagMessage, is_bag, Topic
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.decoding import MAKE
-from djet_ros.recordings.frame_sequence import FrameSequence
+from djet_ros.recordings.frame_sequence import DamagedImage, FrameSequence
 from djet_ros.recordings.imu import ImuTrack
 from djet_ros.recordings.kitti import read_poses
 from djet_ros.recordings.text import lines
@@ -89,15 +89,16 @@ class Recording(Closing):
 class SequenceRecording(Recording):
     """A sequence of image files as the messages of the bag that would be made of it."""
 
-    def __init__(self, sequence: FrameSequence, imu: bool = False, poses: Path | None = None
-                 ) -> None:
+    def __init__(self, sequence: FrameSequence, imu: bool = False, poses: Path | None = None,
+                 damaged: bool = False) -> None:
         """
         Take a sequence; DjetError where a file of poses is none.
 
         imu: whether what its IMU felt is wanted too, where it has one; poses: ground truth instead
-        of its own, see ``open_recording``.
+        of its own, and damaged: whether damaged images are handed on, see ``open_recording``.
         """
         self._sequence = sequence
+        self._damaged = damaged
         # Poses with stamps of their own, and a pose for each image or None.
         self._stamped: tuple[NDArray[np.int64], Array] | None = None
         self._poses = sequence.poses
@@ -142,8 +143,15 @@ class SequenceRecording(Recording):
                 yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
                     stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion,
                     sequence.model))
-                yield BagMessage(self.image_topic, stamp, MAKE.picture(
-                    stamp, CAMERA_FRAME, sequence.raw(index)))
+                yield BagMessage(self.image_topic, stamp, self._image(index, stamp))
+
+    def _image(self, index: int, stamp: int) -> Any:
+        try:
+            return MAKE.picture(stamp, CAMERA_FRAME, self._sequence.raw(index))
+        except DamagedImage as damaged:
+            if not self._damaged:
+                raise
+            return MAKE.compressed(stamp, CAMERA_FRAME, damaged.path.read_bytes())
 
     def static_frames(self) -> Iterator[Any]:
         """Yield how the IMU is turned against the camera, where it is wanted."""
@@ -288,13 +296,14 @@ class BagRecording(Recording):
 
 def open_recording(path: Path, image_topic: str | None = None, info_topic: str | None = None,
                    poses: Path | None = None, beside: Mapping[str, str | None] | None = None,
-                   strict: bool = True) -> Recording:
+                   strict: bool = True, damaged: bool = False) -> Recording:
     """
     Open a bag, or a folder of image files in one of the layouts of ``open_sequence``.
 
     poses: ground truth instead of the recording's own, as KITTI (one row per image) or TUM
     (stamped) file; beside: what else is wanted, by names in BESIDE, each with its topic or, where
-    that is to be found, None; strict: whether it has to be there. Raises DjetError.
+    that is to be found, None; strict: whether it has to be there; damaged: whether files of images
+    that can't be decoded are handed on as a bag's are, as CompressedImage. Raises DjetError.
     """
     beside = beside or {}
     if is_bag(path) or not path.exists():
@@ -306,7 +315,7 @@ def open_recording(path: Path, image_topic: str | None = None, info_topic: str |
     if strict and 'imu' in beside and sequence.imu is None:
         raise DjetError(f'{path} holds nothing of an IMU; leave odometry.imu out, or give a '
                         'recording that has one')
-    return SequenceRecording(sequence, 'imu' in beside, poses)
+    return SequenceRecording(sequence, 'imu' in beside, poses, damaged)
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
