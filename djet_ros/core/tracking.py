@@ -298,9 +298,7 @@ class _Algorithm:
                                     TRACK_TUNING.steps_by_places if by_places else MAX_STEPS)
             if number == 1:
                 self.first = found
-            # A pose is not at rest before surfaces are seen as it has them.
-            seen = self._warp is not None or not self._config.warp_reference
-            last = (seen and found.converged) or number == most
+            last = (found.converged and self._seen_as_it_has_them) or number == most
             if last:
                 found, placed, rivals = self._concluded(found)
             # Keypoints go towards their optimum on the epipolar line of the new pose.
@@ -317,6 +315,12 @@ class _Algorithm:
         minima[voting] = (self._K @ found.problem.rays_y)[:2].T
         return Track(pose, found.problem, found.loss, found.solution.residuals, voting, minima,
                      placed, optimum, self._losses, no_minimum, tuple(rounds), rivals)
+
+    @property
+    def _seen_as_it_has_them(self) -> bool:
+        """Whether surfaces are sampled as a pose has their patches: it is not at rest before."""
+        return (self._warp is not None or not self._config.warp_reference
+                or self._config.method == 'rpe')
 
     def _fits(self, by_places: bool) -> Paraboloids:
         """Fit surfaces around the keypoints, or take these as they are."""
