@@ -138,6 +138,7 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: 
     probability that the preference comes from noise.
     """
     status = Status.TWO_MOTIONS if track.guess else Status.OK
+    unsure: list[Array] = []
     for rival in track.rivals:
         off = difference(pose.R, pose.t, rival.pose)
         if squared_distance(covariances[0], off) < _SURPRISING:
@@ -148,8 +149,10 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: 
         covariances = spanning(covariances[0], pose.t, off,
                                float(ndtr(-_TRUSTED * rival.preference)))
         if undecided:
-            covariances = widened(covariances[0], pose.t,
-                                  _covariance_of(rival.pose, track, places))
+            unsure.append(_covariance_of(rival.pose, track, places))
+    # Not before all are held against it: what is not known of one is no reason to allow of others.
+    for own in unsure:
+        covariances = widened(covariances[0], pose.t, own)
     if other_way:
         status = status if track.guess else Status.AMBIGUOUS
         # It lies 2 away by its chord, to no side more than to another.
