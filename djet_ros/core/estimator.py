@@ -28,7 +28,15 @@ from djet_ros.core.surfaces import (
     ResidualSurface,
 )
 from djet_ros.core.tracking import hold, Track, track_jointly
-from djet_ros.core.types import Array, Features, Pose, RelativePose, Status, View
+from djet_ros.core.types import (
+    Array,
+    Features,
+    of_one_camera,
+    Pose,
+    RelativePose,
+    Status,
+    View,
+)
 from djet_ros.core.verdict import verdict
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +92,7 @@ class TwoViewEstimator:
         with a status that says why. ValueError where the views are not of one camera.
         """
         known, timings = known or Known(), dict[str, float]()
-        if previous.gray.shape != current.gray.shape or not np.array_equal(previous.K, current.K):
+        if not of_one_camera(previous, current):
             raise ValueError(f'views of {previous.gray.shape} and {current.gray.shape} pixels, or '
                              'their camera matrices, differ; a pair is of one camera')
 

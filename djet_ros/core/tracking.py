@@ -92,14 +92,13 @@ class Track:
     """
     Where Algorithm 1 ended.
 
-    pose; problem: of the voting matches, at the end; loss: the robust loss in force; residuals:
-    those of the problem at the pose;
-    voting: (N,) bool, matches that took part; placed: where gray levels have y (N, 2), through the
-    last warp, or y itself where that was not asked; minima: (N, 2) the surfaces' own minima y*,
-    joined with these for matches that voted; y_opt: (N, 2) the final step onto the epipolar line;
-    losses: (N,) last known surface values; rounds: what led there; rivals: other motions that
-    explain the voting matches; guess: whether that is so because two bodies move, and nothing
-    tells which is the world.
+    pose; problem: that of the voting matches, in the end; loss: the robust loss in force;
+    residuals: those of the problem at the pose; voting: (N,) bool, matches that took part; placed:
+    where gray levels have y (N, 2), through the last warp, or y itself where that was not asked;
+    minima: (N, 2) the surfaces' own minima y*, joined with these for matches that voted; y_opt:
+    (N, 2) the final step onto the epipolar line; losses: (N,) last known surface values; rounds:
+    what led there; rivals: other motions that explain the voting matches; guess: whether that is
+    so because two bodies move, and nothing tells which is the world.
     """
 
     pose: Pose

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,23 @@ class Features:
     def with_others(self) -> Features:
         """Give these features, and the others if there are any."""
         return self if self.others is None else Features.together([self, self.others()])
+
+
+class Picture(Protocol):
+    """What a camera shows: gray (H, W), and K (3, 3) its camera matrix."""
+
+    @property
+    def gray(self) -> NDArray[np.uint8]:
+        """Give the gray levels."""
+
+    @property
+    def K(self) -> Array:
+        """Give the camera matrix."""
+
+
+def of_one_camera(one: Picture, other: Picture) -> bool:
+    """Whether two pictures have one size and one camera matrix, as those of a pair have to."""
+    return one.gray.shape == other.gray.shape and np.array_equal(one.K, other.K)
 
 
 @dataclass(frozen=True)

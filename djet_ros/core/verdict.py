@@ -60,8 +60,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     sign, other_way = _sign(track.pose, rays_x, rays_y, x[inliers], pair.before)
     t = sign * track.pose.t
 
-    covariances = pose_covariance(
-        track.residuals, track.loss, x[track.voting], t, sign < 0)
+    voting = x[track.voting]
+    covariances = pose_covariance(track.residuals, track.loss, voting, t, sign < 0)
     hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
                               None if pair.bits is None else (pair.y, pair.bits))
     status = Status.OK
@@ -81,8 +81,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
                 covariances = spanning(covariances[0], t, bent, 1.0)
             status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
-            status, covariances = _judged(Pose(R, t), covariances, track, x[track.voting],
-                                          pair.before, other_way)
+            status, covariances = _judged(Pose(R, t), covariances, track, voting, pair.before,
+                                          other_way)
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
         status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,
@@ -133,9 +133,10 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: 
     """
     Tell whether rivals leave a pose unsure, and widen its covariances to span them.
 
-    other_way: whether t may have the other sign as well, which is a rival too. Those that the
-    covariance allows of are spanned by it already. Any other is the true motion with the
-    probability that the preference comes from noise.
+    places: (M, 2) pixels of the matches that voted, in the previous image; other_way: whether t
+    may have the other sign as well, which is a rival too. Those that the covariance allows of are
+    spanned by it already. Any other is the true motion with the probability that the preference
+    comes from noise.
     """
     status = Status.TWO_MOTIONS if track.guess else Status.OK
     unsure: list[Array] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.types import Array, Status, View
+from djet_ros.core.types import Array, of_one_camera, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,6 +41,6 @@ def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:
     gap = (current.stamp_ns - previous.stamp_ns) * 1e-9
     if gap < 0 or gap > max_gap:
         return Status.TIME_JUMP
-    if current.gray.shape != previous.gray.shape or not np.array_equal(current.K, previous.K):
+    if not of_one_camera(previous, current):
         return Status.SIZE_CHANGED
     return Status.OK

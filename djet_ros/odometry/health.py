@@ -79,9 +79,9 @@ class Health:
         self._fates.append('')
         self._equal, self._last = 0, result
         self._ways = self._ways or result.status is Status.OK
-        self._measured = self._measured or (result.scale_kind is Scale.METRIC and result.measured)
-        if self._config.scale in ('none', 'structure') or (
-                result.scale_kind is Scale.METRIC and result.measured):
+        measured = result.scale_kind is Scale.METRIC and result.measured
+        self._measured = self._measured or measured
+        if measured or not self._asks_for_metres:
             self._unknown_lengths = 0
         elif result.status in TRACKED:
             self._unknown_lengths += 1
@@ -137,25 +137,28 @@ class Health:
             'does; publish it by robot_state_publisher or by tf2_ros static_transform_publisher '
             f'--frame-id {base} --child-frame-id {camera}'))
 
+    @property
+    def _asks_for_metres(self) -> bool:
+        return self._config.scale not in ('none', 'structure')
+
     def _length(self, scale: ScaleSource) -> Complaint | None:
-        if self._unknown_lengths < _IN_A_ROW or self._last is None:
-            return None
-        remedy = _REMEDIES.get(self._config.scale, 'choose another odometry.scale')
-        return Complaint('no metric length', 'WARN', (
-            f'odometry.scale is {self._config.scale}, and no length is measured: '
-            f'{scale.why_unknown(self._last.stamp_ns)}; '
-            + remedy.format(topics=self._speed_topics)))
+        return (None if self._unknown_lengths < _IN_A_ROW
+                else self._no_length(scale, 'is measured', _REMEDIES))
 
     def never_measured(self, scale: ScaleSource) -> Complaint | None:
         """Say that of a whole recording no length was measured, though that was asked for."""
-        asked = self._config.scale
-        if asked in ('none', 'structure') or self._measured or not self._ways \
-                or self._last is None:
+        return (None if self._measured or not self._ways or not self._asks_for_metres
+                else self._no_length(scale, 'was measured', _REMEDIES_RECORDED))
+
+    def _no_length(self, scale: ScaleSource, what: str, remedies: dict[str, str]
+                   ) -> Complaint | None:
+        if self._last is None:
             return None
-        remedy = _REMEDIES_RECORDED.get(asked, 'choose another odometry.scale')
+        remedy = remedies.get(self._config.scale, 'choose another odometry.scale')
         return Complaint('no metric length', 'WARN', (
-            f'odometry.scale is {asked}, and no length was measured: '
-            f'{scale.why_unknown(self._last.stamp_ns)}; {remedy}'))
+            f'odometry.scale is {self._config.scale}, and no length {what}: '
+            f'{scale.why_unknown(self._last.stamp_ns)}; '
+            + remedy.format(topics=self._speed_topics)))
 
     def _share(self, reason: str) -> float:
         few = len(self._fates) < _FEW

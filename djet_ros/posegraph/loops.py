@@ -13,7 +13,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.masks import blocked
-from djet_ros.core.types import Array, RelativePose, Status, TRACKED, View
+from djet_ros.core.types import Array, of_one_camera, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.scale import Length, unknown
@@ -116,7 +116,7 @@ class EdgeFinder:
 
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
         view, other = self._view(current), self._view(place)
-        if view.gray.shape != other.gray.shape or not np.array_equal(view.K, other.K):
+        if not of_one_camera(view, other):
             return
         relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_sure(relative):
