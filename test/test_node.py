@@ -19,6 +19,7 @@ from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.decoding import MAKE
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
 from djet_ros.recordings.imu import ImuTrack
 from djet_ros.recordings.recording import BagRecording, IMU_TOPIC
 import numpy as np
@@ -142,24 +143,16 @@ def wait_for_log(node: NodeProcess, text: str, seconds: float = 2 * PATIENCE) ->
     raise AssertionError(f'{text!r} is not in the log:\n{node.log}')
 
 
-class Drive:
-    """The images as a sequence that can be written as a bag."""
-
-    name, K, size, poses, model = 'cards', K, SIZE, None, 'plumb_bob'
-    distortion = np.zeros(5)
-
-    def __init__(self, images: list[Any]) -> None:
-        self._images = images
-        self.stamps_ns = np.array([stamp(i) for i in range(len(images))])
-        felt = feel(np.array(WAY), PERIOD * 1e-9, Mems(), 0)
-        self.imu = ImuTrack(START + felt.stamps_ns, felt.rates, felt.accelerations,
-                            felt.to_camera)
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def raw(self, index: int) -> Any:
-        return self._images[index]
+def filmed(images: list[Any], folder: Path) -> FrameSequence:
+    """Give the images as a sequence in files, with what an IMU beside the camera felt."""
+    folder.mkdir()
+    paths = [folder / f'{i:06}.png' for i in range(len(images))]
+    for path, pixels in zip(paths, images):
+        assert cv2.imwrite(str(path), pixels)
+    felt = feel(np.array(WAY), PERIOD * 1e-9, Mems(), 0)
+    return FrameSequence(
+        'cards', ImageFiles(paths), K, np.array([stamp(i) for i in range(len(images))]), None,
+        imu=ImuTrack(START + felt.stamps_ns, felt.rates, felt.accelerations, felt.to_camera))
 
 
 @pytest.mark.parametrize(('base_frame', 'imu'), [
@@ -169,7 +162,8 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
     if base_frame or imu:
         pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     mounting = MAKE.frame(0, 'base_link', 'camera', AHEAD)
-    write_kitti_bag(Drive(drive), tmp_path / 'plain')
+    sequence = filmed(drive, tmp_path / 'images')
+    write_kitti_bag(sequence, tmp_path / 'plain')
     with Bag(tmp_path / 'plain') as plain, ResultBag(tmp_path / 'bag') as whole:
         whole.write('/tf_static', mounting, 0)
         for one in plain.messages():
@@ -210,7 +204,7 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
     assert len(expected[RELATIVE]) == len(drive) - 1
     last = subscriber.wait('the last word', lambda heard: (
         found := said('waiting for an image')(heard))['frames processed'] == '12' and found)
-    assert last.get('gyro samples', '0') == str(len(Drive(drive).imu.rates) if imu else 0)
+    assert last.get('gyro samples', '0') == str(len(sequence.imu.rates) if imu else 0)
     for topic in poses:
         assert [serialised(m) for m in subscriber.heard[topic]] == expected[topic]
 
