@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 from djet_ros.core.bundle import (
     eliminate,
     in_frame,
@@ -12,6 +13,7 @@ from djet_ros.core.bundle import (
     PosePrior,
     Poses,
     projected,
+    straightened,
 )
 from djet_ros.core.geometry import rotation_exp
 import numpy as np
@@ -20,16 +22,17 @@ import pytest
 K = np.array([[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
 
 
-def scene(rng, frames=4, landmarks=40):
-    """Poses of a camera that drives and turns, and landmarks that it sees exactly."""
+def scene(rng, frames=4, landmarks=40, k1=0.05):
+    """Poses of a camera that drives and turns, and landmarks that it sees exactly, through k1."""
     poses = Poses(
         np.array([rotation_exp(np.array([0.01, 0.03, -0.02]) * f) for f in range(frames)]),
-        np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None])
+        np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None], k1)
     found = Landmarks.at(rng.uniform((100, 80), (540, 400), (landmarks, 2)),
                          1 / rng.uniform(4, 20, landmarks), 0, frames)
     found.anchors[landmarks // 2:] = 1
+    found.points = straightened(K, found.found, k1)
     for frame in range(frames):
-        found.minima[:, frame] = projected(K, in_frame(K, poses, found, frame))
+        found.minima[:, frame] = projected(K, in_frame(K, poses, found, frame), k1)
         later = found.anchors < frame
         found.seen[later, frame] = True
         A = rng.normal(size=(landmarks, 2, 2))
@@ -45,13 +48,29 @@ def test_a_landmark_is_seen_where_its_point_in_space_is_projected():
         ray = np.linalg.inv(K) @ [*landmarks.points[n], 1]
         world = poses.R[anchor].T @ (ray / landmarks.rho[n] - poses.t[anchor])
         here = poses.R[3] @ world + poses.t[3]
-        assert projected(K, in_frame(K, poses, landmarks, 3))[n] == pytest.approx(
-            (K @ here)[:2] / here[2])
+        there = cv2.projectPoints(here, np.zeros(3), np.zeros(3), K, np.array([0.05, 0, 0, 0]))[0]
+        assert projected(K, in_frame(K, poses, landmarks, 3), 0.05)[n] == pytest.approx(
+            there.ravel())
+
+
+@pytest.mark.parametrize('k1', [-0.05, 0.0, 0.05])
+def test_a_pixel_is_straightened_to_where_a_pinhole_shows_it(k1):
+    pixels = np.random.default_rng(16).uniform((0, 0), (640, 480), (100, 2))
+    where = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K)
+    # Not to the last digit: a landmark's point begins there, and where it was found holds it.
+    assert straightened(K, pixels, k1) == pytest.approx(where[:, 0], abs=0.05)
+
+
+def test_what_is_far_outside_of_the_image_is_not_folded_into_it():
+    far = np.array([[20.0, 0, 1], [0, -1e5, 1], [3, 3, -1]])
+    assert (np.abs(projected(K, far, -0.05)) > 2000).any(1).all()
 
 
 def test_exact_observations_leave_no_residual():
     poses, landmarks = scene(np.random.default_rng(1))
-    assert np.abs(observe(K, poses, landmarks).residuals).max() < 1e-9
+    observed = observe(K, poses, landmarks)
+    assert np.abs(observed.residuals).max() < 1e-9
+    assert np.abs(observed.off).max() < 0.1
 
 
 def test_jacobians_are_those_of_small_steps():
@@ -61,14 +80,16 @@ def test_jacobians_are_those_of_small_steps():
     by = jacobians(observed)
     step = np.random.default_rng(3).normal(size=(4, 6)) * 1e-6
     own = np.random.default_rng(4).normal(size=(40, 3)) * [1e-7, 1e-5, 1e-5]
+    bent = 1e-7
     expected = (np.einsum('nij,nj->ni', by.by_frame, step[observed.frame])
                 + np.einsum('nij,nj->ni', by.by_anchor, step[observed.anchor])
-                + np.einsum('nij,nj->ni', by.by_own, own[observed.landmark]))
-    ahead, back = (observe(K, poses.moved(sign * step.ravel()), landmarks.moved(sign * own))
-                   for sign in (1, -1))
+                + np.einsum('nij,nj->ni', by.by_own, own[observed.landmark]) + by.by_k1 * bent)
+    ahead, back = (observe(K, replace(poses.moved(sign * step.ravel()), k1=0.05 + sign * bent),
+                           landmarks.moved(sign * own)) for sign in (1, -1))
     assert (ahead.residuals - back.residuals) / 2 == pytest.approx(expected, rel=1e-5, abs=1e-9)
     assert (ahead.off - back.off) / 2 == pytest.approx(
-        np.einsum('nij,nj->ni', observed.held, own[:, 1:]), abs=1e-12)
+        np.einsum('nij,nj->ni', by.points_by_own, own[:, 1:]) + by.points_by_k1 * bent, rel=1e-5,
+        abs=1e-9)
 
 
 def test_steps_undo_one_another():
@@ -84,14 +105,15 @@ def test_elimination_solves_the_same_equations_as_all_at_once():
     observed = observe(K, poses, landmarks)
     by = jacobians(observed)
     weights = np.random.default_rng(9).uniform(0.5, 2, len(observed.residuals))
-    J = np.zeros((len(weights) + 40, 2, 24 + 3 * 40))
+    J, of_k1 = np.zeros((len(weights) + 40, 2, 24 + 3 * 40)), np.empty((len(weights) + 40, 2))
+    of_k1[:len(weights)], of_k1[len(weights):] = by.by_k1, by.points_by_k1
     for n, (landmark, frame, anchor) in enumerate(
             zip(observed.landmark, observed.frame, observed.anchor)):
         J[n, :, 6 * frame:6 * frame + 6] += by.by_frame[n]
         J[n, :, 6 * anchor:6 * anchor + 6] += by.by_anchor[n]
         J[n, :, 24 + 3 * landmark:][:, :3] = by.by_own[n]
     for landmark in range(40):
-        J[len(weights) + landmark, :, 25 + 3 * landmark:][:, :2] = observed.held[landmark]
+        J[len(weights) + landmark, :, 25 + 3 * landmark:][:, :2] = by.points_by_own[landmark]
     W = np.repeat([*weights, *[0.7] * 40], 2)[:, None]
     e = np.concatenate([observed.residuals, observed.off]).ravel()
     J = J.reshape(-1, 144)
@@ -102,6 +124,12 @@ def test_elimination_solves_the_same_equations_as_all_at_once():
     step = -np.linalg.solve(reduced.H + np.eye(24), reduced.g)
     assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
     assert reduced.change(step).ravel() == pytest.approx(whole[24:], rel=1e-4, abs=1e-6)
+    # With k1, and nothing else known: the freedoms of the whole don't matter to it.
+    J = np.column_stack([of_k1.ravel(), J])
+    information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
+    told = reduced.of_k1()
+    assert told.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
+    assert told.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
 
 
 def test_noise_free_landmarks_bring_poses_and_depths_back():

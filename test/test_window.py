@@ -28,24 +28,37 @@ class Street:
     """
     Points (N, 3) beside and on a street, seen from a camera that goes a metre ahead each frame.
 
-    noise: pixels, of each place in each frame; turned: rad, by which each pair's rotation is off.
+    noise: pixels, of each place in each frame; turned: rad, by which each pair's rotation is off;
+    curve: rad, by which the street turns each metre from the thirtieth to the ninetieth; k1:
+    distortion of the camera's lens.
     """
 
-    def __init__(self, seed: int, frames: int, noise: float, turned: float = 0.0) -> None:
-        self.rng, self.noise, self.turned = np.random.default_rng(seed), noise, turned
+    def __init__(self, seed: int, frames: int, noise: float, turned: float = 0.0,
+                 curve: float = 0.0, k1: float = 0.0) -> None:
+        self.rng, self.noise, self.turned, self.k1 = np.random.default_rng(seed), noise, turned, k1
         count = 14 * (frames + 70)
-        ahead = self.rng.uniform(0, frames + 70, count)
+        along = self.rng.uniform(0, frames + 70, count)
         road = self.rng.uniform(size=count) < 0.25
         side = self.rng.uniform(5, 12, count) * self.rng.choice([-1, 1], count)
-        self.points = np.stack([
-            np.where(road, self.rng.uniform(-5, 5, count), side),
-            np.where(road, 1.65, self.rng.uniform(-6, 1.6, count)), ahead], axis=1)
+        beside = np.where(road, self.rng.uniform(-5, 5, count), side)
+        # Each metre of the street looks its own way, and leads on by that.
+        self.heading = curve * np.clip(np.arange(frames + 71) - 30, 0, 60)
+        ahead = np.stack([np.sin(self.heading), 0 * self.heading, np.cos(self.heading)], axis=1)
+        self.centre = np.cumsum(ahead, axis=0) - ahead[0]
+        metre, right = along.astype(int), ahead[:, ::-1] * [1, 0, -1]
+        self.points = (self.centre[metre] + (along - metre)[:, None] * ahead[metre]
+                       + beside[:, None] * right[metre])
+        self.points[:, 1] = np.where(road, 1.65, self.rng.uniform(-6, 1.6, count))
+
+    def turn(self, frame: int) -> Numbers:
+        """Rotation (3, 3) of a frame, from the world to its camera."""
+        return rotation_exp(np.array([0.0, -self.heading[frame], 0]))
 
     def seen(self, frame: int) -> tuple[Numbers, NDArray[np.bool_]]:
         """Noisy places (N, 2) of all points in a frame, and which of them are in sight."""
-        ahead = self.points - [0, 0, frame]
+        ahead = (self.points - self.centre[frame]) @ self.turn(frame).T
         near = (ahead[:, 2] > 2) & (ahead[:, 2] < 70)
-        places = projected(K, np.where(near[:, None], ahead, [0.0, 0.0, 1.0]))
+        places = projected(K, np.where(near[:, None], ahead, [0.0, 0.0, 1.0]), self.k1)
         places += self.rng.normal(size=places.shape) * self.noise
         return places, near & inside(places)
 
@@ -53,9 +66,12 @@ class Street:
         """Points (M,) that a frame and the next have matched, and what they tell: the truth."""
         (x, here), (y, there) = self.seen(frame), self.seen(frame + 1)
         which = self.rng.permutation(np.flatnonzero(here & there))[:count]
-        R = rotation_exp(self.turned * self.rng.normal(size=3)) if self.turned else np.eye(3)
+        R = self.turn(frame + 1) @ self.turn(frame).T
+        if self.turned:
+            R = rotation_exp(self.turned * self.rng.normal(size=3)) @ R
+        t = self.turn(frame + 1) @ (self.centre[frame] - self.centre[frame + 1])
         return which, RelativePose(
-            Status.OK, R, np.array([0.0, 0, -1]), np.eye(5) * max(_SURE, self.turned)**2,
+            Status.OK, R, t, np.eye(5) * max(_SURE, self.turned)**2,
             x=x[which], y=y[which], y_opt=y[which], inliers=np.ones(len(which), bool))
 
 
@@ -85,7 +101,7 @@ class NumbersWindow(Window):
         found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
-        wanted = seen[mine] & inside(projected(K, in_frame(K, self._poses, found, newest)))
+        wanted = seen[mine] & inside(self._projected(in_frame(K, self._poses, found, newest)))
         wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
         found.minima[wanted, -1], found.seen[wanted, -1] = places[mine[wanted]], True
         found.roots[wanted, -1] = np.eye(2)
@@ -181,3 +197,24 @@ def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
     assert ways[9] == pytest.approx(1, abs=0.02) and ways[10] == 0
     assert ways[11] == pytest.approx(1 + WINDOW_TUNING.mended, abs=0.02)
     assert here[2, 3] == pytest.approx(40, abs=0.2)
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('k1', [-0.015, 0.015])
+def test_in_a_turn_a_window_finds_what_distortion_is_left_and_lengths_hardly_drift_by_it(
+        seed: int, k1: float) -> None:
+    window = NumbersWindow(Street(seed, 120, 0.1, curve=0.02, k1=k1))
+    lengths = [window.go() for _ in range(120)]
+    assert window.lens.sigma < 0.003
+    assert window.lens.k1 == pytest.approx(k1, abs=2 * window.lens.sigma)
+    # By 5 % where nobody knows of it.
+    assert np.mean(lengths[-15:]) == pytest.approx(np.mean(lengths[:15]), rel=0.02)
+
+
+@pytest.mark.parametrize('curve', [0.0, 0.02])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_lens_without_distortion_is_left_as_it_is(seed: int, curve: float) -> None:
+    window = NumbersWindow(Street(seed, 120, 0.1, curve=curve))
+    for _ in range(120):
+        window.go()
+        assert abs(window.lens.k1) < 3e-4

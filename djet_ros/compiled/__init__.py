@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 1
+_INTERFACE = 2
 
 # Rows of memory that the optimiser asks for, and by how much these may be longer than others.
 _ROWS, _FILLED_UP = 28, 3
@@ -141,25 +141,27 @@ def refine_all(matches: tuple[Array, Array, Array, Array], loss: tuple[int, floa
 
 
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
-              observed: tuple[Array, ...], held: tuple[Array, Array, float],
+              observed: tuple[Array, ...], held: tuple[Array, Array, Array, float],
               K: tuple[Array, Array], least: tuple[float, float], frames: int
               ) -> tuple[Array, Array, Array, Array, Array]:
     """
     Sum up M observations of N landmarks by F frames, and eliminate these: `core.bundle.eliminate`.
 
     which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
-    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); held:
-    (N, 2, 2), off (N, 2) and their weight; K: (3, 3) and its inverse; least: depth, and
+    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2), how they change over k1
+    (M, 2), and weights (M,); held: (N, 2, 2), how it changes over k1 (N, 2), off (N, 2) and their
+    weight; K: (3, 3) and its inverse; least: depth, and
     information about a landmark. Gives a Reduced's fields.
     """
-    n = len(held[1])
-    H, g = np.zeros((6 * frames, 6 * frames)), np.zeros(6 * frames)
-    coupling, variances = np.zeros((n, 3, 6 * frames)), np.empty((n, 3, 3))
-    slopes, gain = np.zeros((n, 3)), np.empty((3, 6 * frames))
+    *of_points, weight = held
+    n, size = len(of_points[0]), 1 + 6 * frames
+    H, g = np.zeros((size, size)), np.zeros(size)
+    coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
+    slopes, gain = np.zeros((n, 3)), np.empty((3, size))
     given = _Given()
     _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames),
           *(given(one, np.int64) for one in which), *map(given, observed),
-          given(held[0]), given(held[1]), c_double(held[2]), *map(given, K),
+          *map(given, of_points), c_double(weight), *map(given, K),
           *map(c_double, least), *map(given, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 

@@ -13,13 +13,14 @@ observation too: its ray there is free, held by a residual like the others. With
 depth would have to make up for that noise, and steps would come out ever shorter.
 
 Poses are world to camera, ``X_camera = R X_world + t``, moved from the left: a step (omega,
-upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``.
+upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``. All have one lens, of which a
+calibration may leave some radial distortion: it moves points u = (X/Z, Y/Z) to u (1 + k1 |u|^2).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
@@ -43,13 +44,24 @@ _HARDLY = 1e-6
 # What is added to the information about an inverse depth, so that there always is some.
 _TRACE = 1e-9
 
+# Information that poses hold on to where observations leave them open, as a share of theirs.
+_OPEN = 1e-7
+
+# Share by which k1 moves points at most: what is farther out is in no image, and must not be
+# folded into one.
+_FARTHEST = 0.1
+
+# Steps to where a point is without k1; each leaves a hundredth of what the one before did.
+_STRAIGHTENINGS = 3
+
 
 @dataclass
 class Poses:
-    """Poses of F frames: R (F, 3, 3), t (F, 3), see above."""
+    """Poses of F frames: R (F, 3, 3), t (F, 3), and the k1 of their lens, see above."""
 
     R: Array
     t: Array
+    k1: float = 0.0
 
     def between(self) -> tuple[Array, Array]:
         """Motions from frame a to frame f: R (F, F, 3, 3) and t (F, F, 3), indexed [f, a]."""
@@ -65,17 +77,18 @@ class Poses:
 
     def joined(self, R: Array, t: Array) -> Poses:
         """Give the poses and one more, R (3, 3) and t (3,)."""
-        return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]))
+        return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]),
+                     self.k1)
 
     def without_frame(self, frame: int) -> Poses:
         """Give all poses but one."""
-        return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0))
+        return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0), self.k1)
 
     def moved(self, step: Array) -> Poses:
         """Give the poses moved by a step (6 F,)."""
         step = step.reshape(-1, 6)
         turns = rotation_exp(step[:, :3])
-        return Poses(turns @ self.R, times(turns, self.t) + step[:, 3:])
+        return Poses(turns @ self.R, times(turns, self.t) + step[:, 3:], self.k1)
 
     def step_from(self, other: Poses) -> Array:
         """Give the step (6 F,) that moves other poses to these, to first order."""
@@ -139,10 +152,10 @@ class Landmarks:
 
     anchors: (N,) frames that saw them first; found: (N, 2) pixels there, around which their
     patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
-    where they are taken to be; rho: (N,) inverse depths there; slopes: (N, 2) by which share these
-    change around them, a pixel; strengths: (N,) how much their patches differ from pixel to pixel;
-    minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)``
-    is white; seen: (N, F) where the last two mean anything.
+    where they would be seen without k1; rho: (N,) inverse depths there; slopes: (N, 2) by which
+    share these change around them, a pixel; strengths: (N,) how much their patches differ from
+    pixel to pixel; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
+    ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
     """
 
     anchors: NDArray[np.int64]
@@ -160,11 +173,12 @@ class Landmarks:
         return len(self.rho)
 
     @classmethod
-    def at(cls, points: Array, rho: Array, anchor: int, frames: int,
+    def at(cls, found: Array, rho: Array, anchor: int, frames: int, points: Array | None = None,
            slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
         """Make landmarks that no other frame has seen yet; without slopes they face the camera."""
         n = len(rho)
-        return cls(np.full(n, anchor, np.int64), points, np.zeros((n, 2, 2)), points, rho,
+        return cls(np.full(n, anchor, np.int64), found, np.zeros((n, 2, 2)),
+                   found if points is None else points, rho,
                    np.zeros((n, 2)) if slopes is None else slopes,
                    np.ones(n) if strengths is None else strengths, np.zeros((n, frames, 2)),
                    np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
@@ -210,10 +224,36 @@ def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
 
 
-def projected(K: Array, places: Array) -> Array:
+def projected(K: Array, places: Array, k1: float = 0.0) -> Array:
     """Project places (N, 3) in a camera to pixels (N, 2); what is behind it goes far out."""
-    image = places @ K.T
-    return np.clip(image[:, :2] / np.maximum(image[:, 2:], _NEAREST), -_FAR_OUT, _FAR_OUT)
+    u = places[:, :2] / np.maximum(places[:, 2:], _NEAREST)
+    return np.clip((u * _stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_FAR_OUT, _FAR_OUT)
+
+
+def _stretch(u: Array, k1: float) -> Array:
+    """By what k1 multiplies points (N, 2), (N, 1)."""
+    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -_FARTHEST, _FARTHEST))
+
+
+def straightened(K: Array, pixels: Array, k1: float) -> Array:
+    """Tell where pixels (N, 2) were without k1."""
+    seen = rays(K, pixels)[:, :2]
+    u = seen
+    for _ in range(_STRAIGHTENINGS):
+        u = seen / _stretch(u, k1)
+    return np.asarray(u @ K[:2, :2].T + K[:2, 2])
+
+
+def _bending(K: Array, u: Array, k1: float) -> tuple[Array, Array]:
+    """
+    How pixels of points (N, 2) move with where they were without k1, (N, 2, 2), and over k1.
+
+    The latter is (N, 2).
+    """
+    by_point = 2 * k1 * u[:, :, None] * u[:, None]
+    by_point[:, [0, 1], [0, 1]] += _stretch(u, k1)
+    by_pixel = K[:2, :2] @ by_point @ inverse_of(K)[:2, :2]
+    return by_pixel, (u * (u * u).sum(1, keepdims=True)) @ K[:2, :2].T
 
 
 @dataclass(frozen=True)
@@ -222,9 +262,9 @@ class Observed:
     M observations of N landmarks: see ``observe``.
 
     landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); off: (N, 2) residuals of
-    the points, held: (N, 2, 2) how they change. R (M, 3, 3), t (M, 3), ray (M, 3), rho (M,):
-    motion from the anchor to the frame, and the landmark there; place (M, 3): R ray + rho t; root:
-    (M, 2, 2) of the precision.
+    the points, held: (N, 2, 2) roots of their precision. R (M, 3, 3), t (M, 3), ray (M, 3), rho
+    (M,): motion from the anchor to the frame, and the landmark there; place (M, 3): R ray + rho t;
+    root: (M, 2, 2) of the precision; straight: (N, 2) X/Z, Y/Z of the points.
     """
 
     landmark: NDArray[np.int64]
@@ -234,6 +274,8 @@ class Observed:
     off: Array
     held: Array
     K: Array
+    k1: float
+    straight: Array
     R: Array
     t: Array
     ray: Array
@@ -248,34 +290,53 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     motions = poses.between()
     R, t = motions[0][frame, anchor], motions[1][frame, anchor]
-    ray = rays(K, landmarks.points)[landmark]
+    rays_of_points = rays(K, landmarks.points)
+    ray = rays_of_points[landmark]
     place = times(R, ray) + rho[:, None] * t
     root = landmarks.roots[landmark, frame]
     return Observed(
         landmark, frame, anchor,
-        times(root, projected(K, place) - landmarks.minima[landmark, frame]),
-        times(landmarks.held, landmarks.points - landmarks.found), landmarks.held,
-        K, R, t, ray, rho, place, root)
+        times(root, projected(K, place, poses.k1) - landmarks.minima[landmark, frame]),
+        times(landmarks.held, projected(K, rays_of_points, poses.k1) - landmarks.found),
+        landmarks.held, K, poses.k1, rays_of_points[:, :2], R, t, ray, rho, place, root)
 
 
 @dataclass(frozen=True)
 class Jacobians:
     """
-    How M residuals change: see ``jacobians``.
+    How the residuals of M observations and N points change: see ``jacobians``.
 
     by_frame, by_anchor: (M, 2, 6) over the steps of the two poses; by_own: (M, 2, 3) over those of
-    the landmark's inverse depth and point.
+    the landmark's inverse depth and point; by_k1: (M, 2). Those of the points over their own steps
+    (N, 2, 2), and over k1 (N, 2).
     """
 
     by_frame: Array
     by_anchor: Array
     by_own: Array
+    by_k1: Array
+    points_by_own: Array
+    points_by_k1: Array
+
+
+def _through_the_lens(observed: Observed) -> tuple[Array, Array, Array, Array]:
+    """
+    How residuals move with where k1 has not moved pixels yet, and over k1 itself.
+
+    Those of observations (M, 2, 2) and (M, 2), and of points (N, 2, 2) and (N, 2).
+    """
+    seen = observed.place[:, :2] / np.maximum(observed.place[:, 2:], _NEAREST)
+    bent, by_k1 = _bending(observed.K, np.concatenate([seen, observed.straight]), observed.k1)
+    roots, count = np.concatenate([observed.root, observed.held]), len(seen)
+    bent, by_k1 = roots @ bent, times(roots, by_k1)
+    return bent[:count], by_k1[:count], bent[count:], by_k1[count:]
 
 
 def jacobians(observed: Observed) -> Jacobians:
-    """Differentiate the residuals of observations."""
+    """Differentiate the residuals of observations and of points."""
     K, R, place, ray = observed.K, observed.R, observed.place, observed.ray
-    scaled = observed.root @ K[:2, :2] / np.maximum(place[:, 2], _NEAREST)[:, None, None]
+    root, *others = _through_the_lens(observed)
+    scaled = root @ K[:2, :2] / np.maximum(place[:, 2], _NEAREST)[:, None, None]
     # Of the projection: d(x / z) = (dx - x / z dz) / z.
     ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _NEAREST)
     by_place = np.concatenate([scaled, ahead[:, :, None]], axis=2)
@@ -290,7 +351,8 @@ def jacobians(observed: Observed) -> Jacobians:
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
     np.matmul(by_turned, inverse_of(K)[:, :2], out=by_own[:, :, 1:])
-    return Jacobians(by_frame, by_anchor, by_own)
+    by_k1, points_by_own, points_by_k1 = others
+    return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
 
 
 def _cross(a: Array, b: Array, out: Array) -> None:
@@ -320,24 +382,51 @@ def noise_scale(observed: Observed) -> float:
     return float(np.sqrt(np.median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
 
 
+class OfK1(NamedTuple):
+    """What observations tell of k1, all else free: its information, and the step to the best."""
+
+    curvature: float
+    step: float
+
+
 @dataclass(frozen=True)
 class Reduced:
     """
     Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
 
-    change gives what becomes of the landmarks with a step of the poses.
+    Those of k1 before them, in the whole. change gives what becomes of the landmarks with a step
+    of the poses.
     """
 
-    H: Array
-    g: Array
+    _whole: Array
+    _gradient: Array
     _coupling: Array
     _variances: Array
     _slopes: Array
 
+    @property
+    def H(self) -> Array:
+        """Give (6 F, 6 F), at a k1 that is known."""
+        return self._whole[1:, 1:]
+
+    @property
+    def g(self) -> Array:
+        """Give (6 F,)."""
+        return self._gradient[1:]
+
+    def of_k1(self) -> OfK1:
+        """Take out the poses too, as if nothing else were known of them, and leave k1."""
+        row, H = self._whole[0, 1:], self.H
+        # Where all is, and how large, is open and does not matter.
+        gain = np.linalg.solve(H + np.diag(_OPEN * np.diag(H) + _HARDLY), row)
+        curvature = float(self._whole[0, 0] - gain @ row)
+        slope = float(self._gradient[0] - gain @ self.g)
+        return OfK1(curvature, -slope / curvature if curvature > 0 else 0.0)
+
     def change(self, step: Array) -> Array:
         """Give the steps (N, 3) of landmarks that go with a step (6 F,) of the poses."""
         return np.asarray(-np.einsum('nij,nj->ni', self._variances,
-                                     self._slopes + self._coupling @ step))
+                                     self._slopes + self._coupling[:, :, 1:] @ step))
 
 
 def eliminate(observed: Observed, weights: Array, weight: float, frames: int) -> Reduced:
@@ -347,25 +436,33 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
     weights: (M,) of the observations; weight: that of where the landmarks were found.
     """
     if compiled.library is not None:
-        o = observed
+        o, (root, by_k1, held, held_by_k1) = observed, _through_the_lens(observed)
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
-            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
-            (o.held, o.off, weight), (o.K, inverse_of(o.K)), (_NEAREST, _TRACE), frames))
+            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, root, by_k1, weights),
+            (held, held_by_k1, o.off, weight), (o.K, inverse_of(o.K)), (_NEAREST, _TRACE),
+            frames))
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
+    by_k1 = linear.by_k1[:, :, None] * root
     e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
-    J = np.zeros((count, 2, frames, 6))
-    rows = np.arange(count)
-    J[rows, :, observed.frame], J[rows, :, observed.anchor] = by_frame, by_anchor
-    flat = J.reshape(-1, 6 * frames)
+    J = np.zeros((count, 2, 1 + 6 * frames))
+    J[:, :, :1] = by_k1
+    rows, by_poses = np.arange(count), np.zeros((count, 2, frames, 6))
+    by_poses[rows, :, observed.frame], by_poses[rows, :, observed.anchor] = by_frame, by_anchor
+    J[:, :, 1:] = by_poses.reshape(count, 2, 6 * frames)
+    flat = J.reshape(-1, 1 + 6 * frames)
     H, g = flat.T @ flat, flat.T @ e.ravel()
+    own, by_lens = linear.points_by_own, linear.points_by_k1
+    H[0, 0] += weight * (by_lens * by_lens).sum()
+    g[0] += weight * (by_lens * observed.off).sum()
     information, slopes = np.tile(np.eye(3) * _TRACE, (n, 1, 1)), np.zeros((n, 3))
-    transposed = observed.held.transpose(0, 2, 1) * weight
-    information[:, 1:, 1:] += transposed @ observed.held
+    transposed = own.transpose(0, 2, 1) * weight
+    information[:, 1:, 1:] += transposed @ own
     slopes[:, 1:] = times(transposed, observed.off)
-    coupling = np.zeros((n, frames, 3, 6))
+    with_k1, coupling = np.zeros((n, 3, 1)), np.zeros((n, frames, 3, 6))
+    with_k1[:, 1:, 0] = times(transposed, by_lens)
     if count:
         # Each landmark is seen once by a frame, and has one anchor.
         coupling[observed.landmark, observed.frame] = back @ by_frame
@@ -374,8 +471,10 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
         coupling[seen, anchor] = np.add.reduceat(back @ by_anchor, first)
         information[seen] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
         slopes[seen] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
-    coupled = coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)
+        with_k1[seen] += np.add.reduceat(back @ by_k1, first)
+    coupled = np.concatenate(
+        [with_k1, coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
     variances = np.asarray(np.linalg.inv(information), float)
-    gain = (variances @ coupled).reshape(-1, 6 * frames).T
-    return Reduced(H - gain @ coupled.reshape(-1, 6 * frames), g - gain @ slopes.ravel(),
+    gain = (variances @ coupled).reshape(-1, 1 + 6 * frames).T
+    return Reduced(H - gain @ coupled.reshape(-1, 1 + 6 * frames), g - gain @ slopes.ravel(),
                    coupled, variances, slopes)

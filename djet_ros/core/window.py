@@ -30,6 +30,7 @@ from djet_ros.core.bundle import (
     Poses,
     projected,
     Reduced,
+    straightened,
 )
 from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -49,6 +50,7 @@ from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import place_all, Placed
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
     CLOSE,
@@ -148,7 +150,8 @@ class Window:
 
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
 
-    settled: (M, 3) places, in the newest frame, of landmarks that it was the last to refine.
+    settled: (M, 3) places, in the newest frame, of landmarks that it was the last to refine; lens:
+    what is known of the distortion of its images.
     """
 
     def __init__(self, config: EstimatorConfig, tuning: WindowTuning = WINDOW_TUNING) -> None:
@@ -162,6 +165,7 @@ class Window:
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
+        self.lens = SelfCalibration.unknown(view.K, view.gray.shape)
         self._scale = 1.0
         # The newest camera as it was told, seen from the oldest keyframe; its pose may have been
         # refined since.
@@ -211,6 +215,7 @@ class Window:
             self._settle(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
             self._forget(len(self._views) - 2)
         if sum(self._is_keyframe) > self._tuning.keyframes:
+            self._learn_lens()
             self._settle(self._landmarks.anchors == 0)
             self._forget(0)
         if relative.t.any():
@@ -233,6 +238,14 @@ class Window:
         places = in_frame(self._K, self._poses, sure, len(self._views) - 1)
         return np.asarray(places / sure.rho[:, None])
 
+    def _projected(self, places: Array) -> Array:
+        """Project places (N, 3) in a camera to pixels (N, 2) as its lens shows them."""
+        return projected(self._K, places, self._poses.k1)
+
+    def _rays(self, pixels: Array) -> Array:
+        """Take pixels (N, 2) as the lens shows them to their viewing rays (N, 3), with z = 1."""
+        return rays(self._K, straightened(self._K, pixels, self._poses.k1))
+
     def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
         """
         Length of the pair, and by which share it may be off.
@@ -249,16 +262,16 @@ class Window:
             known, match = self._near(x, *self._depths_of(*self._latest))
         if len(known) < self._tuning.few:
             return unknown
-        in_units, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x[match]),
-                                         rays(self._K, y[match]))
+        in_units, sigma = inverse_depths(relative.R, relative.t, self._rays(x[match]),
+                                         self._rays(y[match]))
         length = _weighted_median(in_units / known, known / sigma)
         return (length, self._tuning.told) if length > 0 else unknown
 
     def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
         """Pixels (N, 2) of a pair's inliers in its second frame, and inverse depths (N,) there."""
         y = relative.y_opt[relative.inliers]
-        rays_x = rays(self._K, relative.x[relative.inliers])
-        rho, _ = inverse_depths(relative.R, relative.t, rays_x, rays(self._K, y))
+        rays_x = self._rays(relative.x[relative.inliers])
+        rho, _ = inverse_depths(relative.R, relative.t, rays_x, self._rays(y))
         depths = (rays_x @ relative.R.T + rho[:, None] * relative.t)[:, 2]
         ahead = (rho > 0) & (depths > 0)
         return y[ahead], rho[ahead] / (depths[ahead] * length)
@@ -272,7 +285,7 @@ class Window:
         before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
         places = in_frame(self._K, self._poses, before, len(self._views) - 1)
         ahead = places[:, 2] > 0
-        return self._near(x, projected(self._K, places[ahead]),
+        return self._near(x, self._projected(places[ahead]),
                           before.rho[ahead] / places[ahead, 2])
 
     def _near(self, x: Array, points: Array, rho: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -298,8 +311,8 @@ class Window:
         known, match = self._beside(x, newest)
         if not len(known):
             return 0, 0
-        in_units, sigma = inverse_depths(pose.R, pose.t, rays(self._K, x[match]),
-                                         rays(self._K, y[match]))
+        in_units, sigma = inverse_depths(pose.R, pose.t, self._rays(x[match]),
+                                         self._rays(y[match]))
         ratios = in_units / known
         # By what is near, which tells most but may be another body, or by all alike.
         lengths = np.array([[_weighted_median(ratios, known / sigma)], [np.median(ratios)]])
@@ -323,7 +336,7 @@ class Window:
         few = len(here) < (1 - self._tuning.gone) * self._tuning.landmarks
         if not few:
             turn = self._poses.R[newest] @ self._poses.R[last].T
-            turned, moved = (projected(self._K, places) for places in (
+            turned, moved = (self._projected(places) for places in (
                 in_frame(self._K, self._poses, here, last) @ turn.T,
                 in_frame(self._K, self._poses, here, newest)))
             way = np.median(np.linalg.norm(moved - turned, axis=1))
@@ -369,13 +382,13 @@ class Window:
         tuning, anchor = self._tuning, len(self._views) - 2
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        rho, sigma = inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
+        rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
         ahead, off = rho > 0, tuning.off / self._K[0, 0] * sigma
         surfaces = x[ahead], rho[ahead], off[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].tested.shape)
         x, rho = x[usable], rho[usable]
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
-        present = projected(self._K, in_frame(self._K, self._poses, here, anchor))
+        present = self._projected(in_frame(self._K, self._poses, here, anchor))
         side = tuning.cell * np.sqrt(self._views[anchor].tested.size / tuning.landmarks)
         # Near ones tell most, but by their own noisy depths those would be chosen that err most,
         # and each step come out shorter: by 6 % in 300 small pictures. Others tell where is near.
@@ -385,14 +398,15 @@ class Window:
         chosen = _spread(x, present, side, tuning.landmarks - len(here))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
-            x, rho / length, anchor, len(self._views), slopes(*surfaces, x),
+            x, rho / length, anchor, len(self._views),
+            straightened(self._K, x, self._poses.k1), slopes(*surfaces, x),
             self._distances.strengths(self._views[anchor].tested, np.rint(x).astype(np.int64))))
 
     def _measure(self) -> None:
         """Sample the surfaces of landmarks in the newest frame, where they are expected."""
         landmarks, newest = self._landmarks, len(self._views) - 1
         places = in_frame(self._K, self._poses, landmarks, newest)
-        expected = projected(self._K, places)
+        expected = self._projected(places)
         radius = self._config.window // 2
         here = self._views[newest]
         wanted = (places[:, 2] > 0) & ~at(here.mask, expected) & self._distances.describable(
@@ -559,6 +573,22 @@ class Window:
         mended[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
         mended[:3, 3] = share * refined[:3, 3]
         return np.asarray(mended @ np.linalg.inv(before) @ newest)
+
+    def _learn_lens(self) -> None:
+        """
+        Ask the window which k1 suits it, before its oldest keyframe goes.
+
+        As each landmark is in as many windows as there are keyframes, each of them tells so much
+        less. What frames that are gone told stays as it was with the k1 of then.
+        """
+        observed = observe(self._K, self._poses, self._landmarks)
+        told = self._reduced(observed).of_k1()
+        _, weights = self._robustly(observed, self._scale)
+        if told.curvature > 0:
+            self.lens = self.lens.told(
+                self._poses.k1 + told.step, self._tuning.keyframes / told.curvature,
+                self._scale * np.sqrt(told.curvature / weights.sum()))
+            self._poses = replace(self._poses, k1=self.lens.k1)
 
     def _settle(self, chosen: NDArray[np.bool_]) -> None:
         """Take what some landmarks tell into the prior, and drop them, before a frame goes."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, View
 from djet_ros.core.window import Addition, Window
 from djet_ros.odometry.scale import Common, Length, ScaleSource, unknown
@@ -100,6 +101,11 @@ class OneScale:
     def keyframe(self) -> bool | None:
         """Whether the newest frame of the track is a keyframe; None where none are chosen."""
         return self._window.is_keyframe if self._carried else None
+
+    @property
+    def lens(self) -> SelfCalibration | None:
+        """Tell what distortion images still have by their landmarks; None without these."""
+        return self._window.lens if self._carried and self._speed is not None else None
 
     @property
     def is_new(self) -> bool:

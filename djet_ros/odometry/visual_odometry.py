@@ -8,6 +8,7 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import agrees, fused, Turn
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.starts import Known
 from djet_ros.core.types import (
     Array,
@@ -150,6 +151,11 @@ class VisualOdometry:
         settled: of those that are not refined any more from that frame on, instead.
         """
         return self._one_scale.landmarks(settled)
+
+    @property
+    def lens(self) -> SelfCalibration | None:
+        """Tell what landmarks have shown of the lens; None where there are none."""
+        return self._one_scale.lens
 
     def reset(self) -> None:
         """Forget everything, of the scale's source too; the next frame is the first."""

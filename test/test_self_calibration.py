@@ -1,0 +1,55 @@
+"""What windows tell of a distortion: nothing at first, and in the end what turns say."""
+
+from __future__ import annotations
+
+from djet_ros.core.self_calibration import SelfCalibration
+import numpy as np
+import pytest
+
+K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
+
+# Pixels that a k1 of one leaves of itself in a window: see SelfCalibration.told.
+STRAIGHT, TURN = 0.5, 8.0
+
+
+def heard(windows: list[tuple[float, float, float]]) -> SelfCalibration:
+    lens = SelfCalibration.unknown(K, (376, 1241))
+    for window in windows:
+        lens = lens.told(*window)
+    return lens
+
+
+def test_before_anything_is_told_the_calibration_is_right() -> None:
+    lens = SelfCalibration.unknown(K, (376, 1241))
+    assert lens.k1 == 0
+    # It may be off by a hundredth of where the corner is.
+    corner = np.array([1241 - 620, 376 - 180]) / 700
+    assert lens.sigma * (corner @ corner) == pytest.approx(0.01)
+
+
+def test_what_straight_roads_tell_alike_is_not_taken_for_a_distortion() -> None:
+    lens = heard([(0.02, 0.005**2, STRAIGHT)] * 500)
+    assert abs(lens.k1) < 0.005
+    assert lens.sigma > 0.5 * lens.first
+
+
+def test_turns_tell_it_from_what_looks_like_it_on_straight_roads() -> None:
+    roads = [(0.02, 0.005**2, STRAIGHT)] * 50
+    lens = heard(roads + [(0.01, 0.001**2, TURN)] * 20)
+    assert lens.k1 == pytest.approx(0.01, abs=2 * lens.sigma)
+    # 0.01 too much, where a k1 of one leaves half a pixel.
+    assert lens.mean[1] == pytest.approx(0.005, abs=2 * np.sqrt(lens.covariance[1, 1]))
+
+
+def test_noise_makes_no_distortion() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        lens = heard([(0.004 * rng.normal(), 0.004**2, TURN) for _ in range(30)])
+        assert abs(lens.k1) < 0.2 * lens.sigma
+
+
+def test_windows_that_differ_by_more_than_their_noise_do_not_make_it_sure() -> None:
+    # No lens is off by k1 alone.
+    exact = heard([(0.01, 0.0, TURN)] * 2)
+    assert exact.sigma > 0.1 * exact.first
+    assert np.linalg.eigvalsh(exact.covariance)[0] > 0
