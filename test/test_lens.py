@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 from djet_ros.cli.main import main
 from djet_ros.config.sections import Config, OdometryConfig
-from djet_ros.core.covariance import LARGE_CELLS, SHIFT
+from djet_ros.core.covariance import LARGE_CELLS
 from djet_ros.core.geometry import rotation_exp, rotation_log, unit
 from djet_ros.core.lens import (
     by_radius,
@@ -18,6 +18,7 @@ from djet_ros.core.lens import (
     linearise,
     MatchedPair,
     MOST_MATCHES,
+    SHIFT,
 )
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 from djet_ros.errors import DjetError

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from djet_ros.core.cells import beginnings
 from djet_ros.core.geometry import rotation_log, sphere_tangents
-from djet_ros.core.jet import Loss, Residuals
+from djet_ros.core.jet import LEAST_CURVED, Loss, Residuals
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 # Matches in one cell of this side (pixels) are taken to err together: corners are found in several
 # sizes, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
 CELL = 32
 
-# Into so many cells the matches are cut too. What errs together over longer distances, such as a
-# patch's perspective or a haze, is seen by these, each of which errs by itself.
+# Into so many cells the matches are cut too: none of these may hold all that is known either.
 LARGE_CELLS = 20
 
-# Sides of large cells over that; several, for a few cells tell how much they vary to a third only.
-_SIDES = (2 / 3, 3 / 2)
+# What two small cells err alike, by whether they share one of 64, 128, 256 or 512 pixels. Chosen:
+# it halves from one to the next; on scenes rendered with seeds 0-4 it fell to 0.2 to 0.55.
+_FARTHER = np.array([1, 1 / 2, 1 / 4, 1 / 8])
 
 # Squared errors over a covariance that v normal errors tell are Hotelling's T^2: its bound of 99.9
-# % in five directions is that of chi^2 times 1 + 13 / v + 220 / v^2, where v is above 15. Chosen:
-# somewhat more, 1 + 20 / v + 300 / v^2, as errors have longer tails than normal ones. C cells that
-# are alike tell v = 5 C errors; their shares of the whole, squared and summed up, are 1 / C.
-_HARDLY_TOLD = 20 / 5, 300 / 25
+# % in five directions is that of chi^2 times 1 + 13 / v + 220 / v^2 + 4e6 / v^6, to a tenth of
+# what is above 1, where v is above 8. C cells that are alike tell v = 5 C errors; their shares of
+# the whole, squared and summed up, are 1 / C = 5 / v.
+_HOTELLING = 13 / 5, 220 / 5**2, 4e6 / 5**6
 
-# chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large
-# cell by, as a share of the noise of a match.
-SHIFT = 0.12
+# chosen: errors with longer tails than normal ones tell a variance as fewer of those would; 1.5
+# times fewer where the kurtosis is 4, not 3.
+_LONG_TAILS = 1.5
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -66,33 +66,29 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     length. All NaN where the matches do not determine the pose, only those of one cell do, or
     they lie in too few cells.
 
-    The noise is that of the residuals themselves, in whichever of the two images it arose: see
-    `_jackknife`. Many small cells tell the shape of the covariance, and of how many errors: where
-    few decide about a direction, it is less sure than they say. Larger ones, which hold what errs
-    together from one small cell to the next, tell how the size grows with theirs, see `_growth`;
-    it is that of one as large as the image. What no residual shows comes to that: all that is seen
-    in a large cell may be shifted a little.
+    The noise is that of the residuals themselves, in whichever of the two images it arose. Small
+    cells tell how large it is, and of what shape, see `_jackknife`; how much these err alike is
+    told by their errors, see `_alike`. Where few decide about a direction, it is less sure than
+    they say: see `_hardly_told`.
     """
     J = residuals.jacobian
     squared = residuals.r**2
     _, weights = loss(squared)
-    # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6).
-    flattening = loss.curvature(squared).mean() / weights.mean() if len(squared) else 0.0
     H = (J * weights) @ J.T
-    if not np.isfinite(H).all() or flattening <= 0 or np.linalg.cond(H) > 1e12:
+    if not np.isfinite(H).all() or np.linalg.cond(H) > 1e12:
         return UNKNOWN
+    flattened = _flattened(H, (J * loss.curvature(squared)) @ J.T)
     cells = _Cells.of(H, places, J, weights, residuals.r)
-    side = max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL)
-    large = cells.in_larger(side)
-    if cells.without is None or large.without is None:
+    large = cells.in_larger(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS))
+    if flattened is None or cells.without is None or large.without is None:
         return UNKNOWN
-    others = [cells.in_larger(other) for other in (2 * CELL, *(size * side for size in _SIDES))]
-    reach = float(np.ptp(places, axis=0).max())
-    growth = _growth(cells.size(cells.without), [large, *others], reach)
-    noise = (weights * squared).sum() / weights.sum()
-    shifts = SHIFT * cells.inverse @ large.pulls
-    covariance = (growth / flattening**2 * _jackknife(cells, cells.without, growth)
-                  + noise * shifts @ shifts.T)
+    size = cells.size(cells.without)
+    by_itself = _jackknife(cells, cells.without)
+    noise = float((weights * squared).sum() / weights.sum())
+    covariance = by_itself + _alike(cells, by_itself, size, noise)
+    growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
+    covariance += growth * size * _hardly_told(cells, growth)
+    covariance = flattened @ covariance @ flattened.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
@@ -101,19 +97,34 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
+def _flattened(H: Array, curvature: Array) -> Array | None:
+    """
+    Give what a pose moves by (5, 5) over what it would by H, the loss's weights (5, 5).
+
+    A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6), and
+    least along a direction that uncertain matches tell. None where it does not curve upwards.
+    """
+    root = np.linalg.cholesky(H)
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ curvature @ inverse.T)
+    if shares.sum() <= 0:
+        return None
+    return np.asarray(inverse.T @ (axes / np.maximum(shares, LEAST_CURVED)) @ axes.T @ root.T)
+
+
 @dataclass(frozen=True)
 class _Cells:
     """
     What the matches of C cells tell together.
 
-    whole: (5, 5) H of all, and its inverse; side: of a cell in pixels; places: (C, 2) in them;
-    sums: (25, C), one row after the other the upper triangle of H (5, 5) of their loss, its
-    gradient (5,), and how that changes where all residuals of a cell grow alike (5,).
+    whole: (5, 5) H of all, and its inverse; places: (C, 2) pixels in them; sums: (27, C), one row
+    after the other the upper triangle of H (5, 5) of their loss, its gradient (5,), how that
+    changes where all residuals of a cell grow alike (5,), and their weighted residuals and
+    weights.
     """
 
     whole: Array
     inverse: Array
-    side: float
     places: Array
     sums: Array
 
@@ -124,8 +135,9 @@ class _Cells:
         J, weights, r = J.take(order, axis=1), weights[order], r[order]
         weighed = J * weights
         rows, columns = _UPPER
-        terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed])
-        return cls(H, np.asarray(np.linalg.inv(H)), CELL,
+        terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed,
+                                [weights * r, weights]])
+        return cls(H, np.asarray(np.linalg.inv(H)),
                    (places[order[first]] // CELL + 0.5) * CELL,
                    np.add.reduceat(terms, first, axis=1))
 
@@ -133,7 +145,7 @@ class _Cells:
         """Give larger cells, each made of whole small ones; places are those of one of them."""
         side = max(side, CELL)
         order, first = _by_cell(self.places, side)
-        return _Cells(self.whole, self.inverse, side, self.places[order[first]],
+        return _Cells(self.whole, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
 
     def __len__(self) -> int:
@@ -147,12 +159,12 @@ class _Cells:
     @property
     def gradients(self) -> Array:
         """Give (5, C)."""
-        return self.sums[-10:-5]
+        return self.sums[15:20]
 
     @property
     def pulls(self) -> Array:
         """Give (5, C)."""
-        return self.sums[-5:]
+        return self.sums[20:25]
 
     @cached_property
     def without(self) -> Array | None:
@@ -172,43 +184,19 @@ class _Cells:
                 return None
         return np.asarray(np.linalg.inv(self.whole - self.H))
 
-    @cached_property
-    def shares(self) -> Array:
-        """Tell what each cell is of the whole, H^-1 H_c (C, 5, 5)."""
-        return np.asarray(self.inverse @ self.H)
-
-    def errors(self) -> float:
-        """Tell how many independent errors there are, were cells all alike (Satterthwaite)."""
-        return 25 / float((self.shares * self.shares.transpose(0, 2, 1)).sum())
+    def pairs(self) -> tuple[Array, Array]:
+        """Sum products of residuals, of weights (2,) and of pulls (5, 5) within the same cell."""
+        return (self.sums[25:]**2).sum(1), self.pulls @ self.pulls.T
 
     def size(self, without: Array) -> float:
         """
-        Size of the covariance that is told, over H^-1, summed over the five directions.
+        Size of the covariance that is told, over H^-1, on average over the five directions.
 
         Where cells err by themselves, it is the same for any size of them: by (H - H_c)^-1 in
         place of H^-1 it has no bias (Bell and McCaffrey, Survey Methodology 2002).
         """
         moves = np.einsum('cij,jc->ic', without, self.gradients)
-        return float((moves * self.gradients).sum()) + _LEAST_VARIANCE
-
-
-def _growth(least: float, larger: Sequence[_Cells], reach: float) -> float:
-    """
-    Tell how much larger the variances are than small cells have them, which do not err one by one.
-
-    They grow by a power of the side of cells, which several larger ones tell, each as well as it
-    has independent errors. least: size by small ones; reach: in pixels, between the outermost
-    matches: as large as the cell that holds all.
-    """
-    octaves, sizes, errors = [], [], []
-    for cells in larger:
-        if cells.without is not None:
-            octaves.append(np.log2(cells.side / CELL))
-            sizes.append(np.log2(cells.size(cells.without) / least))
-            errors.append(cells.errors())
-    weighed = np.array(errors) * octaves
-    power = max(weighed @ sizes / max(weighed @ octaves, 1e-9), 0.0)
-    return float(max(reach / CELL, 1.0)**power)
+        return float((moves * self.gradients).sum()) / 5 + _LEAST_VARIANCE
 
 
 def difference(R: Array, t: Array, other: Pose) -> Array:
@@ -265,26 +253,63 @@ def lift(tangents: Array) -> Array:
     return lifted
 
 
-def _jackknife(cells: _Cells, without: Array, together: float) -> Array:
+def _jackknife(cells: _Cells, without: Array) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
     without: (C, 5, 5), see ``_Cells``. A delete-a-group jackknife, to first order (Bell and
     McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their moves say
     little; so the mean is taken of the moves that are seen and of those that noise would make,
-    which are large there, at the size that has the seen ones on average. The fewer decide, the
-    less is known of that mean too. together: by what the variances grow as cells err together;
-    chosen: that leaves its root fewer errors.
+    which are large there, at the size that has the seen ones on average.
     """
     moves = np.einsum('cij,jc->ic', without, cells.gradients)
-    seen = moves @ moves.T
+    seen = moves @ moves.T + _LEAST_VARIANCE * cells.inverse
     by_noise = without.sum(0) - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    few = np.sqrt(together) * (cells.shares @ cells.shares).sum(0)
-    first, second = _HARDLY_TOLD
-    hardly_told = (first * few + second * few @ few) @ cells.inverse
-    return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2
-                      + cells.size(without) / 5 * hardly_told)
+    return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
+
+
+def _alike(cells: _Cells, by_itself: Array, size: float, noise: float) -> Array:
+    """
+    Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
+
+    Residuals of pairs of cells are multiplied; as the pose follows what all have in common, too
+    little is left of that, by what its covariance and its own share make of the pulls. The product
+    over its weight falls with distance as `_FARTHER` has it; how large it is, one number, is told
+    with an error that is about normal, and it is not below zero: of that the mean is taken, so
+    that pairs are less sure where few cells tell it. noise: variance of a match, which bounds it.
+    """
+    larger = [cells, *(cells.in_larger(2 * CELL * 2**k) for k in range(len(_FARTHER)))]
+    products, pulls = (np.diff(parts, axis=0) for parts in zip(*(one.pairs() for one in larger)))
+    field = np.tensordot(_FARTHER, pulls, 1)
+    left = cells.inverse @ field @ cells.inverse
+    found = products[:, 0] + (pulls * by_itself).sum((1, 2))
+    expected = _FARTHER * products[:, 1] - (pulls * left).sum((1, 2))
+    weighed = expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
+    known = float(weighed @ expected)
+    if known <= 0:
+        return np.zeros((5, 5))
+    return min(_mean_above_zero(float(weighed @ found) / known, known**-0.5), noise) * left
+
+
+def _mean_above_zero(value: float, deviation: float) -> float:
+    """Give the mean of a normal distribution, cut off below zero."""
+    x = value / deviation
+    return float(value + deviation * np.exp(-x * x / 2 - log_ndtr(x)) / np.sqrt(2 * np.pi))
+
+
+def _hardly_told(cells: _Cells, growth: float) -> Array:
+    """
+    Give by what (5, 5), over a size of one, few cells make a covariance less sure.
+
+    growth: by what the variances grow as cells err alike; chosen: that leaves its root fewer.
+    """
+    shares = cells.inverse @ cells.H
+    few = _LONG_TAILS * np.sqrt(growth) * (shares @ shares).sum(0)
+    first, second, sixth = _HOTELLING
+    square = few @ few
+    return np.asarray((first * few + second * square + sixth * square @ square @ square)
+                      @ cells.inverse)
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:

@@ -33,8 +33,7 @@ _BLOCK = 2048
 _WARPED_BLOCK = 256
 
 # Pixels by which the farthest ends of tests may be off, for when driving, a warp's derivative will
-# do. All of a patch is off by a seventh of that, and a covariance takes twice as much for
-# granted (`covariance.SHIFT`).
+# do. All of a patch is off by a seventh of that, a twentieth of the noise of a match.
 _BENT = 0.02
 
 # chosen: no part of a patch is nearer, or farther, than its middle by a larger factor.

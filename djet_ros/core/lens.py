@@ -21,7 +21,7 @@ from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 from djet_ros.core.cells import cells_of
-from djet_ros.core.covariance import LARGE_CELLS, SHIFT
+from djet_ros.core.covariance import LARGE_CELLS
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
 from djet_ros.core.jet import (
@@ -74,6 +74,10 @@ _BEND = 3.0
 
 # Pixels; matches that are off by less are exact, and must not divide by nothing.
 _LEAST_NOISE = 1e-4
+
+# chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large
+# cell by, in all pairs alike, as a share of the noise of a match.
+SHIFT = 0.12
 
 # Groups of pairs in a row of which the jackknife leaves out one at a time.
 _GROUPS = 10
@@ -359,8 +363,7 @@ def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
     """
     Give the standard error of k1 by what no residual shows: all that is seen in a cell is shifted.
 
-    It is what covariances have too, but in all pairs alike, as sampling and the lens go with the
-    place in the image.
+    It is so in all pairs alike, as sampling and the lens go with the place in the image.
     """
     seen = np.concatenate([lens.pixels(one.pair.y, lens.k1)[0] for one in linearised])
     side = max(float(np.sqrt(np.ptp(seen, axis=0).prod() / LARGE_CELLS)), 1.0)
