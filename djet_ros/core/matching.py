@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from djet_ros.core.features import match_everywhere, match_nearby
 from djet_ros.core.flow import FAR, follow, NEAR, reach_of_levels
+from djet_ros.core.geometry import fit_rotation, rays
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.paraboloid import quantile
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
@@ -75,11 +76,44 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
                  for levels in (NEAR, FAR))
     R = prior.R if known.guess is None else known.guess.R
-    found = _follow_on(previous, current, prior, R, near, NEAR)
-    if found is None:
-        R = likely_rotation(previous.features, current.features, current.K, [R], far)
-        found = _follow_on(previous, current, prior, R, far, FAR)
-    return found
+    foreseen = foresee(previous.features, current.K, R, prior)
+    y, bits = follow(previous, current, foreseen, near, NEAR)
+    if _strays(y, bits, foreseen, near):
+        R = _turned(previous, current, foreseen, y, bits, R, far)
+        foreseen = foresee(previous.features, current.K, R, prior)
+        y, bits = follow(previous, current, foreseen, far, FAR)
+        if _strays(y, bits, foreseen, far):
+            return None
+    found = np.isfinite(bits)
+    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
+        return None
+    first = _surest(bits)
+    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
+                    Pose(R, prior.t))
+
+
+def _strays(y: Array, bits: Array, foreseen: Array, reach: float) -> bool:
+    """
+    Tell whether places y (N, 2) are so far from where they are foreseen that others are beyond.
+
+    As after a step twice as long, or another turn. bits: (N,) infinite for those that are lost.
+    """
+    found = np.isfinite(bits)
+    off = np.linalg.norm((y - foreseen)[found], axis=1)
+    return len(off) < _MANY or quantile(off, _NEARLY_ALL) > reach / 2
+
+
+def _turned(previous: View, current: View, foreseen: Array, y: Array, bits: Array, R: Array,
+            reach: float) -> Array:
+    """
+    Tell how the camera turned (3, 3), where it did not by R.
+
+    By the places y (N, 2) that were found, or where these are few by the largest features.
+    """
+    found, K = np.isfinite(bits), current.K
+    if found.sum() < _MANY:
+        return likely_rotation(previous.features, current.features, K, [R], reach)
+    return np.asarray(fit_rotation(rays(K, foreseen[found]), rays(K, y[found])) @ R)
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
@@ -103,23 +137,6 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
     return Matches(there.points[first], y[first])
-
-
-def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
-               levels: int) -> Foreseen | None:
-    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
-    foreseen = foresee(previous.features, current.K, R, prior)
-    y, bits = follow(previous, current, foreseen, reach, levels)
-    found = np.isfinite(bits)
-    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
-        return None
-    # Where many are far off, as after a step twice as long, others are farther than the reach.
-    off = np.linalg.norm((y - foreseen)[found], axis=1)
-    if quantile(off, _NEARLY_ALL) > reach / 2:
-        return None
-    first = _surest(bits)
-    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
-                    Pose(R, prior.t))
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,
