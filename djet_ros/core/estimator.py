@@ -45,6 +45,9 @@ from numpy.typing import NDArray
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
 
+# chosen: share of the features that leaves no choice of them where it is found.
+_NEARLY_ALL = 0.8
+
 
 class TwoViewEstimator:
     """
@@ -240,11 +243,13 @@ def _as_good(result: RelativePose, prior: RelativePose) -> bool:
     """
     Tell whether a pair is sure, and its matches fit it no worse than those before theirs.
 
-    Most have to agree: where another body moves, the motion before may be a compromise already.
+    Or are of nearly all features, so that no choice of them made it fit. Most have to agree: where
+    another body moves, the motion before may be a compromise already.
     """
     noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
     return (result.status in (Status.OK, Status.NO_PARALLAX)
-            and robust_scale(result.residuals) < _NOISIER * noise
+            and (robust_scale(result.residuals) < _NOISIER * noise
+                 or len(result.x) > _NEARLY_ALL * result.sought)
             and result.inliers.mean() > RIGID)
 
 

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 # preset fast, and .2 to .6 before a lorry.
 RIGID = 0.55
 
-# Share of the inliers of the pair before that near matches have to come to.
+# Share of the matches of the pair before that those which are foreseen have to come to, and of its
+# inliers near matches by descriptors.
 _ENOUGH = 0.8
 
 # Share of the matches that lie within half of the flow's reach of where they are foreseen.
@@ -85,7 +86,7 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
         if _strays(y, bits, foreseen, far):
             return None
     found = np.isfinite(bits)
-    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
+    if found.sum() < max(_ENOUGH * _expected(len(prior.x), prior, len(found)), _MANY):
         return None
     first = _surest(bits)
     return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
@@ -146,14 +147,14 @@ def _match_turned(previous: View, current: View, places: Array, prior: RelativeP
     near = reach_of(prior, current.K) if prior is not None else radius
     pairs = match_nearby(turned, current.features, min(near, radius))
     if (prior is not None and near < radius
-            and len(pairs) < _ENOUGH * _expected(prior, len(places))):
+            and len(pairs) < _ENOUGH * _expected(prior.inliers.sum(), prior, len(places))):
         pairs = match_nearby(turned, current.features, radius)
     return pairs
 
 
-def _expected(prior: RelativePose, sought: int) -> float:
-    """Tell how many inliers the motion before would have had among so many features."""
-    return float(prior.inliers.sum() * (sought / prior.sought if prior.sought else 1.0))
+def _expected(found: int, prior: RelativePose, sought: int) -> float:
+    """Tell how many the motion before would have found among so many features, as of its own."""
+    return float(found * (sought / prior.sought if prior.sought else 1.0))
 
 
 def _settled(previous: View, current: View, y: Array, bits: Array, pairs: NDArray[np.int64]
