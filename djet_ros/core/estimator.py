@@ -102,17 +102,20 @@ class TwoViewEstimator:
         # Where the motion before foresees them, matches are near, and so is the pose.
         with _timed(timings, 'matching'):
             foreseen = match_foreseen(previous, current, prior, known, self.config.search_radius)
-        if foreseen is not None and prior is not None:
-            (x, y), bits, ahead = foreseen
-            result = self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known, ahead,
-                                             bits, sought=len(previous.features), timings=timings))
+        if foreseen is not None and prior is not None and foreseen.are_many(prior):
+            (x, y), bits = foreseen.matches(previous)
+            result = self.estimate_pair(Pair(
+                previous, current, x, y, _pose(prior), known, foreseen.motion, bits,
+                sought=len(previous.features), timings=timings))
             if _as_good(result, prior):
                 return result
 
         # Otherwise they are sought anywhere.
         with _timed(timings, 'matching'):
-            x, y = match_widely(previous, current, prior, known, self.config.search_radius)
-        sought = len(previous.features.with_others)
+            x, y = match_widely(previous, current, prior, known, self.config.search_radius,
+                                foreseen)
+        sought = len(previous.features if foreseen is not None
+                     else previous.features.with_others)
         return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known,
                                        sought=sought, timings=timings))
 

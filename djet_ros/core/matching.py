@@ -52,21 +52,38 @@ class Matches(NamedTuple):
 
 class Foreseen(NamedTuple):
     """
-    Matches that a motion foresaw, and in how many bits (N,) their descriptors differ.
+    Where N features were foreseen by a motion, and where the flow took them from there.
 
-    motion: where the camera turns otherwise than before, with the turn that the largest features
-    tell.
+    places, y: (N, 2) pixels; bits: (N,) in which descriptors differ at x and y, infinite for those
+    that are lost; motion: the one before, but where the camera turns otherwise with that turn.
     """
 
-    matches: Matches
+    places: Array
+    y: Array
     bits: Array
     motion: Pose
+
+    def matches(self, previous: View) -> tuple[Matches, Array]:
+        """Give those that are not lost, and their bits."""
+        first = _surest(self.bits)
+        return Matches(previous.features.points[first], self.y[first]), self.bits[first]
+
+    def are_many(self, prior: RelativePose) -> bool:
+        """Tell whether about as many are found as the pair before had matches."""
+        wanted = _ENOUGH * _expected(len(prior.x), prior, len(self.y))
+        return bool(np.isfinite(self.bits).sum() >= max(wanted, _MANY))
+
+    def stray(self, reach: float) -> bool:
+        """Tell whether so many are far off that others are beyond the reach of the flow."""
+        found = np.isfinite(self.bits)
+        off = np.linalg.norm((self.y - self.places)[found], axis=1)
+        return len(off) < _MANY or quantile(off, _NEARLY_ALL) > reach / 2
 
 
 def match_foreseen(previous: View, current: View, prior: RelativePose | None, known: Known,
                    search_radius: float) -> Foreseen | None:
     """
-    Follow features from where the motion before foresees them; None where too few are near.
+    Follow features from where the motion before foresees them; None where it does not.
 
     Nor where other things move: a gyro is asked to tell these from the world. search_radius: as a
     share of the longer side.
@@ -77,64 +94,55 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
                  for levels in (NEAR, FAR))
     R = prior.R if known.guess is None else known.guess.R
-    foreseen = foresee(previous.features, current.K, R, prior)
-    y, bits = follow(previous, current, foreseen, near, NEAR)
-    if _strays(y, bits, foreseen, near):
-        R = _turned(previous, current, foreseen, y, bits, R, far)
-        foreseen = foresee(previous.features, current.K, R, prior)
-        y, bits = follow(previous, current, foreseen, far, FAR)
-        if _strays(y, bits, foreseen, far):
-            return None
-    found = np.isfinite(bits)
-    if found.sum() < max(_ENOUGH * _expected(len(prior.x), prior, len(found)), _MANY):
-        return None
-    first = _surest(bits)
-    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
-                    Pose(R, prior.t))
+    found = _followed(previous, current, prior, R, near, NEAR)
+    if found.stray(near):
+        R = _turned(previous, current, found, R, far)
+        found = _followed(previous, current, prior, R, far, FAR)
+    return None if found.stray(far) else found
 
 
-def _strays(y: Array, bits: Array, foreseen: Array, reach: float) -> bool:
-    """
-    Tell whether places y (N, 2) are so far from where they are foreseen that others are beyond.
-
-    As after a step twice as long, or another turn. bits: (N,) infinite for those that are lost.
-    """
-    found = np.isfinite(bits)
-    off = np.linalg.norm((y - foreseen)[found], axis=1)
-    return len(off) < _MANY or quantile(off, _NEARLY_ALL) > reach / 2
+def _followed(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
+              levels: int) -> Foreseen:
+    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
+    places = foresee(previous.features, current.K, R, prior)
+    return Foreseen(places, *follow(previous, current, places, reach, levels), Pose(R, prior.t))
 
 
-def _turned(previous: View, current: View, foreseen: Array, y: Array, bits: Array, R: Array,
-            reach: float) -> Array:
+def _turned(previous: View, current: View, found: Foreseen, R: Array, reach: float) -> Array:
     """
     Tell how the camera turned (3, 3), where it did not by R.
 
-    By the places y (N, 2) that were found, or where these are few by the largest features.
+    By the places that were found, or where these are few by the largest features.
     """
-    found, K = np.isfinite(bits), current.K
-    if found.sum() < _MANY:
+    these, K = np.isfinite(found.bits), current.K
+    if these.sum() < _MANY:
         return likely_rotation(previous.features, current.features, K, [R], reach)
-    return np.asarray(fit_rotation(rays(K, foreseen[found]), rays(K, y[found])) @ R)
+    return np.asarray(fit_rotation(rays(K, found.places[these]), rays(K, found.y[these])) @ R)
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
-                 search_radius: float) -> Matches:
+                 search_radius: float, foreseen: Foreseen | None = None) -> Matches:
     """
     Match features that lie near where a turn alone would bring them, or anywhere.
 
     search_radius: as a share of the longer side; 1 matches all with all, by descriptors alone.
+    foreseen: where they were followed already, from places that are as good as those by a turn.
     """
-    previous, current = (replace(view, features=view.features.with_others)
-                         for view in (previous, current))
+    if foreseen is None:
+        previous, current = (replace(view, features=view.features.with_others)
+                             for view in (previous, current))
     there, here = previous.features, current.features
     if search_radius >= 1:
         pairs = match_everywhere(there, here)
         return Matches(there.points[pairs[:, 0]], here.points[pairs[:, 1]])
     radius = search_radius * max(current.gray.shape)
-    rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
-    turned = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
-    y, bits = follow(previous, current, turned, radius)
-    pairs = _match_turned(previous, current, turned, prior, radius)
+    if foreseen is None:
+        rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
+        places = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
+        y, bits = follow(previous, current, places, radius)
+    else:
+        places, y, bits, _ = foreseen
+    pairs = _match_turned(previous, current, places, prior, radius)
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
     return Matches(there.points[first], y[first])
