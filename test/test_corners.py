@@ -1,7 +1,13 @@
 """Corners are spread, real and between pixels, whatever the image."""
 
 import cv2
-from djet_ros.core.corners import corner_slopes, detect_corners, noise_of, spread_out
+from djet_ros.core.corners import (
+    corner_slopes,
+    detect_corners,
+    detect_large_corners,
+    noise_of,
+    spread_out,
+)
 from djet_ros.core.hamming import describable
 import numpy as np
 import pytest
@@ -100,6 +106,22 @@ def test_where_corners_are_few_all_sizes_are_told_at_once():
     features = detect_corners(squares(100)[0], 2000, 1.0)
     assert set(features.octaves) == {0, 1, 2}
     assert features.with_others is features
+
+
+def test_large_corners_are_told_alone_where_they_are_many(image):
+    features = detect_large_corners(image, 50, 1.0)
+    assert set(features.octaves) == {2}
+    assert 0.6 * 50 <= len(features) <= 50
+    assert np.array_equal(features.points, detect_large_corners(image, 50, 1.0).points)
+
+
+def test_where_large_corners_are_few_there_are_small_ones_too():
+    image, corners = squares(100)
+    features = detect_large_corners(image, 400, 1.0)
+    assert set(features.octaves) == {0, 2}
+    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    assert ways[features.octaves == 0].min(0).max() <= 5
+    assert len(features) <= 400
 
 
 def test_points_follow_an_image_by_parts_of_a_pixel(image):

@@ -250,7 +250,7 @@ class Config:
 
     preset: str = parameter(
         'best', 'defaults of the estimator: best (everything known to help), fast (fewer '
-        'matches in about 0.7 of the time, for small computers) or paper (the algorithm as '
+        'matches in about 0.65 of the time, for small computers) or paper (the algorithm as '
         'printed); values given for the estimator come on top', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)

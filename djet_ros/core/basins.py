@@ -205,15 +205,15 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
         solution = minimise(problem, poses[best].R, poses[best].t, loss)
         poses[best] = solution.pose
         losses[best] = losses_at(problem, [solution.pose], loss)[0]
-    rivals = [Rival(pose, float(preference))
-              for pose, preference in zip(poses, preferences(losses, places, best))
-              if apart(poses[best], pose) > BASIN_TUNING.same_basin]
-    return solution, tuple(rival for rival in rivals if rival.preference >= DECIDED
-                           or _stays_apart(problem, rival.pose, solution.pose, loss))
+    preferred = preferences(losses, places, best)
+    return solution, tuple(
+        Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
+        if apart(poses[best], pose) > BASIN_TUNING.same_basin
+        and (preference >= DECIDED or _stays_apart(problem, pose, solution.pose, loss)))
 
 
 def _stays_apart(problem: JetProblem, rival: Pose, pose: Pose, loss: Loss) -> bool:
-    """Tell whether a rival has a minimum of its own: some are only on a long way to the pose."""
+    """Tell whether a rival has a minimum of its own: most are but on a long way to the pose."""
     end = minimise(problem, rival.R, rival.t, loss).pose
     return apart(end, pose) > BASIN_TUNING.same_basin
 

@@ -30,7 +30,8 @@ _SHARES = (0.7, 0.25, 0.18)
 # Octaves that are always told. The one between helps only where they have few corners, or where
 # views are so far apart that a corner is seen in another size; these are told beyond what is asked
 # for.
-_FOLLOWED, _BETWEEN = (0, 2), 1
+_SMALLEST, _BETWEEN, _LARGEST = 0, 1, 2
+_FOLLOWED = _SMALLEST, _LARGEST
 
 # Side of the block, in each second pixel, over which gradients are collected.
 _BLOCK = 3
@@ -47,6 +48,9 @@ _APART, _AT_LEAST_APART = 3, 1
 
 # chosen: share of the corners that are wanted that is enough.
 _ENOUGH = 0.9
+
+# chosen: share of them that is many for corners of the largest size, which are fewer.
+_MANY = 0.6
 
 # The strongest of each cell of this side, in pixels, come first, then the second, and so on.
 _CELL = 40
@@ -87,6 +91,20 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     if len(found) < _ENOUGH * sum(wanted[octave] for octave in _FOLLOWED):
         return Features.together([found, of_size(_BETWEEN, max_features - len(found))])
     return replace(found, others=lambda: of_size(_BETWEEN, wanted[_BETWEEN]))
+
+
+def detect_large_corners(gray: Image, max_features: int, contrast: float,
+                         mask: Mask | None = None, smoothed: Image | None = None) -> Features:
+    """
+    Detect the same corners, but those of the largest size alone, where these are not few.
+
+    In so small an image they are found in a quarter of the time, and each tells as much.
+    """
+    large = _of_size(gray, _LARGEST, max_features, contrast, mask, smoothed)
+    if len(large) >= _MANY * max_features:
+        return large
+    small = _of_size(gray, _SMALLEST, max_features - len(large), contrast, mask, smoothed)
+    return Features.together([small, large])
 
 
 def noise_of(image: Image) -> float:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from djet_ros.core.basins import Ahead, BASIN_TUNING
-from djet_ros.core.corners import detect_corners
+from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
 from djet_ros.core.fusion import agrees
@@ -80,10 +80,11 @@ class TwoViewEstimator:
 
     def _detected(self, gray: NDArray[np.uint8], mask: Mask | None,
                   smoothed: NDArray[np.uint8] | None) -> Features:
-        if self.config.detector == 'corners':
-            return detect_corners(gray, self.config.max_features, self.config.corner_contrast,
-                                  mask, smoothed)
-        return detect_orb(gray, self.config.max_features, self.config.fast_threshold, mask)
+        config = self.config
+        if config.detector == 'orb':
+            return detect_orb(gray, config.max_features, config.fast_threshold, mask)
+        detect = detect_corners if config.detector == 'corners' else detect_large_corners
+        return detect(gray, config.max_features, config.corner_contrast, mask, smoothed)
 
     def estimate(self, previous: View, current: View, prior: RelativePose | None = None,
                  known: Known | None = None) -> RelativePose:
