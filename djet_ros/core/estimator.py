@@ -114,9 +114,8 @@ class TwoViewEstimator:
         # Otherwise they are sought anywhere.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius,
-                                foreseen)
-        sought = len(previous.features if foreseen is not None
-                     else previous.features.with_others)
+                                None if foreseen is None else foreseen.motion.R)
+        sought = len(previous.features.with_others)
         return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known,
                                        sought=sought, timings=timings))
 

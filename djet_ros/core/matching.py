@@ -121,27 +121,26 @@ def _turned(previous: View, current: View, found: Foreseen, R: Array, reach: flo
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
-                 search_radius: float, foreseen: Foreseen | None = None) -> Matches:
+                 search_radius: float, turn: Array | None = None) -> Matches:
     """
     Match features that lie near where a turn alone would bring them, or anywhere.
 
     search_radius: as a share of the longer side; 1 matches all with all, by descriptors alone.
-    foreseen: where they were followed already, from places that are as good as those by a turn.
+    turn: (3, 3) the one that is known already, so that none has to be found.
     """
-    if foreseen is None:
-        previous, current = (replace(view, features=view.features.with_others)
-                             for view in (previous, current))
+    previous, current = (replace(view, features=view.features.with_others)
+                         for view in (previous, current))
     there, here = previous.features, current.features
     if search_radius >= 1:
         pairs = match_everywhere(there, here)
         return Matches(there.points[pairs[:, 0]], here.points[pairs[:, 1]])
     radius = search_radius * max(current.gray.shape)
-    if foreseen is None:
-        rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
-        places = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
-        y, bits = follow(previous, current, places, radius)
-    else:
-        places, y, bits, _ = foreseen
+    rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
+    sure = known.turn is not None
+    if turn is not None:
+        rotations, sure = [turn], True
+    places = predict(there, here, current.K, rotations, radius, sure)
+    y, bits = follow(previous, current, places, radius)
     pairs = _match_turned(previous, current, places, prior, radius)
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
