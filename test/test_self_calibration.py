@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
+from djet_ros.config.sections import Config
 from djet_ros.core.self_calibration import SelfCalibration
+from djet_ros.lab.scenes import make_scene
+from djet_ros.odometry.tracker import Tracker
 import numpy as np
 import pytest
+from ros_messages import camera_info, image, message_type
 
 K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
 
@@ -53,3 +58,33 @@ def test_windows_that_differ_by_more_than_their_noise_do_not_make_it_sure() -> N
     exact = heard([(0.01, 0.0, TURN)] * 2)
     assert exact.sigma > 0.1 * exact.first
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
+
+
+def turned(k1: float, frames: int = 75) -> Tracker:
+    """Track a rendered turn that is seen through a lens of which the calibration knows nothing."""
+    scene = make_scene('sharp_turn', 0, (620, 188))
+    width, height = scene.size
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1, dtype=float)
+    where = cv2.undistortPoints(grid.reshape(-1, 2), scene.K, np.array([k1, 0, 0, 0]), P=scene.K)
+    where = where.reshape(height, width, 2).astype(np.float32)
+    tracker = Tracker(Config(), message_type, image_topic='image')
+    tracker.camera_info(camera_info(scene.K, scene.size))
+    for number, pose in enumerate(scene.trajectory(frames)):
+        seen = cv2.remap(scene.render(pose, number), where[..., 0], where[..., 1],
+                         cv2.INTER_CUBIC)
+        tracker.image(image(seen, stamp_ns=(number + 1) * 10**8))
+    return tracker
+
+
+def test_images_of_a_turn_tell_what_the_calibration_leaves_and_that_is_said() -> None:
+    tracker = turned(0.015)
+    found, sigma = map(float, tracker.diagnosis().values['distortion left (k1)'].split(' +- '))
+    assert found == pytest.approx(0.015, abs=2.5 * sigma)
+    assert sigma < 0.003
+    assert [one.name for one in tracker.complaints_of_content] == ['distortion left']
+
+
+def test_of_a_good_calibration_nothing_is_said() -> None:
+    tracker = turned(0.0)
+    assert 'distortion left (k1)' not in tracker.diagnosis().values
+    assert tracker.complaints_of_content == []

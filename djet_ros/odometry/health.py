@@ -6,6 +6,7 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.images import Coarse
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
@@ -185,6 +186,16 @@ class Health:
         return Complaint('images out of order', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
             'and dropped; do two cameras publish on one topic?'))
+
+
+def bent(lens: SelfCalibration | None) -> Complaint | None:
+    """Say that images have a distortion that their calibration does not know, if that is sure."""
+    if lens is None or not lens.certain:
+        return None
+    return Complaint('distortion left', 'WARN', (
+        f'by its landmarks the images have a distortion left, of k1 = {lens.k1:.4f} +- '
+        f'{lens.sigma:.4f}; lengths make up for it from where it is found, turns and directions '
+        'do not: djet lens finds it by all of the recording, and says what to do'))
 
 
 def _still(images: int, stamp_ns: int) -> Complaint | None:

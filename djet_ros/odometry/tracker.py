@@ -21,7 +21,7 @@ from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.health import Complaint, has_frame, Health, why_restarted
+from djet_ros.odometry.health import bent, Complaint, has_frame, Health, why_restarted
 from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
 from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
@@ -348,7 +348,8 @@ class Tracker:
     def complaints_of_content(self) -> list[Complaint]:
         """Say what there is to mend of what a whole recording holds."""
         found = (self._health.stamps_stood(), self._health.few_levels(),
-                 self._health.never_measured(self._scale), *self.complaints_beside)
+                 self._health.never_measured(self._scale), bent(self._odometry.lens),
+                 *self.complaints_beside)
         return [one for one in found if one is not None]
 
     @property
