@@ -25,8 +25,8 @@ _ALIKE = 0.01
 # as a share of how unsure k1 is at first.
 _ANOTHER = 0.3
 
-# Standard errors, as usual.
-_CERTAIN = 3.0
+# Standard errors, more than usual: it is asked again and again.
+_CERTAIN = 4.0
 
 # chosen: how much more probable it is beforehand that nothing was left.
 _RIGHT = 20.0

@@ -341,8 +341,9 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        return [*self._health.complaints(self._scale, self.mounted), *self.complaints_beside,
-                *self.face_complaints]
+        lens = bent(self._odometry.lens)
+        return [*self._health.complaints(self._scale, self.mounted), *([lens] if lens else []),
+                *self.complaints_beside, *self.face_complaints]
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
