@@ -164,8 +164,8 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     if (_is_clear(problem, places, basins, tight)
             or _mere_turn(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
-    loss = replace(tight, scale=config.loss_scale * scale)
-    basins = _distinct([minimise(problem, one.R, one.t, loss).pose for one in basins])
+    basins = _promising(some, refine_all(some, basins, tight, BASIN_TUNING.steps_to_compare),
+                        tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
     before = ahead.pose if ahead.pose.t.any() else None
@@ -208,14 +208,7 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
     preferred = preferences(losses, places, best)
     return solution, tuple(
         Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
-        if apart(poses[best], pose) > BASIN_TUNING.same_basin
-        and (preference >= DECIDED or _stays_apart(problem, pose, solution.pose, loss)))
-
-
-def _stays_apart(problem: JetProblem, rival: Pose, pose: Pose, loss: Loss) -> bool:
-    """Tell whether a rival has a minimum of its own: most are but on a long way to the pose."""
-    end = minimise(problem, rival.R, rival.t, loss).pose
-    return apart(end, pose) > BASIN_TUNING.same_basin
+        if apart(poses[best], pose) > BASIN_TUNING.same_basin)
 
 
 def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose | None) -> int:
@@ -270,12 +263,3 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
             if len(chosen) == most:
                 break
     return [sketch.pose(number) for number in chosen]
-
-
-def _distinct(poses: Sequence[Pose]) -> list[Pose]:
-    """Leave out poses that lie in the basin of one before them."""
-    kept: list[Pose] = []
-    for pose in poses:
-        if all(apart(pose, one) > BASIN_TUNING.same_basin for one in kept):
-            kept.append(pose)
-    return kept
