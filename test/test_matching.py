@@ -7,11 +7,11 @@ from dataclasses import replace
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rotation_angle, rotation_exp
+from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.hamming import match_distances
-from djet_ros.core.matching import match_foreseen, match_widely
+from djet_ros.core.matching import match_widely
 from djet_ros.core.starts import Known
-from djet_ros.core.types import Array, RelativePose, Status, View
+from djet_ros.core.types import Array, View
 import numpy as np
 import pytest
 from two_view import some, textured
@@ -98,36 +98,3 @@ def test_no_feature_at_all_is_no_match():
         previous.features, np.zeros(len(previous.features), bool)))
     x, y = match_widely(none, current, None, Known(), 0.15)
     assert x.shape == y.shape == (0, 2)
-
-
-def gone_on(previous: View) -> RelativePose:
-    """Give a camera that did not turn before, of which all features were followed."""
-    x = previous.features.points
-    return RelativePose(Status.OK, np.eye(3), np.zeros(3), x=x, y=x, y_opt=x,
-                        inliers=np.ones(len(x), bool), sought=len(x))
-
-
-@pytest.mark.parametrize('degrees', [0.5, 1.5, 3.0])
-def test_another_turn_than_before_is_told_by_what_is_found_nearby(degrees: float):
-    image = textured(np.random.default_rng(91), SIZE)
-    R = rotation_exp(np.deg2rad([0.0, degrees, 0.0]))
-    H = K @ R @ np.linalg.inv(K)
-    estimator = TwoViewEstimator(EstimatorConfig(max_features=600))
-    previous, current = (estimator.view(seen, K) for seen in (
-        image, cv2.warpPerspective(image, H, SIZE, borderMode=cv2.BORDER_CONSTANT)))
-    foreseen = match_foreseen(previous, current, gone_on(previous), Known(), 0.15)
-    assert foreseen is not None and foreseen.are_many(gone_on(previous))
-    (x, y), bits = foreseen.matches(previous)
-    assert np.median(misses(H, x, y)) < 0.1
-    assert (np.diff(bits) >= 0).all()
-    if degrees > 1:
-        assert np.rad2deg(rotation_angle(R, foreseen.motion.R)) < 0.2
-
-
-def test_a_turn_that_is_known_is_not_looked_for_again():
-    previous, current, H = turned_views(600)
-    R, wrong = rotation_exp(TURN), rotation_exp(np.array([0.0, 0.5, 0.0]))
-    x, y = match_widely(previous, current, None, Known(), 0.15, R)
-    assert len(x) > 0.5 * len(previous.features)
-    assert np.median(misses(H, x, y)) < 0.1
-    assert len(match_widely(previous, current, None, Known(), 0.15, wrong).x) < 0.5 * len(x)

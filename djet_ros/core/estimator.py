@@ -45,9 +45,6 @@ from numpy.typing import NDArray
 # the next (1.4 was the most that was seen), and pixels that are not worth speaking of.
 _NOISIER, _LEAST_NOISE = 1.5, 0.1
 
-# chosen: share of the features that leaves no choice of them where it is found.
-_NEARLY_ALL = 0.8
-
 
 class TwoViewEstimator:
     """
@@ -103,18 +100,16 @@ class TwoViewEstimator:
         # Where the motion before foresees them, matches are near, and so is the pose.
         with _timed(timings, 'matching'):
             foreseen = match_foreseen(previous, current, prior, known, self.config.search_radius)
-        if foreseen is not None and prior is not None and foreseen.are_many(prior):
-            (x, y), bits = foreseen.matches(previous)
-            result = self.estimate_pair(Pair(
-                previous, current, x, y, _pose(prior), known, foreseen.motion, bits,
-                sought=len(previous.features), timings=timings))
+        if foreseen is not None and prior is not None:
+            (x, y), bits, ahead = foreseen
+            result = self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known, ahead,
+                                             bits, sought=len(previous.features), timings=timings))
             if _as_good(result, prior):
                 return result
 
         # Otherwise they are sought anywhere.
         with _timed(timings, 'matching'):
-            x, y = match_widely(previous, current, prior, known, self.config.search_radius,
-                                None if foreseen is None else foreseen.motion.R)
+            x, y = match_widely(previous, current, prior, known, self.config.search_radius)
         sought = len(previous.features.with_others)
         return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known,
                                        sought=sought, timings=timings))
@@ -246,13 +241,11 @@ def _as_good(result: RelativePose, prior: RelativePose) -> bool:
     """
     Tell whether a pair is sure, and its matches fit it no worse than those before theirs.
 
-    Or are of nearly all features, so that no choice of them made it fit. Most have to agree: where
-    another body moves, the motion before may be a compromise already.
+    Most have to agree: where another body moves, the motion before may be a compromise already.
     """
     noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
     return (result.status in (Status.OK, Status.NO_PARALLAX)
-            and (robust_scale(result.residuals) < _NOISIER * noise
-                 or len(result.x) > _NEARLY_ALL * result.sought)
+            and robust_scale(result.residuals) < _NOISIER * noise
             and result.inliers.mean() > RIGID)
 
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from djet_ros.core.features import match_everywhere, match_nearby
 from djet_ros.core.flow import FAR, follow, NEAR, reach_of_levels
-from djet_ros.core.geometry import fit_rotation, rays
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.paraboloid import quantile
 from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
@@ -25,8 +24,7 @@ from numpy.typing import NDArray
 # preset fast, and .2 to .6 before a lorry.
 RIGID = 0.55
 
-# Share of the matches of the pair before that those which are foreseen have to come to, and of its
-# inliers near matches by descriptors.
+# Share of the inliers of the pair before that near matches have to come to.
 _ENOUGH = 0.8
 
 # Share of the matches that lie within half of the flow's reach of where they are foreseen.
@@ -52,38 +50,21 @@ class Matches(NamedTuple):
 
 class Foreseen(NamedTuple):
     """
-    Where N features were foreseen by a motion, and where the flow took them from there.
+    Matches that a motion foresaw, and in how many bits (N,) their descriptors differ.
 
-    places, y: (N, 2) pixels; bits: (N,) in which descriptors differ at x and y, infinite for those
-    that are lost; motion: the one before, but where the camera turns otherwise with that turn.
+    motion: where the camera turns otherwise than before, with the turn that the largest features
+    tell.
     """
 
-    places: Array
-    y: Array
+    matches: Matches
     bits: Array
     motion: Pose
-
-    def matches(self, previous: View) -> tuple[Matches, Array]:
-        """Give those that are not lost, and their bits."""
-        first = _surest(self.bits)
-        return Matches(previous.features.points[first], self.y[first]), self.bits[first]
-
-    def are_many(self, prior: RelativePose) -> bool:
-        """Tell whether about as many are found as the pair before had matches."""
-        wanted = _ENOUGH * _expected(len(prior.x), prior, len(self.y))
-        return bool(np.isfinite(self.bits).sum() >= max(wanted, _MANY))
-
-    def stray(self, reach: float) -> bool:
-        """Tell whether so many are far off that others are beyond the reach of the flow."""
-        found = np.isfinite(self.bits)
-        off = np.linalg.norm((self.y - self.places)[found], axis=1)
-        return len(off) < _MANY or quantile(off, _NEARLY_ALL) > reach / 2
 
 
 def match_foreseen(previous: View, current: View, prior: RelativePose | None, known: Known,
                    search_radius: float) -> Foreseen | None:
     """
-    Follow features from where the motion before foresees them; None where it does not.
+    Follow features from where the motion before foresees them; None where too few are near.
 
     Nor where other things move: a gyro is asked to tell these from the world. search_radius: as a
     share of the longer side.
@@ -94,39 +75,19 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
                  for levels in (NEAR, FAR))
     R = prior.R if known.guess is None else known.guess.R
-    found = _followed(previous, current, prior, R, near, NEAR)
-    if found.stray(near):
-        R = _turned(previous, current, found, R, far)
-        found = _followed(previous, current, prior, R, far, FAR)
-    return None if found.stray(far) else found
-
-
-def _followed(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
-              levels: int) -> Foreseen:
-    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
-    places = foresee(previous.features, current.K, R, prior)
-    return Foreseen(places, *follow(previous, current, places, reach, levels), Pose(R, prior.t))
-
-
-def _turned(previous: View, current: View, found: Foreseen, R: Array, reach: float) -> Array:
-    """
-    Tell how the camera turned (3, 3), where it did not by R.
-
-    By the places that were found, or where these are few by the largest features.
-    """
-    these, K = np.isfinite(found.bits), current.K
-    if these.sum() < _MANY:
-        return likely_rotation(previous.features, current.features, K, [R], reach)
-    return np.asarray(fit_rotation(rays(K, found.places[these]), rays(K, found.y[these])) @ R)
+    found = _follow_on(previous, current, prior, R, near, NEAR)
+    if found is None:
+        R = likely_rotation(previous.features, current.features, current.K, [R], far)
+        found = _follow_on(previous, current, prior, R, far, FAR)
+    return found
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
-                 search_radius: float, turn: Array | None = None) -> Matches:
+                 search_radius: float) -> Matches:
     """
     Match features that lie near where a turn alone would bring them, or anywhere.
 
     search_radius: as a share of the longer side; 1 matches all with all, by descriptors alone.
-    turn: (3, 3) the one that is known already, so that none has to be found.
     """
     previous, current = (replace(view, features=view.features.with_others)
                          for view in (previous, current))
@@ -136,15 +97,29 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
         return Matches(there.points[pairs[:, 0]], here.points[pairs[:, 1]])
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
-    sure = known.turn is not None
-    if turn is not None:
-        rotations, sure = [turn], True
-    places = predict(there, here, current.K, rotations, radius, sure)
-    y, bits = follow(previous, current, places, radius)
-    pairs = _match_turned(previous, current, places, prior, radius)
+    turned = predict(there, here, current.K, rotations, radius, sure=known.turn is not None)
+    y, bits = follow(previous, current, turned, radius)
+    pairs = _match_turned(previous, current, turned, prior, radius)
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
     return Matches(there.points[first], y[first])
+
+
+def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
+               levels: int) -> Foreseen | None:
+    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
+    foreseen = foresee(previous.features, current.K, R, prior)
+    y, bits = follow(previous, current, foreseen, reach, levels)
+    found = np.isfinite(bits)
+    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
+        return None
+    # Where many are far off, as after a step twice as long, others are farther than the reach.
+    off = np.linalg.norm((y - foreseen)[found], axis=1)
+    if quantile(off, _NEARLY_ALL) > reach / 2:
+        return None
+    first = _surest(bits)
+    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
+                    Pose(R, prior.t))
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,
@@ -154,14 +129,14 @@ def _match_turned(previous: View, current: View, places: Array, prior: RelativeP
     near = reach_of(prior, current.K) if prior is not None else radius
     pairs = match_nearby(turned, current.features, min(near, radius))
     if (prior is not None and near < radius
-            and len(pairs) < _ENOUGH * _expected(prior.inliers.sum(), prior, len(places))):
+            and len(pairs) < _ENOUGH * _expected(prior, len(places))):
         pairs = match_nearby(turned, current.features, radius)
     return pairs
 
 
-def _expected(found: int, prior: RelativePose, sought: int) -> float:
-    """Tell how many the motion before would have found among so many features, as of its own."""
-    return float(found * (sought / prior.sought if prior.sought else 1.0))
+def _expected(prior: RelativePose, sought: int) -> float:
+    """Tell how many inliers the motion before would have had among so many features."""
+    return float(prior.inliers.sum() * (sought / prior.sought if prior.sought else 1.0))
 
 
 def _settled(previous: View, current: View, y: Array, bits: Array, pairs: NDArray[np.int64]
