@@ -150,8 +150,8 @@ def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int6
     which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
     R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2), how they change over k1
     (M, 2), and weights (M,); held: (N, 2, 2), how it changes over k1 (N, 2), off (N, 2) and their
-    weight; K: (3, 3) and its inverse; least: depth, and
-    information about a landmark. Gives a Reduced's fields.
+    weight; K: (3, 3) and its inverse; least: depth, and information about a landmark. Gives a
+    Reduced's fields.
     """
     *of_points, weight = held
     n, size = len(of_points[0]), 1 + 6 * frames

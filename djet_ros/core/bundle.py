@@ -175,7 +175,11 @@ class Landmarks:
     @classmethod
     def at(cls, found: Array, rho: Array, anchor: int, frames: int, points: Array | None = None,
            slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
-        """Make landmarks that no other frame has seen yet; without slopes they face the camera."""
+        """
+        Make landmarks that no other frame has seen yet.
+
+        Without points they are seen through no k1; without slopes they face the camera.
+        """
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), found, np.zeros((n, 2, 2)),
                    found if points is None else points, rho,

@@ -82,8 +82,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     large = cells.in_larger(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS))
     if flattened is None or cells.without is None or large.without is None:
         return UNKNOWN
-    size = cells.size(cells.without)
-    by_itself = _jackknife(cells, cells.without)
+    moves = np.einsum('cij,jc->ic', cells.without, cells.gradients)
+    size = cells.size(moves)
+    by_itself = _jackknife(cells, cells.without, moves)
     noise = float((weights * squared).sum() / weights.sum())
     covariance = by_itself + _alike(cells, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
@@ -188,14 +189,14 @@ class _Cells:
         """Sum products of residuals, of weights (2,) and of pulls (5, 5) within the same cell."""
         return (self.sums[25:]**2).sum(1), self.pulls @ self.pulls.T
 
-    def size(self, without: Array) -> float:
+    def size(self, moves: Array) -> float:
         """
         Size of the covariance that is told, over H^-1, on average over the five directions.
 
-        Where cells err by themselves, it is the same for any size of them: by (H - H_c)^-1 in
-        place of H^-1 it has no bias (Bell and McCaffrey, Survey Methodology 2002).
+        moves: (5, C) of the pose without the matches of each cell. Where cells err by themselves,
+        it is the same for any size of them: by (H - H_c)^-1 in place of H^-1 it has no bias (Bell
+        and McCaffrey, Survey Methodology 2002).
         """
-        moves = np.einsum('cij,jc->ic', without, self.gradients)
         return float((moves * self.gradients).sum()) / 5 + _LEAST_VARIANCE
 
 
@@ -253,16 +254,15 @@ def lift(tangents: Array) -> Array:
     return lifted
 
 
-def _jackknife(cells: _Cells, without: Array) -> Array:
+def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
-    without: (C, 5, 5), see ``_Cells``. A delete-a-group jackknife, to first order (Bell and
-    McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their moves say
-    little; so the mean is taken of the moves that are seen and of those that noise would make,
-    which are large there, at the size that has the seen ones on average.
+    without: (C, 5, 5), see ``_Cells``; moves: (5, C). A delete-a-group jackknife, to first order
+    (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their
+    moves say little; so the mean is taken of the moves that are seen and of those that noise would
+    make, which are large there, at the size that has the seen ones on average.
     """
-    moves = np.einsum('cij,jc->ic', without, cells.gradients)
     seen = moves @ moves.T + _LEAST_VARIANCE * cells.inverse
     by_noise = without.sum(0) - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5

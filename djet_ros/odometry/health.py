@@ -189,8 +189,8 @@ class Health:
 
 
 def bent(lens: SelfCalibration | None) -> Complaint | None:
-    """Say that images have a distortion that their calibration does not know, if that is sure."""
-    if lens is None or not lens.certain:
+    """Say that images have a distortion that their calibration does not know, if it was told."""
+    if lens is None:
         return None
     return Complaint('distortion left', 'WARN', (
         f'by its landmarks the images have a distortion left, of k1 = {lens.k1:.4f} +- '

@@ -104,8 +104,10 @@ class OneScale:
 
     @property
     def lens(self) -> SelfCalibration | None:
-        """Tell what distortion images still have by their landmarks; None without these."""
-        return self._window.lens if self._carried and self._speed is not None else None
+        """Tell what distortion landmarks show to be left; None before that is certain."""
+        if not self._carried or self._speed is None or not self._window.lens.certain:
+            return None
+        return self._window.lens
 
     @property
     def is_new(self) -> bool:

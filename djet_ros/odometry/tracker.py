@@ -363,7 +363,7 @@ class Tracker:
         diagnosis = diagnose(self.state, self.detail, self.counts,
                              self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
-        if (lens := self._odometry.lens) is not None and lens.certain:
+        if (lens := self._odometry.lens) is not None:
             diagnosis.values['distortion left (k1)'] = f'{lens.k1:.4f} +- {lens.sigma:.4f}'
         diagnosis.values.update(self._beside.values())
         diagnosis.values.update(self.face_values)

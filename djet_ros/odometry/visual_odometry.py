@@ -154,7 +154,7 @@ class VisualOdometry:
 
     @property
     def lens(self) -> SelfCalibration | None:
-        """Tell what landmarks have shown of the lens; None where there are none."""
+        """Tell what landmarks have shown of the lens; None before that is certain."""
         return self._one_scale.lens
 
     def reset(self) -> None:
