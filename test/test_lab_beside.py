@@ -149,6 +149,7 @@ def test_a_camera_stands_for_what_stood_before_it_while_lorries_hide_nearly_all(
     assert all(result.stationary for result in results[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', [102, 106])
 def test_depths_of_a_lorry_do_not_speak_against_the_motion_that_a_gyro_confirms(seed: int) -> None:
     scene = make_scene('moving_object', seed)
@@ -166,6 +167,7 @@ def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands(
     assert [result.status for result in results[1:]] == [Status.OK] * 5
 
 
+@pytest.mark.slow
 def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
     seen = set()
     for seed in (70, 71, 73):

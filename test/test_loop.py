@@ -21,6 +21,8 @@ import numpy as np
 import pytest
 from ros_messages import message_type
 
+pytestmark = pytest.mark.slow
+
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 
 

@@ -585,6 +585,7 @@ def test_its_loops_are_as_sure_as_they_say(closed):
     assert np.median(surprises) < 8
 
 
+@pytest.mark.slow
 def test_the_command_takes_results_too_and_wherever_their_recording_went(
         closed, drive, tmp_path):
     results = closed / 'replay'

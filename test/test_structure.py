@@ -334,6 +334,7 @@ def test_near_is_told_by_what_is_beyond_a_patch():
     assert not len(_around_patches(points[:0], values[:0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', [1, 3])
 def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(seed: int) -> None:
     """In the hand it rests, and what landmarks there are is told by next to no parallax."""
