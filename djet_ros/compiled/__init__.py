@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 2
+_INTERFACE = 3
 
 # Rows of memory that the optimiser asks for, and by how much these may be longer than others.
 _ROWS, _FILLED_UP = 28, 3
@@ -100,6 +100,41 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
           c_int(len(tests)), given(tests, np.int64), c_int(far), c_int(reach),
           given(distances, np.float32))
     return distances
+
+
+def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8], y: Array,
+                    tests: NDArray[np.int64], reach: int) -> Array:
+    """
+    Distances (N,) of descriptors at pixels of two images (H, W): `core.hamming.match_distances`.
+
+    x, y: (N, 2); tests: (256, 4), which look at most `reach` pixels away.
+    """
+    n = len(x)
+    distances, given = np.empty(n), _Given()
+    _call('djet_match_distances', given(there, np.uint8), c_int(there.shape[0]),
+          c_int(there.shape[1]), given(here, np.uint8), c_int(here.shape[0]),
+          c_int(here.shape[1]), c_int(n), given(x), given(y), given(tests, np.int64),
+          c_int(reach), given(distances))
+    return distances
+
+
+def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Array],
+                 here: tuple[NDArray[np.uint8], Array]
+                 ) -> tuple[NDArray[np.int64], Gray, Gray]:
+    """
+    Find the most similar features in strips of two images: `core.features.most_similar`.
+
+    strips: (S, 4); there, here: descriptors (N, 32) and places (N, 2) of each.
+    """
+    strips, (n, m) = strips.reshape(-1, 4), (len(there[0]), len(here[0]))
+    nearest, best_there, best_here = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(
+        m, np.float32)
+    given = _Given()
+    _call('djet_most_similar', c_int(len(strips)), given(strips, np.int64), c_int(n), c_int(m),
+          given(there[0], np.uint8), given(there[1], np.float32), given(here[0], np.uint8),
+          given(here[1], np.float32), given(nearest, np.int64), given(best_there, np.float32),
+          given(best_here, np.float32))
+    return nearest, best_there, best_here
 
 
 def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,

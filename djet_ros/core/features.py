@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.masks import Mask
 from djet_ros.core.parallel import both, each
 from djet_ros.core.types import Array, Features
@@ -66,27 +67,53 @@ def match_nearby(previous: Features, current: Features,
 
     Gives (M, 2) indices into the previous and the current features, the most similar ones first.
     Only features of like size are compared, and the nearer of two that look alike is preferred.
-    Matrix products of +-1/2 bits, in strips of the image, give the distances: several times
-    faster than brute force over all pairs, and with fewer chances to be wrong.
+    Strips of the image are compared: several times faster than brute force over all pairs, and
+    with fewer chances to be wrong.
     """
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)
     rows, columns = _by_octave_and_column(previous), _by_octave_and_column(current)
     there, here = previous.points[rows], current.points[columns]
-    left, right = _comparable(previous, rows, current, columns, search_radius)
-    claim, best_there = np.zeros(len(rows), np.int64), np.full(len(rows), -np.inf, np.float32)
-    best_here = np.full(len(columns), -np.inf, np.float32)
-    neighbourhoods = list(_neighbourhoods(previous.octaves[rows], there[:, 0],
-                                          current.octaves[columns], here[:, 0], search_radius))
-    compared = each(lambda n: _compare(left[n[0]], right[n[1]]), neighbourhoods)
-    for (strip, near), (nearest, highest, highest_here) in zip(neighbourhoods, compared):
+    strips = np.array([(strip.start, strip.stop, near.start, near.stop)
+                       for strip, near in _neighbourhoods(
+                           previous.octaves[rows], there[:, 0], current.octaves[columns],
+                           here[:, 0], search_radius)], np.int64).reshape(-1, 4)
+    # Keeps the numbers small: single precision is enough.
+    centre, weight = there.mean(0), np.sqrt(_DISTANCE_BITS / 2) / search_radius
+    claim, best_there, best_here = most_similar(
+        strips, (previous.descriptors[rows], (there - centre) * weight),
+        (current.descriptors[columns], (here - centre) * weight))
+    apart = np.linalg.norm(here[claim] - there, axis=1)
+    mutual = (claim >= 0) & (best_there == best_here[claim]) & (apart <= search_radius)
+    best = np.flatnonzero(mutual)[np.argsort(-best_there[mutual], kind='stable')]
+    return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))
+
+
+def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Array],
+                 here: tuple[NDArray[np.uint8], Array]
+                 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """
+    Find the most similar features in strips of two images.
+
+    there, here: descriptors (N, 32) and places (N, 2) of N and of M features; strips: (S, 4), of
+    those there the first and the one after the last, and of those here that they are compared
+    with. Similarity is 64 - Hamming distance / 2 - distance of places^2. Gives which of here each
+    of there is most similar to (N,), -1 where it is compared with none, how similar (N,), and how
+    similar each of here is at most (M,).
+    """
+    if compiled.library is not None:
+        return compiled.most_similar(strips, there, here)
+    claim = np.full(len(there[0]), -1)
+    best_there = np.full(len(there[0]), -np.inf, np.float32)
+    best_here = np.full(len(here[0]), -np.inf, np.float32)
+    left, right = _comparable(there, here)
+    bounds = [(slice(*strip[:2]), slice(*strip[2:])) for strip in strips.tolist()]
+    compared = each(lambda two: _compare(left[two[0]], right[two[1]]), bounds)
+    for (strip, near), (nearest, highest, highest_here) in zip(bounds, compared):
         claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
         np.maximum(best_there[strip], highest, out=best_there[strip])
         np.maximum(best_here[near], highest_here, out=best_here[near])
-    apart = np.linalg.norm(here[claim] - there, axis=1)
-    mutual = np.isfinite(best_there) & (best_there == best_here[claim]) & (apart <= search_radius)
-    best = np.flatnonzero(mutual)[np.argsort(-best_there[mutual], kind='stable')]
-    return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))
+    return claim, best_there, best_here
 
 
 def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -110,22 +137,14 @@ def _by_octave_and_column(features: Features) -> NDArray[np.int64]:
     return np.lexsort((features.points[:, 0], features.octaves))
 
 
-def _comparable(previous: Features, rows: NDArray[np.int64], current: Features,
-                columns: NDArray[np.int64],
-                search_radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """
-    Factors (N, 260) and (M, 260) whose product is the similarity of features.
-
-    64 - Hamming distance / 2, less _DISTANCE_BITS / 2 (distance / search_radius)^2.
-    """
-    centre = previous.points.mean(0)  # keeps the numbers small: single precision is enough
-    weight = np.sqrt(_DISTANCE_BITS / 2) / search_radius
-    a, b = ((f.points[order] - centre) * weight
-            for f, order in ((previous, rows), (current, columns)))
+def _comparable(there: tuple[NDArray[np.uint8], Array], here: tuple[NDArray[np.uint8], Array]
+                ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Give factors (N, 260) and (M, 260) whose product is the similarity of features."""
+    (one, a), (other, b) = there, here
     one_a, one_b = np.ones((len(a), 1)), np.ones((len(b), 1))
     square_a, square_b = ((p * p).sum(1, keepdims=True) for p in (a, b))
-    return both(lambda: factor(previous.descriptors[rows], 2 * a, -square_a, -one_a),
-                lambda: factor(current.descriptors[columns], b, one_b, square_b))
+    return both(lambda: factor(one, 2 * a, -square_a, -one_a),
+                lambda: factor(other, b, one_b, square_b))
 
 
 def factor(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32]:

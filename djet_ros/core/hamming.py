@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.geometry import inverses
 from djet_ros.core.orb_pattern import reach, TESTS
 from djet_ros.core.parallel import each
@@ -241,13 +242,17 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
     known: other places y' (N, 2) with their distances, which most y share the pixel with. NaN
     where one of the two is too close to the border for a descriptor.
     """
+    if known is not None:
+        anew = ~(np.rint(known[0]) == np.rint(y)).all(1)
+        distances = known[1].copy()
+        distances[anew] = match_distances(smoothed_a, x.compress(anew, axis=0), smoothed_b,
+                                          y.compress(anew, axis=0))
+        return distances
+    if compiled.library is not None:
+        return compiled.match_distances(smoothed_a, x, smoothed_b, y, TESTS, reach(TESTS))
     x_pixels, y_pixels = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
     wanted = describable(x_pixels, smoothed_a.shape) & describable(y_pixels, smoothed_b.shape)
     distances = np.full(len(x), np.nan)
-    if known is not None:
-        same = (np.rint(known[0]) == y_pixels).all(1)
-        distances[same] = known[1][same]
-        wanted &= ~same
     differing = (descriptor_bits(smoothed_a, x_pixels.compress(wanted, axis=0))
                  != descriptor_bits(smoothed_b, y_pixels.compress(wanted, axis=0)))
     distances[wanted] = differing.view(np.uint8).sum(0, dtype=np.uint16)

@@ -1,0 +1,83 @@
+/* Descriptors and their distances: see core/hamming.py and core/features.py. */
+#include "common.h"
+
+/* How many tests there are, and 64-bit words of a descriptor. */
+enum { TESTS = 256, WORDS = TESTS / 64 };
+
+typedef struct {
+    const uint8_t *gray;
+    int height, width;
+    int64_t first[TESTS], second[TESTS];
+} Image;
+
+INLINE Image tested(const uint8_t *gray, int height, int width, const int64_t (*tests)[4])
+{
+    Image image = {.gray = gray, .height = height, .width = width};
+    for (int t = 0; t < TESTS; t++) {
+        image.first[t] = tests[t][1] * width + tests[t][0];
+        image.second[t] = tests[t][3] * width + tests[t][2];
+    }
+    return image;
+}
+
+/* The pixel next to a point; none where a descriptor would leave the image. */
+INLINE const uint8_t *pixel_at(const Image *image, const double point[2], int reach)
+{
+    const double x = rint(point[0]), y = rint(point[1]);
+    const int inside = x >= reach && x < image->width - reach && y >= reach
+                       && y < image->height - reach;
+    return inside ? image->gray + (int64_t)y * image->width + (int64_t)x : 0;
+}
+
+/* In how many bits (n,) descriptors differ at the pixels next to x (n, 2) of one image and
+   y (n, 2) of another; NaN where one of them has none. tests: (TESTS, 4), which look at most
+   `reach` pixels away. */
+WIDE void djet_match_distances(const uint8_t *there, int there_height, int there_width,
+                               const uint8_t *here, int here_height, int here_width, int n,
+                               const double (*x)[2], const double (*y)[2],
+                               const int64_t (*tests)[4], int reach, double *distances)
+{
+    const Image previous = tested(there, there_height, there_width, tests),
+                current = tested(here, here_height, here_width, tests);
+    for (int k = 0; k < n; k++) {
+        const uint8_t *a = pixel_at(&previous, x[k], reach), *b = pixel_at(&current, y[k], reach);
+        int differing = 0;
+        for (int t = 0; a && b && t < TESTS; t++)
+            differing += (a[previous.first[t]] < a[previous.second[t]])
+                         != (b[current.first[t]] < b[current.second[t]]);
+        distances[k] = a && b ? differing : NAN;
+    }
+}
+
+/* Which feature of another image each of one is most similar to, and how similar: 64 less half of
+   the bits in which they differ, less the square of how far they are apart. Only those of `strips`
+   (m, 4) are compared, from a first one up to a last one of both images. Gives `nearest` and
+   `best_there` for the one image, -1 and -infinity where there is none, `best_here` for the other
+   one. */
+WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int n_here,
+                            const uint64_t (*there)[WORDS], const float (*x)[2],
+                            const uint64_t (*here)[WORDS], const float (*y)[2], int64_t *nearest,
+                            float *best_there, float *best_here)
+{
+    for (int i = 0; i < n_there; i++) {
+        nearest[i] = -1;
+        best_there[i] = -INFINITY;
+    }
+    for (int j = 0; j < n_here; j++)
+        best_here[j] = -INFINITY;
+    for (int s = 0; s < m; s++)
+        for (int64_t i = strips[s][0]; i < strips[s][1]; i++)
+            for (int64_t j = strips[s][2]; j < strips[s][3]; j++) {
+                int differing = 0;
+                for (int word = 0; word < WORDS; word++)
+                    differing += __builtin_popcountll(there[i][word] ^ here[j][word]);
+                const float dx = x[i][0] - y[j][0], dy = x[i][1] - y[j][1];
+                const float similarity = 64 - 0.5f * differing - (dx * dx + dy * dy);
+                if (similarity > best_there[i]) {
+                    best_there[i] = similarity;
+                    nearest[i] = j;
+                }
+                if (similarity > best_here[j])
+                    best_here[j] = similarity;
+            }
+}
