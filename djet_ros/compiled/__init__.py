@@ -27,6 +27,9 @@ _INTERFACE = 3
 # Rows of memory that the optimiser asks for, and by how much these may be longer than others.
 _ROWS, _FILLED_UP = 28, 3
 
+# Rows of sums that slopes of corners ask for.
+_SUMS = 12
+
 
 def _loaded() -> ctypes.CDLL | None:
     found = find_spec('djet_ros.compiled._loops')
@@ -100,6 +103,22 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
           c_int(len(tests)), given(tests, np.int64), c_int(far), c_int(reach),
           given(distances, np.float32))
     return distances
+
+
+def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> Gray:
+    """
+    Mean square slopes (H / 2, W / 2) of blocks: `core.corners.corner_slopes`.
+
+    image: (H, W), both even and at least 4; least_ratio: of the weakest to the strongest
+    direction; unit: that slopes are told in.
+    """
+    height, width = image.shape
+    slopes, given = np.empty((height // 2, width // 2), np.float32), _Given()
+    _call('djet_corner_slopes', given(image, np.uint8), c_int(height), c_int(width),
+          c_float(least_ratio), c_float(unit),
+          given(np.empty((_SUMS, width // 2 + 1), np.int32), np.int32),
+          given(np.empty((4, width + 2), np.int16), np.int16), given(slopes, np.float32))
+    return slopes
 
 
 def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8], y: Array,

@@ -66,18 +66,22 @@ WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int 
     for (int j = 0; j < n_here; j++)
         best_here[j] = -INFINITY;
     for (int s = 0; s < m; s++)
-        for (int64_t i = strips[s][0]; i < strips[s][1]; i++)
+        for (int64_t i = strips[s][0]; i < strips[s][1]; i++) {
+            const uint64_t bits[WORDS] = {there[i][0], there[i][1], there[i][2], there[i][3]};
+            const float x_i = x[i][0], y_i = x[i][1];
+            float best = best_there[i];
+            int64_t of_best = nearest[i];
             for (int64_t j = strips[s][2]; j < strips[s][3]; j++) {
                 int differing = 0;
                 for (int word = 0; word < WORDS; word++)
-                    differing += __builtin_popcountll(there[i][word] ^ here[j][word]);
-                const float dx = x[i][0] - y[j][0], dy = x[i][1] - y[j][1];
+                    differing += __builtin_popcountll(bits[word] ^ here[j][word]);
+                const float dx = x_i - y[j][0], dy = y_i - y[j][1];
                 const float similarity = 64 - 0.5f * differing - (dx * dx + dy * dy);
-                if (similarity > best_there[i]) {
-                    best_there[i] = similarity;
-                    nearest[i] = j;
-                }
-                if (similarity > best_here[j])
-                    best_here[j] = similarity;
+                of_best = similarity > best ? j : of_best;
+                best = similarity > best ? similarity : best;
+                best_here[j] = similarity > best_here[j] ? similarity : best_here[j];
             }
+            best_there[i] = best;
+            nearest[i] = of_best;
+        }
 }

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.cells import rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import at, Mask
@@ -132,6 +133,8 @@ def corner_slopes(image: Image) -> NDArray[np.float32]:
     # Halves are exact, and OpenCV is five times as fast, where both sides are even.
     height, width = (side // 2 for side in image.shape)
     image, slopes = image[:2 * height, :2 * width], np.empty((height, width), np.float32)
+    if compiled.library is not None and min(height, width) > 1:
+        return compiled.corner_slopes(image, _LEAST_RATIO, 0.5 / _SOBEL**2)
     for first in range(0, height, _STRIP):
         slopes[first:first + _STRIP] = _slopes_of_rows(image, first, min(first + _STRIP, height))
     return slopes

@@ -92,7 +92,8 @@ def likely_rotation(previous: Features, current: Features, K: Array, known: Sequ
         one, other = np.random.default_rng(0).integers(0, len(x), (2, _SAMPLES))
         turned = _frames(y[one], y[other]) @ _frames(x[one], x[other]).transpose(0, 2, 1)
         tried = np.concatenate([tried, turned])
-    cosines = (y * (x @ tried.transpose(0, 2, 1))).sum(2)
+    # y^T R x for all of them in one product.
+    cosines = tried.reshape(-1, 9) @ (y[:, :, None] * x[:, None]).reshape(-1, 9).T
     agreement = 1 - 2 * (1 - cosines) * (K[0, 0] / reach)**2
     return np.asarray(tried[np.maximum(agreement, 0).sum(1).argmax()])
 

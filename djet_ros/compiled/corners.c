@@ -1,0 +1,104 @@
+/* How corner-like places of an image are: see core/corners.py. */
+#include <string.h>
+
+#include "common.h"
+
+/* Rows of blocks that are next to one another, and products of slopes along x and y: xx, xy, yy. */
+enum { NEAR = 3, PRODUCTS = 3 };
+
+/* A place beyond either end is that as far within: OpenCV's BORDER_REFLECT_101. */
+static int mirrored(int place, int count)
+{
+    return place < 0 ? -place : place < count ? place : 2 * count - 2 - place;
+}
+
+/* Sobel's slopes in a row of pixels, along x and y. across, down: (width + 2,), room for what that
+   takes. */
+INLINE void slopes_at(const uint8_t *image, int height, int width, int row,
+                      int16_t *restrict across, int16_t *restrict down, int16_t *restrict dx,
+                      int16_t *restrict dy)
+{
+    const uint8_t *here = image + (int64_t)row * width,
+                  *above = image + (int64_t)mirrored(row - 1, height) * width,
+                  *below = image + (int64_t)mirrored(row + 1, height) * width;
+    for (int x = 0; x < width; x++) {
+        across[x + 1] = (int16_t)(above[x] + 2 * here[x] + below[x]);
+        down[x + 1] = (int16_t)(below[x] - above[x]);
+    }
+    across[0] = across[2];
+    across[width + 1] = across[width - 1];
+    down[0] = down[2];
+    down[width + 1] = down[width - 1];
+    for (int x = 0; x < width; x++) {
+        dx[x] = (int16_t)(across[x + 2] - across[x]);
+        dy[x] = (int16_t)(down[x] + 2 * down[x + 1] + down[x + 2]);
+    }
+}
+
+/* Add products of slopes (2 n,), in pairs. */
+INLINE void add_pairs(const int16_t *restrict a, const int16_t *restrict b, int n,
+                      int32_t *restrict sums)
+{
+    for (int j = 0; j < n; j++)
+        sums[j] += a[2 * j] * b[2 * j] + a[2 * j + 1] * b[2 * j + 1];
+}
+
+/* Add three rows, and mirror their ends. sums: (n + 2,). */
+INLINE void add_rows(const int32_t *a, const int32_t *b, const int32_t *c, int n,
+                     int32_t *restrict sums)
+{
+    for (int j = 0; j < n; j++)
+        sums[j + 1] = a[j] + b[j] + c[j];
+    sums[0] = sums[2];
+    sums[n + 1] = sums[n - 1];
+}
+
+/* Slopes of a row of blocks by sums (3, n + 2) of products in three rows of pairs. */
+INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
+                      float *restrict slopes)
+{
+    const int32_t *xx = sums, *xy = xx + n + 2, *yy = xy + n + 2;
+    for (int j = 0; j < n; j++) {
+        const float x = (float)((xx[j] + xx[j + 1] + xx[j + 2]) * 0.25 * (1.0 / 9)),
+                    both = (float)((xy[j] + xy[j + 1] + xy[j + 2]) * 0.25 * (1.0 / 9)),
+                    y = (float)((yy[j] + yy[j + 1] + yy[j + 2]) * 0.25 * (1.0 / 9));
+        const float trace = x + y, apart = x - y;
+        const float spread = sqrtf(apart * apart + both * both * 4);
+        const float least = trace - spread, most = (trace + spread) * least_ratio;
+        slopes[j] = (least < most ? 0 : least) * unit;
+    }
+}
+
+/* Mean square slopes (height / 2, width / 2) of blocks in their weakest direction, 0 where it is
+   less than a share of that in the strongest: core.corners.corner_slopes. height, width: even;
+   sums, rows: room for (12, width / 2 + 1) and (4, width + 2). */
+WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float least_ratio,
+                             float unit, int32_t *sums, int16_t *rows, float *slopes)
+{
+    const int n = width / 2, blocks = height / 2;
+    int16_t *across = rows, *down = across + width + 2, *dx = down + width + 2,
+            *dy = dx + width + 2;
+    int32_t *of_three = sums + NEAR * PRODUCTS * n;
+    for (int row = 0; row <= blocks; row++) {
+        if (row < blocks) {
+            int32_t *latest = sums + row % NEAR * PRODUCTS * n;
+            memset(latest, 0, (size_t)(PRODUCTS * n) * sizeof *latest);
+            for (int i = 0; i < 2; i++) {
+                slopes_at(image, height, width, 2 * row + i, across, down, dx, dy);
+                add_pairs(dx, dx, n, latest);
+                add_pairs(dx, dy, n, latest + n);
+                add_pairs(dy, dy, n, latest + 2 * n);
+            }
+        }
+        if (row == 0)
+            continue;
+        /* Those above and below the one before are known now. */
+        const int32_t *near[NEAR];
+        for (int i = 0; i < NEAR; i++)
+            near[i] = sums + mirrored(row - 2 + i, blocks) % NEAR * PRODUCTS * n;
+        for (int p = 0; p < PRODUCTS; p++)
+            add_rows(near[0] + p * n, near[1] + p * n, near[2] + p * n, n,
+                     of_three + p * (n + 2));
+        to_slopes(of_three, n, least_ratio, unit, slopes + (int64_t)(row - 1) * n);
+    }
+}
