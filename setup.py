@@ -25,7 +25,8 @@ setup(
     ext_modules=[Extension(
         f'{package_name}.compiled._loops', sorted(glob(f'{package_name}/compiled/*.c')),
         depends=glob(f'{package_name}/compiled/*.h'), optional=True,
-        extra_compile_args=['-O3', '-ffp-contract=off', '-fno-math-errno', '-Wno-psabi'])],
+        extra_compile_args=['-O3', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math',
+                            '-Wno-psabi'])],
     zip_safe=False,
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 (ROS Jazzy) ships, where the registry has it for

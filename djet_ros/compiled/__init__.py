@@ -8,6 +8,7 @@ layout. `library` is None where there is none, and where the environment says ``
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import ctypes
 from ctypes import c_double, c_float, c_int, c_void_p
 from importlib.util import find_spec
@@ -192,6 +193,24 @@ def refine_all(matches: tuple[Array, Array, Array, Array], loss: tuple[int, floa
           c_int(steps), c_double(damping), c_int(starts), given(R), given(t), given(costs),
           given(r), given(sign), given(_memory(n)))
     return R, t, costs, r, sign
+
+
+def losses_in_front(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float],
+                    poses: tuple[Array, Array], residuals: tuple[Array, Array],
+                    signs: Sequence[float]) -> Array:
+    """
+    Losses (S, N) of points in front of both cameras: `core.sketch.losses_in_front`.
+
+    matches, loss: as in `minimise`; poses: R (S, 3, 3), t (S, 3); residuals: (S, N), and their
+    signs of curvature; signs: of t that are tried.
+    """
+    n, starts = len(matches[3]), len(poses[0])
+    losses, given = np.empty((starts, n)), _Given()
+    _call('djet_losses_in_front', c_int(n), *map(given, matches), c_int(loss[0]),
+          c_double(loss[1]), c_int(starts), *map(given, poses), *map(given, residuals),
+          c_int(len(signs)), given(np.array(signs, float)), given(losses),
+          given(np.empty((3, n))))
+    return losses
 
 
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],

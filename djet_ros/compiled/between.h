@@ -12,6 +12,8 @@ enum { LANES = 8 };
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
 typedef int32_t Whole __attribute__((vector_size(LANES * sizeof(int32_t))));
 
+typedef uint64_t Pairs __attribute__((vector_size(LANES * sizeof(uint64_t))));
+
 /* Numbers that lie so far apart, side by side. Where there are fewer than lanes, the last one stands
    in for those that are lacking. */
 INLINE Lanes gathered(const float *values, int apart, int count)
@@ -38,6 +40,13 @@ INLINE Lanes clipped(Lanes values, float least, float most)
     return (Lanes)((below & raised) | (~below & (Whole)highest));
 }
 
+/* The first or the second of pairs of numbers. */
+INLINE Lanes one_of(Pairs pairs, int number)
+{
+    const int is_low = (__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__) == (number == 0);
+    return (Lanes)__builtin_convertvector(is_low ? pairs : pairs >> 32, Whole);
+}
+
 /* Gray levels between pixels; beyond the image its border goes on. */
 INLINE Lanes between(const float *image, int height, int width, Lanes x, Lanes y)
 {
@@ -46,16 +55,18 @@ INLINE Lanes between(const float *image, int height, int width, Lanes x, Lanes y
     const Whole left = __builtin_convertvector(clipped(x, 0, width - 2), Whole);
     const Whole top = __builtin_convertvector(clipped(y, 0, height - 2), Whole);
     const Whole first = top * width + left;
-    float corners[2][2][LANES];
+    Pairs pairs[2];
     for (int l = 0; l < LANES; l++)
-        for (int row = 0; row < 2; row++)
-            for (int column = 0; column < 2; column++)
-                corners[row][column][l] = image[first[l] + row * width + column];
+        for (int row = 0; row < 2; row++) {
+            uint64_t pair;
+            memcpy(&pair, image + first[l] + row * width, sizeof pair);
+            pairs[row][l] = pair;
+        }
     x -= __builtin_convertvector(left, Lanes);
     y -= __builtin_convertvector(top, Lanes);
-    const Lanes left_above = load(corners[0][0]), left_below = load(corners[1][0]);
-    const Lanes above = left_above + x * (load(corners[0][1]) - left_above);
-    const Lanes below = left_below + x * (load(corners[1][1]) - left_below);
+    const Lanes left_above = one_of(pairs[0], 0), left_below = one_of(pairs[1], 0);
+    const Lanes above = left_above + x * (one_of(pairs[0], 1) - left_above);
+    const Lanes below = left_below + x * (one_of(pairs[1], 1) - left_below);
     return above + y * (below - above);
 }
 

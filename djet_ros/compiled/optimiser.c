@@ -412,3 +412,76 @@ WIDE void djet_refine_all(int n, const double *x, const double *y, const double 
         memcpy(sign + start * n, here.left.sign, (size_t)n * sizeof(double));
     }
 }
+
+/* What a squared residual costs: jet.Loss. */
+INLINE double value_of(int kind, double square, double squared)
+{
+    const double u = squared / square;
+    return kind == GEMAN_MCCLURE ? squared / (1 + u) : kind == CAUCHY ? square * log1p(u)
+           : kind == HUBER && u > 1 ? square * (2 * sqrt(u) - 1) : squared;
+}
+
+/* Add what way behind a camera costs to losses on lines: as below, of one pose and sign. */
+INLINE double add_losses(int n, int kind, double square, const double *restrict squared,
+                         const double *restrict way, const double *restrict curves,
+                         double towards, double *restrict losses)
+{
+    for (int k = 0; k < n; k++) {
+        const double back = towards * way[k] < 0 ? way[k] : 0;
+        losses[k] = curves[k] * value_of(kind, square, squared[k] + back * back);
+    }
+    double sum = 0;
+    for (int k = 0; k < n; k++)
+        sum += losses[k];
+    return sum;
+}
+
+/* How far along its line each match lies behind where points at infinity are seen, and its squared
+   residual. */
+INLINE void look_along(int n, const double *restrict x, const double *restrict y,
+                       const double *restrict spread, const double *restrict blur,
+                       const double *restrict R, const double *restrict t,
+                       const double *restrict r, double *restrict way, double *restrict squared)
+{
+    for (int k = 0; k < n; k++) {
+        const double x1 = x[k], x2 = x[n + k], x3 = x[2 * n + k];
+        const double depth = R[6] * x1 + R[7] * x2 + R[8] * x3;
+        const double by = 1 / (depth > 0 ? depth : 1.0);
+        const double i1 = (R[0] * x1 + R[1] * x2 + R[2] * x3) * by,
+                     i2 = (R[3] * x1 + R[4] * x2 + R[5] * x3) * by;
+        const double a1 = t[0] - i1 * t[2], a2 = t[1] - i2 * t[2];
+        const double variance = fabs(spread[k] * a1 * a1 + 2 * spread[n + k] * a1 * a2
+                                     + spread[2 * n + k] * a2 * a2) + blur[k];
+        const double along = (y[k] - i1) * a1 + (y[n + k] - i2) * a2;
+        const double units = along / sqrt(variance > 1e-24 ? variance : 1e-24);
+        way[k] = depth > 0 ? units : 0;
+        squared[k] = r[k] * r[k];
+    }
+}
+
+/* Losses (S, n) at S poses, where points also have to lie in front of both cameras, by the one of
+   some signs of t with which they cost less: sketch.losses_in_front. r, curves: (S, n) residuals,
+   and their signs of curvature; memory: (3, n). */
+WIDE void djet_losses_in_front(int n, const double *x, const double *y, const double *spread,
+                               const double *blur, int kind, double scale, int S, const double *R,
+                               const double *t, const double *r, const double *curves, int signs,
+                               const double *towards, double *losses, double *memory)
+{
+    const double square = scale * scale;
+    double *way = memory, *squared = memory + n, *other = memory + 2 * n;
+    for (int s = 0; s < S; s++, R += 9, t += 3, r += n, curves += n, losses += n) {
+        look_along(n, x, y, spread, blur, R, t, r, way, squared);
+        double least = INFINITY;
+        for (int i = 0; i < signs; i++) {
+            double *to = i == 0 ? losses : other;
+            double cost = 0;
+            if (kind == GEMAN_MCCLURE)
+                cost = add_losses(n, GEMAN_MCCLURE, square, squared, way, curves, towards[i], to);
+            else
+                cost = add_losses(n, kind, square, squared, way, curves, towards[i], to);
+            if (i > 0 && cost < least)
+                memcpy(losses, other, (size_t)n * sizeof *losses);
+            least = cost < least ? cost : least;
+        }
+    }
+}

@@ -129,6 +129,9 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
     before that pay for their way to it. Taken is the sign of t that costs less, of some.
     """
+    if compiled.library is not None:
+        return compiled.losses_in_front(problem.matches, loss.numbers, (sketch.R, sketch.t),
+                                        (sketch.r, sketch.sign), signs)
     t = sketch.t[:, :, None]
     m = sketch.R @ problem.rays_x
     ahead = m[:, 2] > 0
