@@ -17,7 +17,7 @@ from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
 from djet_ros.core.memory import keep_freed_memory
-from djet_ros.core.pair import Observer, Pair
+from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import both
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
@@ -102,9 +102,11 @@ class TwoViewEstimator:
             foreseen = match_foreseen(previous, current, prior, known, self.config.search_radius)
         if foreseen is not None and prior is not None:
             (x, y), bits, ahead = foreseen
+            limits = _limits(prior)
             result = self.estimate_pair(Pair(previous, current, x, y, _pose(prior), known, ahead,
-                                             bits, sought=len(previous.features), timings=timings))
-            if _as_good(result, prior):
+                                             limits, bits, sought=len(previous.features),
+                                             timings=timings))
+            if _as_good(result, limits):
                 return result
 
         # Otherwise they are sought anywhere.
@@ -237,16 +239,20 @@ def _failed(status: Status, pair: Pair) -> RelativePose:
     return RelativePose(status, x=pair.x, y=pair.y, timings=pair.timings)
 
 
-def _as_good(result: RelativePose, prior: RelativePose) -> bool:
+def _limits(prior: RelativePose) -> Limits:
     """
-    Tell whether a pair is sure, and its matches fit it no worse than those before theirs.
+    Tell what a pair has to keep to whose matches are to fit it no worse than those before theirs.
 
     Most have to agree: where another body moves, the motion before may be a compromise already.
     """
-    noise = max(robust_scale(prior.residuals), _LEAST_NOISE)
+    return Limits(_NOISIER * max(robust_scale(prior.residuals), _LEAST_NOISE), RIGID)
+
+
+def _as_good(result: RelativePose, limits: Limits) -> bool:
+    """Tell whether a pair is sure, and keeps to limits."""
     return (result.status in (Status.OK, Status.NO_PARALLAX)
-            and robust_scale(result.residuals) < _NOISIER * noise
-            and result.inliers.mean() > RIGID)
+            and robust_scale(result.residuals) < limits.noise
+            and result.inliers.mean() > limits.agreeing)
 
 
 def _pose(prior: RelativePose | None) -> Pose | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Pose, View
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,19 @@ class Round:
     optimum: Array
 
 
+@dataclass(frozen=True)
+class Limits:
+    """
+    What a pair has to keep to that goes on as the one before it did.
+
+    noise: at most so large may the robust standard deviation of its matches from their epipolar
+    lines be, in pixels; agreeing: more than this share of its matches have to agree.
+    """
+
+    noise: float = np.inf
+    agreeing: float = 0.0
+
+
 Observer = Callable[[Round], None]
 
 
@@ -38,7 +52,7 @@ class Pair:
     x, y: (N, 2) matched pixels of the previous and the current view, the surest first; before: the
     motion before this one; known: what others than the images tell; ahead: a motion from which the
     matches were followed, so that its basin will do as a start where none other comes near, its t
-    may be zeros; bits: (N,) in which descriptors at x and y differ, where that is known already;
+    may be zeros; limits: what is given up as not going on so; bits: (N,) in which descriptors at x and y differ, where that is known already;
     covariances: (N, 2, 2) of y, up to a common factor, which re-projection errors count by, all
     alike where they are not told; sought: of how many features, see ``RelativePose``; observe: is
     shown each round of Algorithm 1; timings: gets the seconds of each stage.
@@ -51,6 +65,7 @@ class Pair:
     before: Pose | None = None
     known: Known = field(default_factory=Known)
     ahead: Pose | None = None
+    limits: Limits = field(default_factory=Limits)
     bits: Array | None = None
     covariances: Array | None = None
     sought: int = 0

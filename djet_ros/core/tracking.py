@@ -22,6 +22,7 @@ from djet_ros.core.geometry import (
     fundamental,
     growth,
     inverse_depths,
+    line_distances,
     patch_warp,
     rays,
     slant_warp,
@@ -36,10 +37,11 @@ from djet_ros.core.jet import (
     MAX_STEPS,
     minimise,
     Residuals,
+    robust_scale,
     Solution,
 )
 from djet_ros.core.joining import with_places
-from djet_ros.core.pair import Pair, Round
+from djet_ros.core.pair import Limits, Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import as_matched, Placed
 from djet_ros.core.rivals import (
@@ -142,11 +144,12 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     motion before is taken where they are still undecided. Without any starts they are looked for
     around the pose ahead, which is likely, and from which the keypoints were followed: exactly
     enough for the first round to go by them alone. Where two bodies move, it is the camera's
-    motion, as far as that can be told. None where too few matches have a usable surface.
+    motion, as far as that can be told. None where too few matches have a usable surface, or where
+    the pair is beyond its limits.
     """
     everything, turn = np.ones(len(pair.y), bool), pair.known.turn
     algorithm = _Algorithm(pair, surface, config, everything)
-    track = algorithm.run(starts, ahead)
+    track = algorithm.run(starts, ahead, pair.limits)
     if track is None or len(starts) == 1:
         return track
     first = algorithm.first
@@ -278,8 +281,14 @@ class _Algorithm:
         self._plausible, self._ours = np.ones(len(pair.y), bool), np.ones(len(pair.y), bool)
         self._warp: Array | None = None
 
-    def run(self, starts: list[Pose], ahead: Ahead | None = None) -> Track | None:
-        """Take rounds until the pose rests; None where too few matches have a surface."""
+    def run(self, starts: list[Pose], ahead: Ahead | None = None,
+            limits: Limits | None = None) -> Track | None:
+        """
+        Take rounds until the pose rests; None where too few matches have a surface.
+
+        limits: what it is given up beyond, as soon as it is.
+        """
+        limits = limits or Limits()
         poses, most, rounds = starts, self._config.max_iterations, []
         # Places that were followed tell the pose well enough to sample surfaces only once: around
         # them on its lines, as it stretches the patches.
@@ -290,7 +299,8 @@ class _Algorithm:
             paraboloids, no_minimum = with_minimum(fits, self._config.indefinite)
             # Match culling: a keypoint without a surface is out, and keeps its last loss.
             voting = self._voting(paraboloids)
-            if voting.sum() < self._config.min_matches:
+            if (voting.sum() < self._config.min_matches
+                    or not by_places and voting.mean() <= limits.agreeing):
                 return None
             # Step 2: global pose optimisation.
             found = self._optimised(paraboloids, voting, poses, ahead,
@@ -302,6 +312,8 @@ class _Algorithm:
                 found, placed, rivals = self._concluded(found)
             # Keypoints go towards their optimum on the epipolar line of the new pose.
             pose = found.solution.pose
+            if by_places and self._noise_of_matches(pose) >= limits.noise:
+                return None
             optimum = _optimum_on_line(paraboloids, self._surface.x,
                                        fundamental(self._K, pose.R, pose.t))
             self._losses[self._alive] = paraboloids.values(optimum)[self._alive]
@@ -373,6 +385,11 @@ class _Algorithm:
                                       self.first.rivals, found.loss, pair.before)
             found = replace(found, solution=solution)
         return found, placed, rivals
+
+    def _noise_of_matches(self, pose: Pose) -> float:
+        """Tell how far matches are from their epipolar lines, in pixels."""
+        lines = epipolar_lines(fundamental(self._K, pose.R, pose.t), self._surface.x)
+        return robust_scale(line_distances(lines, self._pair.y))
 
     def _advance(self, pose: Pose, optimum: Array) -> None:
         """Move keypoints to where the next round samples, seen as the pose has it."""
