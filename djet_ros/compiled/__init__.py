@@ -28,8 +28,8 @@ _INTERFACE = 3
 # Rows of memory that the optimiser asks for, and by how much these may be longer than others.
 _ROWS, _FILLED_UP = 28, 3
 
-# Rows of sums that slopes of corners ask for.
-_SUMS = 12
+# Rows of sums that slopes of corners ask for, and planes in squares.
+_SUMS, _OF_SQUARES = 12, 14
 
 
 def _loaded() -> ctypes.CDLL | None:
@@ -122,6 +122,20 @@ def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> 
     return slopes
 
 
+def describe(image: NDArray[np.uint8], pixels: NDArray[np.int64], tests: NDArray[np.int64]
+             ) -> NDArray[np.uint8]:
+    """
+    Descriptors (N, 32) at pixels (N, 2) of an image (H, W): `core.hamming.dense_descriptors`.
+
+    tests: (256, 4); all that they see lies in the image.
+    """
+    descriptors, given = np.empty((len(pixels), len(tests) // 8), np.uint8), _Given()
+    _call('djet_describe', given(image, np.uint8), c_int(image.shape[0]), c_int(image.shape[1]),
+          c_int(len(pixels)), given(pixels, np.int64), given(tests, np.int64),
+          given(descriptors, np.uint8))
+    return descriptors
+
+
 def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8], y: Array,
                     tests: NDArray[np.int64], reach: int) -> Array:
     """
@@ -155,6 +169,22 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
           given(here[1], np.float32), given(nearest, np.int64), given(best_there, np.float32),
           given(best_here, np.float32))
     return nearest, best_there, best_here
+
+
+def nearest(sites: Array, points: Array, corner: Array, side: float, shape: tuple[int, int]
+            ) -> NDArray[np.int64]:
+    """
+    Tell which of sites (M, 2) is next to each of points (N, 2): `core.cells.nearest`.
+
+    corner: (2,) of the first cell; side: of cells; shape: how many columns and rows of these hold
+    all sites.
+    """
+    found, given = np.empty(len(points), np.int64), _Given()
+    memory = np.empty(shape[0] * shape[1] + 1 + len(sites), np.int32)
+    _call('djet_nearest', c_int(len(sites)), given(sites), c_int(len(points)), given(points),
+          *map(c_double, (*corner, side)), *map(c_int, shape), given(memory, np.int32),
+          given(found, np.int64))
+    return found
 
 
 def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
@@ -211,6 +241,23 @@ def losses_in_front(matches: tuple[Array, Array, Array, Array], loss: tuple[int,
           c_int(len(signs)), given(np.array(signs, float)), given(losses),
           given(np.empty((3, n))))
     return losses
+
+
+def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: float
+           ) -> tuple[Array, Array, Array]:
+    """
+    Fit planes to values r (N,) around points at u, v >= 0 (N,): `core.slants.planes_at`.
+
+    trusted: (N,) over their variances; usual: slopes that are nothing out of the ordinary, as
+    shares of the level. Gives planes (N, 4), squares (N,), and how many points fit (N,).
+    """
+    n, columns, rows = len(u), int(u.max()) + 3, int(v.max()) + 3
+    off, found, fitting = np.empty(n), np.empty((n, 4)), np.empty(n)
+    given = _Given()
+    _call('djet_planes', c_int(n), *map(given, (u, v, r, trusted)), c_int(columns), c_int(rows),
+          c_int(rounds), c_double(usual), given(np.empty((_OF_SQUARES, rows * columns))),
+          *map(given, (off, found, fitting)))
+    return found, off, fitting
 
 
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],

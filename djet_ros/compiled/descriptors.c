@@ -85,3 +85,22 @@ WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int 
             nearest[i] = of_best;
         }
 }
+
+/* Descriptors (n, TESTS / 8) at pixels (n, 2) of an image, which have room for them. Of a byte, the
+   lowest bit comes first. */
+WIDE void djet_describe(const uint8_t *gray, int height, int width, int n,
+                        const int64_t (*pixels)[2], const int64_t (*tests)[4],
+                        uint8_t (*descriptors)[TESTS / 8])
+{
+    const Image image = tested(gray, height, width, tests);
+    for (int k = 0; k < n; k++) {
+        const uint8_t *at = gray + pixels[k][1] * width + pixels[k][0];
+        for (int byte = 0; byte < TESTS / 8; byte++) {
+            int bits = 0;
+            for (int bit = 0; bit < 8; bit++)
+                bits |= (at[image.first[8 * byte + bit]] < at[image.second[8 * byte + bit]])
+                        << bit;
+            descriptors[k][byte] = (uint8_t)bits;
+        }
+    }
+}

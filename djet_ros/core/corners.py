@@ -9,6 +9,7 @@ beside the larger one there is an edge, whose stair steps pass for corners at on
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -236,6 +237,7 @@ def _of_size(gray: Image, octave: int, most: int, contrast: float, mask: Mask | 
     chosen = spread_out(_pixels(points), strengths, most, lonely[found])
     points, strengths = points.take(chosen, axis=0), strengths[chosen]
 
+    @cache
     def describe() -> Image:
         # Made anew, which is seldom: views that are kept would keep it.
         seen = (smoothed if scale == 1 and smoothed is not None

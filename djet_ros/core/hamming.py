@@ -169,6 +169,9 @@ def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
     """Unrotated descriptors, packed as (N, 32) uint8 like those of ``cv2.ORB.compute``."""
     if not len(points):
         return np.empty((0, 32), np.uint8)
+    if compiled.library is not None:
+        require_describable(points, smoothed, 0)
+        return compiled.describe(smoothed, points, TESTS)
     # Points first, one byte after the other, they are packed in a third of the time.
     bits = np.asarray(cv2.transpose(descriptor_bits(smoothed, points).view(np.uint8)), np.uint8)
     return np.packbits(bits, axis=1, bitorder='little')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from djet_ros import compiled
 from djet_ros.core.types import Array
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,6 +21,9 @@ _BENT, _USUAL = 0.01, 1.0
 _STEEPEST = 0.03
 
 _ROUNDS = 4
+
+# Square of the usual three standard deviations.
+_FITS = 9.0
 
 # Half the side in pixels of the squares in which all points are told at once, and rounds of that.
 _HALF, _ROUNDS_OF_ALL = 32.0, 3
@@ -60,7 +64,7 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
         squares = (value - (J @ plane)[:, :, 0])**2 * trusted
         weights = trusted / (1 + squares / 4)
     here, lean = plane[:, 0, 0], plane[:, 1:, 0]
-    flat = ((there & (squares < 9)).sum(1) >= _FEW) & (here > 0)
+    flat = ((there & (squares < _FITS)).sum(1) >= _FEW) & (here > 0)
     found = lean / (_REACH * np.where(flat, here, 1.0)[:, None])
     flat &= np.abs(found).max(1) < _STEEPEST
     return np.where(flat[:, None], found, 0.0)
@@ -77,20 +81,35 @@ def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
     if len(x) < _FEW:
         return np.zeros((len(x), 2))
     u, v = x.T / _HALF - np.floor(x.min(0) / _HALF)[:, None]
-    squares = _Squares(u, v)
-    ones = np.ones_like(u)
-    terms = np.stack([ones, u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
-    weights = trusted = 1 / np.maximum(sigma**2 + (_BENT * rho)**2, 1e-18)
-    for _ in range(_ROUNDS_OF_ALL):
-        here, *lean, told = _planes(*squares.sums(weights * terms))[:, squares.which]
-        off = (rho - here - lean[0] * u - lean[1] * v)**2 * trusted
-        weights = trusted / (1 + off / 4)
-    fits = off < 9
-    enough = squares.sums(fits[None].astype(float))[0] >= _FEW
-    found = np.stack(lean, axis=1) / _HALF
-    flat = (fits & enough[squares.which] & (told > _BY_CHANCE)
+    trusted = 1 / np.maximum(sigma**2 + (_BENT * rho)**2, 1e-18)
+    planes, off, fitting = planes_at(u, v, rho, trusted)
+    found, told = planes[:, 1:3] / _HALF, planes[:, 3]
+    flat = ((off < _FITS) & (fitting >= _FEW) & (told > _BY_CHANCE)
             & (np.abs(found).max(1) < _STEEPEST * np.abs(rho)))
     return np.where(flat[:, None], found, 0.0)
+
+
+def planes_at(u: Array, v: Array, rho: Array, trusted: Array) -> tuple[Array, Array, Array]:
+    """
+    Fit planes to inverse depths rho (N,) around points at u, v >= 0 (N,), in halves of squares.
+
+    trusted: (N,) over the variances of rho. Gives planes (N, 4): their values at u = v = 0, their
+    slopes along both, and by how much these lessen the sum of squares; the squares (N,) by which
+    points are off theirs, in variances; and how many points (N,) of a square fit its plane.
+    """
+    usual = _USUAL * _HALF / _REACH
+    if compiled.library is not None:
+        return compiled.planes(u, v, rho, trusted, _ROUNDS_OF_ALL, usual)
+    squares = _Squares(u, v)
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
+    weights = trusted
+    for _ in range(_ROUNDS_OF_ALL):
+        planes = _planes(*squares.sums(weights * terms), usual)[:, squares.which]
+        here, along_u, along_v, _ = planes
+        off = (rho - here - along_u * u - along_v * v)**2 * trusted
+        weights = trusted / (1 + off / 4)
+    fits = (off < _FITS)[None].astype(float)
+    return planes.T, off, squares.sums(fits)[0, squares.which]
 
 
 class _Squares:
@@ -120,7 +139,7 @@ class _Squares:
 
 
 def _planes(n: Array, u: Array, v: Array, uu: Array, uv: Array, vv: Array, r: Array, ur: Array,
-            vr: Array) -> Array:
+            vr: Array, usual: float) -> Array:
     """
     Fit planes to points, by weighted sums (S,) of their terms.
 
@@ -129,7 +148,7 @@ def _planes(n: Array, u: Array, v: Array, uu: Array, uv: Array, vv: Array, r: Ar
     """
     level = r / n
     # Of no depth at all, nothing leans.
-    prior = 1 / np.maximum((_USUAL * _HALF / _REACH * level)**2, 1e-18)
+    prior = 1 / np.maximum((usual * level)**2, 1e-18)
     # The level is eliminated first.
     uu, uv, vv = uu - u * u / n + prior, uv - u * v / n, vv - v * v / n + prior
     ur, vr = ur - u * level, vr - v * level

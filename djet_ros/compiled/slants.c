@@ -1,0 +1,79 @@
+/* Planes through inverse depths in squares of an image: see core/slants.py. */
+#include <string.h>
+
+#include "common.h"
+
+/* Sums of a square's weights, and of u, v, uu, uv, vv, r, ur, vr by these. */
+enum { SUMS = 9 };
+
+/* The value of a plane at u = v = 0, its slopes along both, and by how much these lessen the sum of
+   squares: slants._planes. */
+typedef struct {
+    double level, along_u, along_v, told;
+} Plane;
+
+static Plane plane_of(const double sums[SUMS], double usual)
+{
+    const double n = sums[0], u = sums[1], v = sums[2], level = sums[6] / n;
+    const double deviation = usual * level, square = deviation * deviation;
+    const double prior = 1 / (square > 1e-18 ? square : 1e-18);
+    const double uu = sums[3] - u * u / n + prior, uv = sums[4] - u * v / n,
+                 vv = sums[5] - v * v / n + prior;
+    const double ur = sums[7] - u * level, vr = sums[8] - v * level;
+    const double scale = 1 / (uu * vv - uv * uv);
+    const double along_u = (vv * ur - uv * vr) * scale, along_v = (uu * vr - uv * ur) * scale;
+    const Plane plane = {level - (along_u * u + along_v * v) / n, along_u, along_v,
+                         along_u * ur + along_v * vr};
+    return plane;
+}
+
+/* Square of three standard deviations, within which points fit. */
+static const double FITS = 9;
+
+/* Planes (n, 4) next to points at u, v >= 0 (n,) of inverse depths r (n,), in squares with a side
+   of two that overlap by half, and how far r is off these (n,), squared, times trusted (n,). Fitted
+   by so many rounds under a Cauchy loss. fitting: (n,) by how many points of its square a plane is
+   fitted to three standard deviations. columns, rows: of quarters that hold all points, with one
+   more on each side; memory: room for (14, rows columns). usual: slopes that are nothing out of the
+   ordinary, as a share of the level. */
+WIDE void djet_planes(int n, const double *u, const double *v, const double *r,
+                      const double *trusted, int columns, int rows, int rounds, double usual,
+                      double *memory, double *off, double (*planes)[4], double *fitting)
+{
+    const int quarters = columns * rows;
+    double (*sums)[SUMS] = (double (*)[SUMS])memory;
+    Plane *of_squares = (Plane *)(memory + SUMS * quarters);
+    double *fits = memory + (SUMS + 4) * quarters;
+    memset(fits, 0, (size_t)quarters * sizeof *fits);
+    for (int round = 0; round < rounds; round++) {
+        memset(sums, 0, (size_t)quarters * sizeof *sums);
+        for (int k = 0; k < n; k++) {
+            const double weight = round ? trusted[k] / (1 + off[k] / 4) : trusted[k];
+            const double terms[SUMS] = {1, u[k], v[k], u[k] * u[k], u[k] * v[k], v[k] * v[k],
+                                        r[k], u[k] * r[k], v[k] * r[k]};
+            double *quarter = sums[((int)v[k] + 1) * columns + (int)u[k] + 1];
+            for (int i = 0; i < SUMS; i++)
+                quarter[i] += weight * terms[i];
+        }
+        for (int square = 0; square < quarters - columns - 1; square++) {
+            double whole[SUMS];
+            for (int i = 0; i < SUMS; i++)
+                whole[i] = (sums[square + columns + 1][i] + sums[square + 1][i])
+                           + (sums[square + columns][i] + sums[square][i]);
+            of_squares[square] = plane_of(whole, usual);
+        }
+        for (int k = 0; k < n; k++) {
+            const Plane *plane = of_squares + (int)rint(v[k]) * columns + (int)rint(u[k]);
+            const double away = r[k] - plane->level - plane->along_u * u[k]
+                                - plane->along_v * v[k];
+            off[k] = away * away * trusted[k];
+            memcpy(planes[k], plane, sizeof *plane);
+        }
+    }
+    for (int k = 0; k < n; k++)
+        fits[((int)v[k] + 1) * columns + (int)u[k] + 1] += off[k] < FITS;
+    for (int k = 0; k < n; k++) {
+        const double *at = fits + (int)rint(v[k]) * columns + (int)rint(u[k]);
+        fitting[k] = at[0] + at[1] + at[columns] + at[columns + 1];
+    }
+}
