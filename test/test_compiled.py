@@ -14,15 +14,20 @@ from typing import TypeVar
 import cv2
 from djet_ros import compiled
 from djet_ros.core.bundle import eliminate, observe
+from djet_ros.core.cells import nearest
+from djet_ros.core.corners import corner_slopes
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
+from djet_ros.core.features import most_similar
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.graded import graded_surfaces, grades_through, smooth_finely
-from djet_ros.core.jet import jet_problem, JetProblem, Loss, minimise
+from djet_ros.core.hamming import dense_descriptors, match_distances
+from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, minimise
 from djet_ros.core.orb_pattern import pattern, reach
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import place_exactly
-from djet_ros.core.sketch import refine_all
+from djet_ros.core.sketch import losses_in_front, refine_all
+from djet_ros.core.slants import planes_at
 from djet_ros.core.starts import around
 from djet_ros.core.types import Pose, Status
 from djet_ros.lab.scenes import make_scene
@@ -128,6 +133,56 @@ def test_surfaces_are_those_of_numpy_to_the_last_bit(
     np.testing.assert_array_equal(ours, numpys)
 
 
+@pytest.mark.parametrize('size', [(320, 200), (321, 203), (5, 4)])
+def test_slopes_of_corners_are_those_of_numpy_to_the_last_bit(size: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, size[::-1]).astype(np.uint8)
+    for gray in (noise, image(1, size)):
+        ours, numpys = both(partial(corner_slopes, gray))
+        np.testing.assert_array_equal(ours, numpys)
+
+
+def test_descriptors_are_those_of_numpy_to_the_last_bit() -> None:
+    there, here, rng = image(2), image(3), np.random.default_rng(2)
+    x, y = rng.uniform((-9, -9), (330, 210), (2, 400, 2))
+    for ours, numpys in (both(lambda: match_distances(there, x, here, y)),
+                         both(lambda: dense_descriptors(there, np.rint(x[(x > 14).all(1) & (
+                             x < (306, 186)).all(1)]).astype(np.int64)))):
+        np.testing.assert_array_equal(ours, numpys)
+        assert len(ours) > 200
+
+
+@pytest.mark.parametrize('strips', [[], [(0, 40, 3, 90), (0, 40, 95, 99), (60, 90, 0, 99)]])
+def test_the_most_similar_features_are_those_of_numpy(strips: list[tuple[int, ...]]) -> None:
+    rng = np.random.default_rng(3)
+    there, here = ((rng.integers(0, 256, (count, 32)).astype(np.uint8),
+                    rng.uniform(0, 4, (count, 2))) for count in (90, 99))
+    ours, numpys = both(lambda: most_similar(np.reshape(strips, (-1, 4)).astype(int), there, here))
+    np.testing.assert_array_equal(ours[0], numpys[0])
+    assert (ours[0] >= 0).sum() == (70 if strips else 0)
+    for mine, others in zip(ours[1:], numpys[1:]):
+        np.testing.assert_allclose(mine, others, atol=1e-4)
+
+
+@pytest.mark.parametrize('stretch', [(640, 480), (640, 1e-3), (0, 0)])
+@pytest.mark.parametrize('count', [1, 2, 700])
+def test_the_nearest_of_points_are_as_near_as_those_of_numpy(
+        count: int, stretch: tuple[float, float]) -> None:
+    rng = np.random.default_rng(count)
+    sites, points = rng.uniform(0, stretch, (count, 2)), rng.uniform(-100, 700, (300, 2))
+    ours, numpys = (np.linalg.norm(sites[which] - points, axis=1)
+                    for which in both(lambda: nearest(sites, points)))
+    np.testing.assert_allclose(ours, numpys)
+
+
+@pytest.mark.parametrize('count', [1, 9, 900])
+def test_planes_through_depths_are_those_of_numpy(count: int) -> None:
+    rng = np.random.default_rng(count)
+    u, v = rng.uniform(0, (12, 7), (count, 2)).T
+    rho = 0.1 + 0.01 * u + 0.02 * v + 0.02 * (u > 6) + rng.normal(0, 2e-3, count)
+    for ours, numpys in zip(*both(lambda: planes_at(u, v, rho, np.full(count, 2e-3**-2)))):
+        np.testing.assert_allclose(ours, numpys, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize('counts', [(0, 0), (0, 1), (100, 233)])
 def test_references_are_those_of_numpy_to_a_grade(counts: tuple[int, int]) -> None:
     count = sum(counts)
@@ -155,6 +210,14 @@ def test_the_optimiser_takes_numpys_steps(loss: Loss, count: int, indefinite: bo
         np.testing.assert_allclose(mine, others, rtol=1e-5, atol=1e-5 * np.abs(others).max())
 
 
+@pytest.mark.parametrize('indefinite', [False, True])
+def test_residuals_are_those_of_numpy(indefinite: bool) -> None:
+    matches, pose = problem(np.random.default_rng(7), 203, indefinite)
+    ours, numpys = both(lambda: epipolar_residuals(matches, pose.R, pose.t))
+    for mine, others in zip(vars(ours).values(), vars(numpys).values()):
+        np.testing.assert_allclose(mine, others, rtol=1e-9, atol=1e-9 * np.abs(others).max())
+
+
 def test_the_optimiser_ends_where_numpy_does() -> None:
     matches, start = problem(np.random.default_rng(0), 500, False)
     ours, numpys = both(lambda: minimise(matches, start.R, start.t, Loss('geman_mcclure', 1.5)))
@@ -171,6 +234,16 @@ def test_many_starts_are_refined_as_numpy_does(loss: Loss, steps: int) -> None:
     np.testing.assert_allclose(ours.R, numpys.R, atol=1e-6)
     np.testing.assert_allclose(ours.r, numpys.r, rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(ours.sign, numpys.sign)
+
+
+@pytest.mark.parametrize('indefinite', [False, True])
+@pytest.mark.parametrize('signs', [(1.0,), (1.0, -1.0)])
+def test_points_before_the_cameras_cost_what_numpy_says(
+        loss: Loss, indefinite: bool, signs: tuple[float, ...]) -> None:
+    matches, start = problem(np.random.default_rng(6), 203, indefinite)
+    seen = refine_all(matches, [*around(start, 10), Pose(np.eye(3), np.zeros(3))], loss, 1)
+    ours, numpys = both(lambda: losses_in_front(matches, seen, loss, signs))
+    np.testing.assert_allclose(ours, numpys, rtol=1e-9, atol=1e-12)
 
 
 def test_matches_that_tell_nothing_move_no_pose() -> None:

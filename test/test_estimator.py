@@ -27,7 +27,8 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.hamming import dense_descriptors
-from djet_ros.core.pair import Pair
+from djet_ros.core.jet import robust_scale
+from djet_ros.core.pair import Limits, Pair
 from djet_ros.core.starts import five_point, Known, planar, several
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
@@ -437,6 +438,25 @@ def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
     took = perf_counter() - began
     assert stages['starts'] > 0
     assert 0.8 * took < sum(stages.values()) < took
+
+
+@pytest.mark.parametrize(('limit', 'value'), [('noise', 0.8), ('agreeing', 1.0)])
+def test_a_pair_is_given_up_beyond_its_limits_before_it_is_judged(limit, value):
+    scene = make_scene('road', size=(620, 188))
+    estimator = TwoViewEstimator()
+    a, b = (estimator.view(scene.render(pose, i), scene.K)
+            for i, pose in enumerate(scene.trajectory(2)))
+    alone = estimator.estimate(a, b)
+    least = {'noise': robust_scale(alone.residuals), 'agreeing': alone.voting.mean()}[limit]
+    assert limit == 'noise' or least < 1
+    pair = Pair(a, b, alone.x, alone.y, ahead=Pose(alone.R, alone.t))
+    within = {'noise': 1.2 * least, 'agreeing': 0.9 * alone.inliers.mean()}[limit]
+    assert estimator.estimate_pair(replace(pair, limits=Limits(**{limit: within}), timings={})
+                                   ).status == Status.OK
+    given_up = estimator.estimate_pair(
+        replace(pair, limits=Limits(**{limit: value * least}), timings={}))
+    assert given_up.status == Status.TOO_FEW_MATCHES
+    assert 'result' not in given_up.timings
 
 
 def test_the_time_of_a_second_attempt_is_added_to_that_of_the_first(pair):

@@ -196,6 +196,9 @@ def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:
 
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     """Residuals at the pose (R, t) with their analytic Jacobian over 3 + 2 parameters."""
+    if compiled.library is not None:
+        return Residuals(*compiled.minimise(problem.matches, Loss().numbers, 0, DAMPING_AT_FIRST,
+                                            _LIMITS, R, t)[2])
     tangents = sphere_tangents(t)
     # Of t, and of the two directions in which it moves.
     frame = np.empty((3, 3))
