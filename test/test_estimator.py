@@ -440,7 +440,7 @@ def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
     assert 0.8 * took < sum(stages.values()) < took
 
 
-@pytest.mark.parametrize(('limit', 'value'), [('noise', 0.8), ('agreeing', 1.0)])
+@pytest.mark.parametrize(('limit', 'value'), [('noise', 0.7), ('agreeing', 1.0)])
 def test_a_pair_is_given_up_beyond_its_limits_before_it_is_judged(limit, value):
     scene = make_scene('road', size=(620, 188))
     estimator = TwoViewEstimator()

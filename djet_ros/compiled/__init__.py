@@ -300,7 +300,7 @@ class _Given:
         if not ordered.flags.writeable:
             return c_void_p(ordered.ctypes.data)
         # The same, in a fifth of the time: hundreds are given a frame.
-        return c_void_p(addressof(_NOTHING.from_buffer(ordered)))
+        return c_void_p(addressof(_NOTHING.from_buffer(ordered.data)))
 
 
 def _memory(n: int) -> Array:

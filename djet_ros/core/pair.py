@@ -52,10 +52,11 @@ class Pair:
     x, y: (N, 2) matched pixels of the previous and the current view, the surest first; before: the
     motion before this one; known: what others than the images tell; ahead: a motion from which the
     matches were followed, so that its basin will do as a start where none other comes near, its t
-    may be zeros; limits: what is given up as not going on so; bits: (N,) in which descriptors at x and y differ, where that is known already;
-    covariances: (N, 2, 2) of y, up to a common factor, which re-projection errors count by, all
-    alike where they are not told; sought: of how many features, see ``RelativePose``; observe: is
-    shown each round of Algorithm 1; timings: gets the seconds of each stage.
+    may be zeros; limits: beyond these it is given up; bits: (N,) in which descriptors at x and y
+    differ, where that is known already; covariances: (N, 2, 2) of y, up to a common factor, which
+    re-projection errors count by, all alike where they are not told; sought: of how many features,
+    see ``RelativePose``; observe: is shown each round of Algorithm 1; timings: gets the seconds of
+    each stage.
     """
 
     previous: View

@@ -104,7 +104,7 @@ def planes_at(u: Array, v: Array, rho: Array, trusted: Array) -> tuple[Array, Ar
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
     weights = trusted
     for _ in range(_ROUNDS_OF_ALL):
-        planes = _planes(*squares.sums(weights * terms), usual)[:, squares.which]
+        planes = _planes(squares.sums(weights * terms), usual)[:, squares.which]
         here, along_u, along_v, _ = planes
         off = (rho - here - along_u * u - along_v * v)**2 * trusted
         weights = trusted / (1 + off / 4)
@@ -138,14 +138,15 @@ class _Squares:
             len(values), -1)[:, self._used])
 
 
-def _planes(n: Array, u: Array, v: Array, uu: Array, uv: Array, vv: Array, r: Array, ur: Array,
-            vr: Array, usual: float) -> Array:
+def _planes(sums: Array, usual: float) -> Array:
     """
-    Fit planes to points, by weighted sums (S,) of their terms.
+    Fit planes to points, by sums (9, S) of their weights, and of u, v, uu, uv, vv, r, ur, vr.
 
-    Gives (4, S): their values at u = v = 0, their slopes along both, and by how much these lessen
-    the sum of squares.
+    r: the values; usual: slopes that are nothing out of the ordinary, as shares of the level.
+    Gives (4, S): values at u = v = 0, slopes along both, and by how much these lessen the sum of
+    squares.
     """
+    n, u, v, uu, uv, vv, r, ur, vr = sums
     level = r / n
     # Of no depth at all, nothing leans.
     prior = 1 / np.maximum((usual * level)**2, 1e-18)

@@ -80,6 +80,9 @@ class TrackTuning:
     deep: float = 0.25
     # chosen: steps on all matches to a pose that surfaces are only placed by
     steps_by_places: int = 2
+    # chosen: by what matches may be noisier after the first round than in the end, where they are
+    # held against the limits of their pair
+    noisier_at_first: float = 1.25
     # pixels; chosen: what right matches are off, where planes are fitted to their depths
     off: float = 0.1
     # robust standard deviations; the usual three, within which a match agrees with a pose
@@ -300,7 +303,7 @@ class _Algorithm:
             # Match culling: a keypoint without a surface is out, and keeps its last loss.
             voting = self._voting(paraboloids)
             if (voting.sum() < self._config.min_matches
-                    or not by_places and voting.mean() <= limits.agreeing):
+                    or voting.mean() <= limits.agreeing):
                 return None
             # Step 2: global pose optimisation.
             found = self._optimised(paraboloids, voting, poses, ahead,
@@ -312,7 +315,8 @@ class _Algorithm:
                 found, placed, rivals = self._concluded(found)
             # Keypoints go towards their optimum on the epipolar line of the new pose.
             pose = found.solution.pose
-            if by_places and self._noise_of_matches(pose) >= limits.noise:
+            if by_places and (self._noise_of_matches(pose)
+                              > TRACK_TUNING.noisier_at_first * limits.noise):
                 return None
             optimum = _optimum_on_line(paraboloids, self._surface.x,
                                        fundamental(self._K, pose.R, pose.t))
