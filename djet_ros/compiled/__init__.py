@@ -132,24 +132,22 @@ def describe(image: NDArray[np.uint8], pixels: NDArray[np.int64], tests: NDArray
     tests: (256, 4); all that they see lies in the image.
     """
     descriptors, given = np.empty((len(pixels), len(tests) // 8), np.uint8), _Given()
-    _call('djet_describe', given(image, np.uint8), c_int(image.shape[0]), c_int(image.shape[1]),
-          c_int(len(pixels)), given(pixels, np.int64), given(tests, np.int64),
-          given(descriptors, np.uint8))
+    _call('djet_describe', given(image, np.uint8), c_int(image.shape[1]), c_int(len(pixels)),
+          given(pixels, np.int64), given(tests, np.int64), given(descriptors, np.uint8))
     return descriptors
 
 
 def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8], y: Array,
                     tests: NDArray[np.int64], reach: int) -> Array:
     """
-    Distances (N,) of descriptors at pixels of two images (H, W): `core.hamming.match_distances`.
+    Distances (N,) of descriptors in two images of one size: `core.hamming.match_distances`.
 
     x, y: (N, 2); tests: (256, 4), which look at most `reach` pixels away.
     """
     n = len(x)
     distances, given = np.empty(n), _Given()
-    _call('djet_match_distances', given(there, np.uint8), c_int(there.shape[0]),
-          c_int(there.shape[1]), given(here, np.uint8), c_int(here.shape[0]),
-          c_int(here.shape[1]), c_int(n), given(x), given(y), given(tests, np.int64),
+    _call('djet_match_distances', given(there, np.uint8), given(here, np.uint8),
+          *map(c_int, there.shape), c_int(n), given(x), given(y), given(tests, np.int64),
           c_int(reach), given(distances))
     return distances
 

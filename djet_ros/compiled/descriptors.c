@@ -4,47 +4,45 @@
 /* How many tests there are, and 64-bit words of a descriptor. */
 enum { TESTS = 256, WORDS = TESTS / 64 };
 
+/* How far from a pixel both ends of each test are, in images of a width. */
 typedef struct {
-    const uint8_t *gray;
-    int height, width;
-    int64_t first[TESTS], second[TESTS];
-} Image;
+    int32_t first[TESTS], second[TESTS];
+} Ends;
 
-INLINE Image tested(const uint8_t *gray, int height, int width, const int64_t (*tests)[4])
+INLINE Ends ends_of(const int64_t (*tests)[4], int width)
 {
-    Image image = {.gray = gray, .height = height, .width = width};
+    Ends ends;
     for (int t = 0; t < TESTS; t++) {
-        image.first[t] = tests[t][1] * width + tests[t][0];
-        image.second[t] = tests[t][3] * width + tests[t][2];
+        ends.first[t] = (int32_t)(tests[t][1] * width + tests[t][0]);
+        ends.second[t] = (int32_t)(tests[t][3] * width + tests[t][2]);
     }
-    return image;
+    return ends;
 }
 
 /* The pixel next to a point; none where a descriptor would leave the image. */
-INLINE const uint8_t *pixel_at(const Image *image, const double point[2], int reach)
+INLINE const uint8_t *pixel_at(const uint8_t *gray, int height, int width, const double point[2],
+                               int reach)
 {
     const double x = rint(point[0]), y = rint(point[1]);
-    const int inside = x >= reach && x < image->width - reach && y >= reach
-                       && y < image->height - reach;
-    return inside ? image->gray + (int64_t)y * image->width + (int64_t)x : 0;
+    const int inside = x >= reach && x < width - reach && y >= reach && y < height - reach;
+    return inside ? gray + (int64_t)y * width + (int64_t)x : 0;
 }
 
-/* In how many bits (n,) descriptors differ at the pixels next to x (n, 2) of one image and
-   y (n, 2) of another; NaN where one of them has none. tests: (TESTS, 4), which look at most
-   `reach` pixels away. */
-WIDE void djet_match_distances(const uint8_t *there, int there_height, int there_width,
-                               const uint8_t *here, int here_height, int here_width, int n,
-                               const double (*x)[2], const double (*y)[2],
+/* In how many bits (n,) descriptors differ at the pixels next to x (n, 2) of one image (height,
+   width) and y (n, 2) of another; NaN where one of them has none. tests: (TESTS, 4), which look at
+   most `reach` pixels away. */
+WIDE void djet_match_distances(const uint8_t *there, const uint8_t *here, int height, int width,
+                               int n, const double (*x)[2], const double (*y)[2],
                                const int64_t (*tests)[4], int reach, double *distances)
 {
-    const Image previous = tested(there, there_height, there_width, tests),
-                current = tested(here, here_height, here_width, tests);
+    const Ends ends = ends_of(tests, width);
     for (int k = 0; k < n; k++) {
-        const uint8_t *a = pixel_at(&previous, x[k], reach), *b = pixel_at(&current, y[k], reach);
+        const uint8_t *a = pixel_at(there, height, width, x[k], reach),
+                      *b = pixel_at(here, height, width, y[k], reach);
         int differing = 0;
         for (int t = 0; a && b && t < TESTS; t++)
-            differing += (a[previous.first[t]] < a[previous.second[t]])
-                         != (b[current.first[t]] < b[current.second[t]]);
+            differing += (a[ends.first[t]] < a[ends.second[t]])
+                         != (b[ends.first[t]] < b[ends.second[t]]);
         distances[k] = a && b ? differing : NAN;
     }
 }
@@ -88,18 +86,16 @@ WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int 
 
 /* Descriptors (n, TESTS / 8) at pixels (n, 2) of an image, which have room for them. Of a byte, the
    lowest bit comes first. */
-WIDE void djet_describe(const uint8_t *gray, int height, int width, int n,
-                        const int64_t (*pixels)[2], const int64_t (*tests)[4],
-                        uint8_t (*descriptors)[TESTS / 8])
+WIDE void djet_describe(const uint8_t *gray, int width, int n, const int64_t (*pixels)[2],
+                        const int64_t (*tests)[4], uint8_t (*descriptors)[TESTS / 8])
 {
-    const Image image = tested(gray, height, width, tests);
+    const Ends ends = ends_of(tests, width);
     for (int k = 0; k < n; k++) {
         const uint8_t *at = gray + pixels[k][1] * width + pixels[k][0];
         for (int byte = 0; byte < TESTS / 8; byte++) {
             int bits = 0;
             for (int bit = 0; bit < 8; bit++)
-                bits |= (at[image.first[8 * byte + bit]] < at[image.second[8 * byte + bit]])
-                        << bit;
+                bits |= (at[ends.first[8 * byte + bit]] < at[ends.second[8 * byte + bit]]) << bit;
             descriptors[k][byte] = (uint8_t)bits;
         }
     }

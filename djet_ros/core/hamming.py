@@ -251,7 +251,7 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
         distances[anew] = match_distances(smoothed_a, x.compress(anew, axis=0), smoothed_b,
                                           y.compress(anew, axis=0))
         return distances
-    if compiled.library is not None:
+    if compiled.library is not None and smoothed_a.shape == smoothed_b.shape:
         return compiled.match_distances(smoothed_a, x, smoothed_b, y, TESTS, reach(TESTS))
     x_pixels, y_pixels = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
     wanted = describable(x_pixels, smoothed_a.shape) & describable(y_pixels, smoothed_b.shape)
