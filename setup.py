@@ -21,7 +21,7 @@ setup(
         (f'share/{package_name}/config', glob('config/*')),
         (f'share/{package_name}/launch', glob('launch/*')),
     ],
-    # Inner loops: without a C compiler those in NumPy do, and a frame takes a third longer.
+    # Inner loops: without a C compiler those in NumPy do, and a frame takes half as long again.
     ext_modules=[Extension(
         f'{package_name}.compiled._loops', sorted(glob(f'{package_name}/compiled/*.c')),
         depends=glob(f'{package_name}/compiled/*.h'), optional=True,
