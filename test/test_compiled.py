@@ -14,7 +14,6 @@ from typing import TypeVar
 import cv2
 from djet_ros import compiled
 from djet_ros.core.bundle import eliminate, observe
-from djet_ros.core.cells import nearest
 from djet_ros.core.corners import corner_slopes
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
@@ -161,17 +160,6 @@ def test_the_most_similar_features_are_those_of_numpy(strips: list[tuple[int, ..
     assert (ours[0] >= 0).sum() == (70 if strips else 0)
     for mine, others in zip(ours[1:], numpys[1:]):
         np.testing.assert_allclose(mine, others, atol=1e-4)
-
-
-@pytest.mark.parametrize('stretch', [(640, 480), (640, 1e-3), (0, 0)])
-@pytest.mark.parametrize('count', [1, 2, 700])
-def test_the_nearest_of_points_are_as_near_as_those_of_numpy(
-        count: int, stretch: tuple[float, float]) -> None:
-    rng = np.random.default_rng(count)
-    sites, points = rng.uniform(0, stretch, (count, 2)), rng.uniform(-100, 700, (300, 2))
-    ours, numpys = (np.linalg.norm(sites[which] - points, axis=1)
-                    for which in both(lambda: nearest(sites, points)))
-    np.testing.assert_allclose(ours, numpys)
 
 
 @pytest.mark.parametrize('count', [1, 9, 900])

@@ -171,22 +171,6 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
     return nearest, best_there, best_here
 
 
-def nearest(sites: Array, points: Array, corner: Array, side: float, shape: tuple[int, int]
-            ) -> NDArray[np.int64]:
-    """
-    Tell which of sites (M, 2) is next to each of points (N, 2): `core.cells.nearest`.
-
-    corner: (2,) of the first cell; side: of cells; shape: how many columns and rows of these hold
-    all sites.
-    """
-    found, given = np.empty(len(points), np.int64), _Given()
-    memory = np.empty(shape[0] * shape[1] + 1 + len(sites), np.int32)
-    _call('djet_nearest', c_int(len(sites)), given(sites), c_int(len(points)), given(points),
-          *map(c_double, (*corner, side)), *map(c_int, shape), given(memory, np.int32),
-          given(found, np.int64))
-    return found
-
-
 def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
              damping: float, limits: Array, R: Array, t: Array
              ) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from djet_ros import compiled
-from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-
-# chosen: points in a cell in which the nearest ones are looked for, were they spread evenly.
-_IN_CELL = 2.0
 
 
 def cells_of(points: NDArray[Any], side: float) -> NDArray[np.int64]:
@@ -33,15 +27,3 @@ def beginnings(ordered: NDArray[Any]) -> NDArray[np.int64]:
     begins = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=begins[1:])
     return np.flatnonzero(begins)
-
-
-def nearest(sites: Array, points: Array) -> NDArray[np.int64]:
-    """Tell which of some sites (M, 2), one at least, is next to each of points (N, 2)."""
-    if compiled.library is None:
-        return np.asarray(cKDTree(sites).query(points)[1])
-    corner, size = sites.min(0), np.ptp(sites, axis=0)
-    # Cells are no narrower than that as many as there are sites hold all of these.
-    side = max(float(np.sqrt(size.prod() * _IN_CELL / len(sites))),
-               float(size.max()) / len(sites), 1e-9)
-    columns, rows = (size / side).astype(int).tolist()
-    return compiled.nearest(sites, points, corner, side, (columns + 1, rows + 1))

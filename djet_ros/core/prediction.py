@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from djet_ros.core.cells import nearest
 from djet_ros.core.features import factor
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.types import Array, Features, RelativePose
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 # Features of the largest size that are compared with all of their size, wherever they are.
 _COMPARED = 250
@@ -57,7 +57,7 @@ def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Arr
     # With z = 1 of x: of the same length as rho, whatever the depth.
     there = (seen @ before.R.T + step) @ R.T
     shift = _seen(K, there + step) - _seen(K, there)
-    return np.asarray(_seen(K, turned) + shift[nearest(y, previous.points)])
+    return np.asarray(_seen(K, turned) + shift[cKDTree(y).query(previous.points)[1]])
 
 
 def _seen(K: Array, places: Array) -> Array:
