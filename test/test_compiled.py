@@ -242,7 +242,8 @@ def test_matches_that_tell_nothing_move_no_pose() -> None:
             assert found.t.tolist() == [0, 0, 1]
 
 
-def test_landmarks_are_eliminated_as_numpy_does() -> None:
+@pytest.mark.parametrize('lens', [False, True])
+def test_landmarks_are_eliminated_as_numpy_does(lens: bool) -> None:
     rng = np.random.default_rng(5)
     poses, landmarks = scene(rng, frames=6, landmarks=57)
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
@@ -251,7 +252,7 @@ def test_landmarks_are_eliminated_as_numpy_does() -> None:
     landmarks.held[12] = 0
     observed = observe(BUNDLE_K, poses, landmarks)
     weights = rng.uniform(0, 2, len(observed.residuals))
-    ours, numpys = both(lambda: eliminate(observed, weights, 1.7, 6))
+    ours, numpys = both(lambda: eliminate(observed, weights, 1.7, 6, lens))
     for mine, others in zip(vars(ours).values(), vars(numpys).values(), strict=True):
         np.testing.assert_allclose(mine, others, rtol=1e-6, atol=1e-9 * np.abs(others).max())
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 3
+_INTERFACE = 4
 
 _NOTHING = c_char * 0
 
@@ -245,27 +245,29 @@ def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: flo
 
 
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
-              observed: tuple[Array, ...], held: tuple[Array, Array, Array, float],
-              K: tuple[Array, Array], least: tuple[float, float], frames: int
+              observed: tuple[Array, ...], held: tuple[Array, Array, float],
+              by_k1: tuple[Array, Array] | None, K: tuple[Array, Array],
+              least: tuple[float, float], frames: int
               ) -> tuple[Array, Array, Array, Array, Array]:
     """
     Sum up M observations of N landmarks by F frames, and eliminate these: `core.bundle.eliminate`.
 
     which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
-    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2), how they change over k1
-    (M, 2), and weights (M,); held: (N, 2, 2), how it changes over k1 (N, 2), off (N, 2) and their
-    weight; K: (3, 3) and its inverse; least: depth, and information about a landmark. Gives a
-    Reduced's fields.
+    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); held:
+    (N, 2, 2), off (N, 2) and their weight; by_k1: how residuals (M, 2) and off change over k1,
+    where that is among the equations; K: (3, 3) and its inverse; least: depth, and information
+    about a landmark. Gives a Reduced's arrays.
     """
     *of_points, weight = held
-    n, size = len(of_points[0]), 1 + 6 * frames
+    n, size = len(of_points[0]), (by_k1 is not None) + 6 * frames
     H, g = np.zeros((size, size)), np.zeros(size)
     coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
     slopes, gain = np.zeros((n, 3)), np.empty((3, size))
     given = _Given()
+    lens = (c_void_p(None),) * 2 if by_k1 is None else (given(one) for one in by_k1)
     _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames),
           *(given(one, np.int64) for one in which), *map(given, observed),
-          *map(given, of_points), c_double(weight), *map(given, K),
+          *map(given, of_points), c_double(weight), *lens, *map(given, K),
           *map(c_double, least), *map(given, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 

@@ -3,10 +3,10 @@
 
 #include "common.h"
 
-/* Of one observation: its residuals (2,), and how they change with the steps of both poses, with
-   the landmark's inverse depth and point, and with k1, all of them by the root of its weight. */
+/* Of one observation: its residuals (2,), and how they change with the steps of both poses, and
+   with the landmark's inverse depth and point, all of them by the root of its weight. */
 typedef struct {
-    double e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3], by_k1[2];
+    double e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
 } Row;
 
 static void cross(const double a[3], const double b[3], double product[3])
@@ -20,9 +20,9 @@ static void cross(const double a[3], const double b[3], double product[3])
 static void differentiate(const double *K, const double *K_inverse, double nearest,
                           const double *residuals, const double *R, const double *t,
                           const double *ray, double rho, const double *place, const double *root,
-                          const double *by_k1, double weight, Row *row)
+                          double by, Row *row)
 {
-    const double depth = place[2] > nearest ? place[2] : nearest, by = sqrt(weight);
+    const double depth = place[2] > nearest ? place[2] : nearest;
     for (int i = 0; i < 2; i++) {
         double by_place[3], by_turned[3];
         for (int j = 0; j < 2; j++)
@@ -40,7 +40,6 @@ static void differentiate(const double *K, const double *K_inverse, double neare
         for (int j = 0; j < 2; j++)
             row->by_own[i][1 + j] = by_turned[0] * K_inverse[j] + by_turned[1] * K_inverse[3 + j]
                                     + by_turned[2] * K_inverse[6 + j];
-        row->by_k1[i] = by * by_k1[i];
         row->e[i] = by * residuals[i];
     }
 }
@@ -89,58 +88,66 @@ INLINE void eliminate(int size, const double *C, const double *variances, const 
 }
 
 /* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark.
-   Adds to H (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 1 + 6F for k1 and the
-   poses; gives variances (N, 3, 3); gain: (3, S) of memory. */
+   Adds to H (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 6F for the poses, and
+   one before them where k1 is asked for, by_k1 and held_by_k1 given; gives variances (N, 3, 3);
+   gain: (3, S) of memory. */
 WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
                          const int64_t *anchor, const double *residuals, const double *R,
                          const double *t, const double *ray, const double *rho,
-                         const double *place, const double *root, const double *by_k1,
-                         const double *weights, const double *held, const double *held_by_k1,
-                         const double *off, double weight, const double *K,
+                         const double *place, const double *root, const double *weights,
+                         const double *held, const double *off, double weight,
+                         const double *by_k1, const double *held_by_k1, const double *K,
                          const double *K_inverse, double nearest, double trace, double *H,
                          double *g, double *coupling, double *variances, double *slopes,
                          double *gain)
 {
-    const int64_t size = 1 + 6 * (int64_t)F;
+    const int64_t lens = by_k1 != NULL, size = lens + 6 * (int64_t)F;
     for (int n = 0, m = 0; n < N; n++) {
         double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace};
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
-        const double *lens = held_by_k1 + 2 * n;
-        H[0] += weight * (lens[0] * lens[0] + lens[1] * lens[1]);
-        g[0] += weight * (lens[0] * off[2 * n] + lens[1] * off[2 * n + 1]);
+        const double *gone = off + 2 * n, *by = lens ? held_by_k1 + 2 * n : NULL;
+        if (lens) {
+            H[0] += weight * (by[0] * by[0] + by[1] * by[1]);
+            g[0] += weight * (by[0] * gone[0] + by[1] * gone[1]);
+        }
         for (int i = 0; i < 2; i++) {
             const double *column = held + 4 * n + i;
             for (int j = 0; j < 2; j++)
                 information[3 * (i + 1) + j + 1] +=
                     weight * (column[0] * held[4 * n + j] + column[2] * held[4 * n + 2 + j]);
-            slope[i + 1] += weight * (column[0] * off[2 * n] + column[2] * off[2 * n + 1]);
-            C[(i + 1) * size] += weight * (column[0] * lens[0] + column[2] * lens[1]);
+            slope[i + 1] += weight * (column[0] * gone[0] + column[2] * gone[1]);
+            if (lens)
+                C[(i + 1) * size] += weight * (column[0] * by[0] + column[2] * by[1]);
         }
         for (; m < M && landmark[m] == n; m++) {
+            const double root_of_weight = sqrt(weights[m]);
             Row row;
             differentiate(K, K_inverse, nearest, residuals + 2 * m, R + 9 * m, t + 3 * m,
-                          ray + 3 * m, rho[m], place + 3 * m, root + 4 * m, by_k1 + 2 * m,
-                          weights[m], &row);
-            const int64_t f = 1 + 6 * frame[m], a = 1 + 6 * anchor[m];
+                          ray + 3 * m, rho[m], place + 3 * m, root + 4 * m, root_of_weight, &row);
+            const int64_t f = lens + 6 * frame[m], a = lens + 6 * anchor[m];
             const double *by_frame = row.by_frame[0], *by_anchor = row.by_anchor[0],
                          *by_own = row.by_own[0];
             add_block(H + f * size + f, size, by_frame, 6, by_frame, 6);
             add_block(H + f * size + a, size, by_frame, 6, by_anchor, 6);
             add_block(H + a * size + f, size, by_anchor, 6, by_frame, 6);
             add_block(H + a * size + a, size, by_anchor, 6, by_anchor, 6);
-            add_block(H, size, row.by_k1, 1, row.by_k1, 1);
-            add_block(H + f, size, row.by_k1, 1, by_frame, 6);
-            add_block(H + a, size, row.by_k1, 1, by_anchor, 6);
-            add_block(H + f * size, size, by_frame, 6, row.by_k1, 1);
-            add_block(H + a * size, size, by_anchor, 6, row.by_k1, 1);
-            add_block(g, 1, row.by_k1, 1, row.e, 1);
             add_block(g + f, 1, by_frame, 6, row.e, 1);
             add_block(g + a, 1, by_anchor, 6, row.e, 1);
-            add_block(C, size, by_own, 3, row.by_k1, 1);
             add_block(C + f, size, by_own, 3, by_frame, 6);
             add_block(C + a, size, by_own, 3, by_anchor, 6);
             add_block(information, 3, by_own, 3, by_own, 3);
             add_block(slope, 1, by_own, 3, row.e, 1);
+            if (lens) {
+                const double k1[2] = {root_of_weight * by_k1[2 * m],
+                                      root_of_weight * by_k1[2 * m + 1]};
+                add_block(H, size, k1, 1, k1, 1);
+                add_block(H + f, size, k1, 1, by_frame, 6);
+                add_block(H + a, size, k1, 1, by_anchor, 6);
+                add_block(H + f * size, size, by_frame, 6, k1, 1);
+                add_block(H + a * size, size, by_anchor, 6, k1, 1);
+                add_block(g, 1, k1, 1, row.e, 1);
+                add_block(C, size, by_own, 3, k1, 1);
+            }
         }
         invert(information, variances + 9 * n);
         eliminate((int)size, C, variances + 9 * n, slope, gain, H, g);

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import times
+from djet_ros.core.radial import bending, stretch
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -46,13 +47,6 @@ _TRACE = 1e-9
 
 # Information that poses hold on to where observations leave them open, as a share of theirs.
 _OPEN = 1e-7
-
-# Share by which k1 moves points at most: what is farther out is in no image, and must not be
-# folded into one.
-_FARTHEST = 0.1
-
-# Steps to where a point is without k1; each leaves a hundredth of what the one before did.
-_STRAIGHTENINGS = 3
 
 
 @dataclass
@@ -231,33 +225,7 @@ def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
 def projected(K: Array, places: Array, k1: float = 0.0) -> Array:
     """Project places (N, 3) in a camera to pixels (N, 2); what is behind it goes far out."""
     u = places[:, :2] / np.maximum(places[:, 2:], _NEAREST)
-    return np.clip((u * _stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_FAR_OUT, _FAR_OUT)
-
-
-def _stretch(u: Array, k1: float) -> Array:
-    """By what k1 multiplies points (N, 2), (N, 1)."""
-    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -_FARTHEST, _FARTHEST))
-
-
-def straightened(K: Array, pixels: Array, k1: float) -> Array:
-    """Tell where pixels (N, 2) were without k1."""
-    seen = rays(K, pixels)[:, :2]
-    u = seen
-    for _ in range(_STRAIGHTENINGS):
-        u = seen / _stretch(u, k1)
-    return np.asarray(u @ K[:2, :2].T + K[:2, 2])
-
-
-def _bending(K: Array, u: Array, k1: float) -> tuple[Array, Array]:
-    """
-    How pixels of points (N, 2) move with where they were without k1, (N, 2, 2), and over k1.
-
-    The latter is (N, 2).
-    """
-    by_point = 2 * k1 * u[:, :, None] * u[:, None]
-    by_point[:, [0, 1], [0, 1]] += _stretch(u, k1)
-    by_pixel = K[:2, :2] @ by_point @ inverse_of(K)[:2, :2]
-    return by_pixel, (u * (u * u).sum(1, keepdims=True)) @ K[:2, :2].T
+    return np.clip((u * stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_FAR_OUT, _FAR_OUT)
 
 
 @dataclass(frozen=True)
@@ -323,23 +291,31 @@ class Jacobians:
     points_by_k1: Array
 
 
-def _through_the_lens(observed: Observed) -> tuple[Array, Array, Array, Array]:
-    """
-    How residuals move with where k1 has not moved pixels yet, and over k1 itself.
+def _seen(observed: Observed) -> Array:
+    """X/Z, Y/Z (M + N, 2) of observations and points, as they would be seen without k1."""
+    ahead = np.maximum(observed.place[:, 2:], _NEAREST)
+    return np.concatenate([observed.place[:, :2] / ahead, observed.straight])
 
-    Those of observations (M, 2, 2) and (M, 2), and of points (N, 2, 2) and (N, 2).
-    """
-    seen = observed.place[:, :2] / np.maximum(observed.place[:, 2:], _NEAREST)
-    bent, by_k1 = _bending(observed.K, np.concatenate([seen, observed.straight]), observed.k1)
-    roots, count = np.concatenate([observed.root, observed.held]), len(seen)
-    bent, by_k1 = roots @ bent, times(roots, by_k1)
-    return bent[:count], by_k1[:count], bent[count:], by_k1[count:]
+
+def _through_the_lens(observed: Observed) -> tuple[Array, Array]:
+    """Give how residuals (M, 2, 2) and (N, 2, 2) move with pixels that k1 has not moved yet."""
+    roots = np.concatenate([observed.root, observed.held])
+    turned = roots @ bending(observed.K, _seen(observed), observed.k1)
+    return turned[:len(observed.root)], turned[len(observed.root):]
+
+
+def _over_k1(observed: Observed) -> tuple[Array, Array]:
+    """Give how residuals of observations (M, 2) and of points (N, 2) move with k1."""
+    u = _seen(observed)
+    moved = (u * (u * u).sum(1, keepdims=True)) @ observed.K[:2, :2].T
+    count = len(observed.root)
+    return times(observed.root, moved[:count]), times(observed.held, moved[count:])
 
 
 def jacobians(observed: Observed) -> Jacobians:
     """Differentiate the residuals of observations and of points."""
     K, R, place, ray = observed.K, observed.R, observed.place, observed.ray
-    root, *others = _through_the_lens(observed)
+    root, points_by_own = _through_the_lens(observed)
     scaled = root @ K[:2, :2] / np.maximum(place[:, 2], _NEAREST)[:, None, None]
     # Of the projection: d(x / z) = (dx - x / z dz) / z.
     ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _NEAREST)
@@ -355,7 +331,7 @@ def jacobians(observed: Observed) -> Jacobians:
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
     np.matmul(by_turned, inverse_of(K)[:, :2], out=by_own[:, :, 1:])
-    by_k1, points_by_own, points_by_k1 = others
+    by_k1, points_by_k1 = _over_k1(observed)
     return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
 
 
@@ -398,8 +374,8 @@ class Reduced:
     """
     Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
 
-    Those of k1 before them, in the whole. change gives what becomes of the landmarks with a step
-    of the poses.
+    Those of k1 before them in the whole, where it is asked for. change gives what becomes of the
+    landmarks with a step of the poses.
     """
 
     _whole: Array
@@ -407,19 +383,24 @@ class Reduced:
     _coupling: Array
     _variances: Array
     _slopes: Array
+    _lens: bool
 
     @property
     def H(self) -> Array:
         """Give (6 F, 6 F), at a k1 that is known."""
-        return self._whole[1:, 1:]
+        return self._whole[self._lens:, self._lens:]
 
     @property
     def g(self) -> Array:
         """Give (6 F,)."""
-        return self._gradient[1:]
+        return self._gradient[self._lens:]
 
     def of_k1(self) -> OfK1:
-        """Take out the poses too, as if nothing else were known of them, and leave k1."""
+        """
+        Take out the poses too, as if nothing else were known of them, and leave k1.
+
+        It has to be among the equations.
+        """
         row, H = self._whole[0, 1:], self.H
         # Where all is, and how large, is open and does not matter.
         gain = np.linalg.solve(H + np.diag(_OPEN * np.diag(H) + _HARDLY), row)
@@ -430,43 +411,48 @@ class Reduced:
     def change(self, step: Array) -> Array:
         """Give the steps (N, 3) of landmarks that go with a step (6 F,) of the poses."""
         return np.asarray(-np.einsum('nij,nj->ni', self._variances,
-                                     self._slopes + self._coupling[:, :, 1:] @ step))
+                                     self._slopes + self._coupling[:, :, self._lens:] @ step))
 
 
-def eliminate(observed: Observed, weights: Array, weight: float, frames: int) -> Reduced:
+def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
+              lens: bool = False) -> Reduced:
     """
     Sum up observations, and eliminate the landmarks.
 
-    weights: (M,) of the observations; weight: that of where the landmarks were found.
+    weights: (M,) of the observations; weight: that of where the landmarks were found; lens:
+    whether k1 is among the equations, or taken as it is.
     """
     if compiled.library is not None:
-        o, (root, by_k1, held, held_by_k1) = observed, _through_the_lens(observed)
+        o, (root, held) = observed, _through_the_lens(observed)
+        by_k1 = _over_k1(observed) if lens else None
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
-            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, root, by_k1, weights),
-            (held, held_by_k1, o.off, weight), (o.K, inverse_of(o.K)), (_NEAREST, _TRACE),
-            frames))
+            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, root, weights),
+            (held, o.off, weight), by_k1, (o.K, inverse_of(o.K)), (_NEAREST, _TRACE), frames),
+            lens)
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
+    size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
-    by_k1 = linear.by_k1[:, :, None] * root
     e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
-    J = np.zeros((count, 2, 1 + 6 * frames))
-    J[:, :, :1] = by_k1
+    J = np.zeros((count, 2, size))
     rows, by_poses = np.arange(count), np.zeros((count, 2, frames, 6))
     by_poses[rows, :, observed.frame], by_poses[rows, :, observed.anchor] = by_frame, by_anchor
-    J[:, :, 1:] = by_poses.reshape(count, 2, 6 * frames)
-    flat = J.reshape(-1, 1 + 6 * frames)
+    J[:, :, lens:] = by_poses.reshape(count, 2, 6 * frames)
+    by_k1 = linear.by_k1[:, :, None] * root
+    J[:, :, :lens] = by_k1[:, :, :lens]
+    flat = J.reshape(-1, size)
     H, g = flat.T @ flat, flat.T @ e.ravel()
     own, by_lens = linear.points_by_own, linear.points_by_k1
-    H[0, 0] += weight * (by_lens * by_lens).sum()
-    g[0] += weight * (by_lens * observed.off).sum()
     information, slopes = np.tile(np.eye(3) * _TRACE, (n, 1, 1)), np.zeros((n, 3))
     transposed = own.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ own
     slopes[:, 1:] = times(transposed, observed.off)
     with_k1, coupling = np.zeros((n, 3, 1)), np.zeros((n, frames, 3, 6))
     with_k1[:, 1:, 0] = times(transposed, by_lens)
+    if lens:
+        H[0, 0] += weight * (by_lens * by_lens).sum()
+        g[0] += weight * (by_lens * observed.off).sum()
     if count:
         # Each landmark is seen once by a frame, and has one anchor.
         coupling[observed.landmark, observed.frame] = back @ by_frame
@@ -477,8 +463,8 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
         slopes[seen] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
         with_k1[seen] += np.add.reduceat(back @ by_k1, first)
     coupled = np.concatenate(
-        [with_k1, coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
+        [with_k1[:, :, :lens], coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
     variances = np.asarray(np.linalg.inv(information), float)
-    gain = (variances @ coupled).reshape(-1, 1 + 6 * frames).T
-    return Reduced(H - gain @ coupled.reshape(-1, 1 + 6 * frames), g - gain @ slopes.ravel(),
-                   coupled, variances, slopes)
+    gain = (variances @ coupled).reshape(-1, size).T
+    return Reduced(H - gain @ coupled.reshape(-1, size), g - gain @ slopes.ravel(),
+                   coupled, variances, slopes, lens)

@@ -30,14 +30,12 @@ from djet_ros.core.bundle import (
     Poses,
     projected,
     Reduced,
-    straightened,
 )
 from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
     patch_warp,
-    rays,
     rotation_exp,
     rotation_log,
     skew,
@@ -50,6 +48,7 @@ from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import place_all, Placed
+from djet_ros.core.radial import straight_rays, straightened
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
@@ -244,7 +243,7 @@ class Window:
 
     def _rays(self, pixels: Array) -> Array:
         """Take pixels (N, 2) as the lens shows them to their viewing rays (N, 3), with z = 1."""
-        return rays(self._K, straightened(self._K, pixels, self._poses.k1))
+        return straight_rays(self._K, pixels, self._poses.k1)
 
     def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
         """
@@ -537,11 +536,11 @@ class Window:
             self._scale = max(noise_scale(observed), self._tuning.least_scale)
         return observed
 
-    def _reduced(self, observed: Observed) -> Reduced:
-        """Weigh observations robustly, and eliminate the depths."""
+    def _reduced(self, observed: Observed, lens: bool = False) -> Reduced:
+        """Weigh observations robustly, and eliminate the depths; lens: with k1 beside poses."""
         _, weights = self._robustly(observed, self._scale)
         weight = self._scale**-2
-        return eliminate(observed, weights * weight, weight, len(self._views))
+        return eliminate(observed, weights * weight, weight, len(self._views), lens)
 
     def _addition(self, H: Array) -> Addition:
         """Read the newest motion off the window, and how sure its length is."""
@@ -582,7 +581,7 @@ class Window:
         less. What frames that are gone told stays as it was with the k1 of then.
         """
         observed = observe(self._K, self._poses, self._landmarks)
-        told = self._reduced(observed).of_k1()
+        told = self._reduced(observed, lens=True).of_k1()
         _, weights = self._robustly(observed, self._scale)
         if told.curvature > 0:
             self.lens = self.lens.told(

@@ -1,0 +1,61 @@
+"""
+What radial distortion does to points and images, and how it is undone.
+
+By a coefficient k1, points u = (X/Z, Y/Z) are seen at u (1 + k1 |u|^2).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+from djet_ros.core.geometry import inverse_of, rays
+from djet_ros.core.masks import Mask
+from djet_ros.core.types import Array
+import numpy as np
+from numpy.typing import NDArray
+
+# Share by which k1 moves points at most: what is farther out is in no image, and must not be
+# folded into one.
+_FARTHEST = 0.1
+
+# Steps to where a point is without k1; each leaves a hundredth of what the one before did.
+_STRAIGHTENINGS = 3
+
+
+def stretch(u: Array, k1: float) -> Array:
+    """By what k1 multiplies points u (N, 2), (N, 1)."""
+    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -_FARTHEST, _FARTHEST))
+
+
+def bending(K: Array, u: Array, k1: float) -> Array:
+    """Tell how pixels of points u (N, 2) move with where they were without k1, (N, 2, 2)."""
+    by_point = 2 * k1 * u[:, :, None] * u[:, None]
+    by_point[:, [0, 1], [0, 1]] += stretch(u, k1)
+    return np.asarray(K[:2, :2] @ by_point @ inverse_of(K)[:2, :2])
+
+
+def straight_rays(K: Array, pixels: Array, k1: float) -> Array:
+    """Take pixels (N, 2) as k1 shows them to their viewing rays (N, 3), with z = 1."""
+    towards = rays(K, pixels)
+    u = seen = towards[:, :2]
+    for _ in range(_STRAIGHTENINGS):
+        u = seen / stretch(u, k1)
+    towards[:, :2] = u
+    return towards
+
+
+def straightened(K: Array, pixels: Array, k1: float) -> Array:
+    """Tell where pixels (N, 2) were without k1."""
+    return _pixels(K, straight_rays(K, pixels, k1)[:, :2])
+
+
+def bent(K: Array, pixels: Array, k1: float) -> Array:
+    """Tell where k1 shows pixels (N, 2) that are without."""
+    u = rays(K, pixels)[:, :2]
+    return _pixels(K, u * stretch(u, k1))
+
+
+def _pixels(K: Array, u: Array) -> Array:
+    return np.asarray(u @ K[:2, :2].T + K[:2, 2])
