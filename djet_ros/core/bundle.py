@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import times
-from djet_ros.core.radial import bending, stretch
+from djet_ros.core.radial import bending, bent, straightened, stretch
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -205,6 +205,27 @@ class Landmarks:
     def moved(self, step: Array) -> Landmarks:
         """Give the landmarks moved by a step (N, 3) of their inverse depths and points."""
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
+
+    def seen_otherwise(self, K: Array, before: float, after: float) -> Landmarks:
+        """
+        Give them as images without a k1 show them, that were seen without another before.
+
+        Their points stay: they are without all of it.
+        """
+        def moved(pixels: Array) -> tuple[Array, Array]:
+            """Pixels (N, 2) in the other image, and how the former ones change by those."""
+            straight = straightened(K, bent(K, pixels, before), after)
+            u = rays(K, straight)[:, :2]
+            back = bending(K, rays(K, pixels)[:, :2], before)
+            return straight, np.linalg.solve(back, bending(K, u, after))
+
+        found, by_found = moved(self.found)
+        minima, by_minima = moved(self.minima.reshape(-1, 2))
+        return replace(
+            self, found=found, held=self.held @ by_found,
+            slopes=times(by_found.transpose(0, 2, 1), self.slopes),
+            minima=minima.reshape(self.minima.shape),
+            roots=self.roots @ by_minima.reshape(self.roots.shape))
 
     def _by_anchor(self) -> tuple[Any, ...]:
         return self.anchors, self.found, self.held, self.points, self.rho, self.slopes, \

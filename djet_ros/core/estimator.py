@@ -19,6 +19,7 @@ from djet_ros.core.matching import match_foreseen, match_widely, Matches, RIGID
 from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import both
+from djet_ros.core.radial import straight_image
 from djet_ros.core.starts import all_round, five_point, Known, known_starts, starting_poses
 from djet_ros.core.surfaces import (
     DescriptorDistances,
@@ -51,10 +52,12 @@ class TwoViewEstimator:
     Estimates the relative pose of two calibrated views, ``x_current = R x_previous + t``.
 
     Has no state but its parameters: the same views and prior give the same result.
+
+    k1: radial distortion that images still have, without which it sees them.
     """
 
-    def __init__(self, config: EstimatorConfig | None = None) -> None:
-        self.config = config or EstimatorConfig()
+    def __init__(self, config: EstimatorConfig | None = None, k1: float = 0.0) -> None:
+        self.config, self.k1 = config or EstimatorConfig(), k1
         keep_freed_memory()
 
     def view(self, gray: NDArray[np.uint8], K: Array, features: Features | None = None,
@@ -62,9 +65,11 @@ class TwoViewEstimator:
         """
         Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3).
 
-        features: where they are known already; left_out: (H, W) bool, pixels that nothing is to
-        be told from.
+        features: where they are known already, in what it makes of the image; left_out: (H, W)
+        bool, pixels that nothing is to be told from.
         """
+        if self.k1:
+            gray, left_out = straight_image(gray, left_out, K, self.k1)
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:

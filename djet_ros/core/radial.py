@@ -1,7 +1,8 @@
 """
 What radial distortion does to points and images, and how it is undone.
 
-By a coefficient k1, points u = (X/Z, Y/Z) are seen at u (1 + k1 |u|^2).
+By a coefficient k1, points u = (X/Z, Y/Z) are seen at u (1 + k1 |u|^2). What is called straight is
+without it.
 """
 
 from __future__ import annotations
@@ -59,3 +60,39 @@ def bent(K: Array, pixels: Array, k1: float) -> Array:
 
 def _pixels(K: Array, u: Array) -> Array:
     return np.asarray(u @ K[:2, :2].T + K[:2, 2])
+
+
+class _Undoing(NamedTuple):
+    """OpenCV's maps to a straight image, and (H, W) what of it the image as it is does not show."""
+
+    maps: tuple[Any, Any]
+    unseen: Mask
+
+
+def straight_image(gray: NDArray[np.uint8], left_out: Mask | None, K: Array, k1: float,
+                   before: float = 0.0) -> tuple[NDArray[np.uint8], Mask | None]:
+    """
+    Give an image (H, W) without k1, and what is left out of it.
+
+    left_out: (H, W) bool, of the image as it is, or None; before: k1 that it is without already.
+    """
+    height, width = gray.shape
+    undoing = _undoing(np.asarray(K, float).tobytes(), (height, width), k1, before)
+    # A black rim would be an edge that moves with the camera.
+    straight = cv2.remap(gray, *undoing.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    hidden = undoing.unseen
+    if left_out is not None:
+        hidden = hidden | (cv2.remap(left_out.astype(np.uint8), *undoing.maps, cv2.INTER_NEAREST,
+                                     borderMode=cv2.BORDER_REPLICATE) > 0)
+    return np.asarray(straight, np.uint8), hidden if hidden.any() else None
+
+
+@lru_cache(maxsize=4)
+def _undoing(matrix: bytes, shape: tuple[int, int], k1: float, before: float) -> _Undoing:
+    K, (height, width) = np.frombuffer(matrix).reshape(3, 3), shape
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    x, y = straightened(K, bent(K, pixels, k1), before).T.reshape(2, height, width)
+    # Up to half a pixel beyond the middles of the outermost ones something is seen.
+    unseen = (np.abs(x - (width - 1) / 2) > width / 2) | (np.abs(y - (height - 1) / 2) > height / 2)
+    maps = cv2.convertMaps(x.astype(np.float32), y.astype(np.float32), cv2.CV_16SC2)
+    return _Undoing(maps, unseen)

@@ -8,7 +8,7 @@ they do not, and as long as it is unknown, lengths of steps come out ever longer
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
@@ -38,12 +38,15 @@ class SelfCalibration:
     What is known of k1.
 
     mean, covariance: (2,) and (2, 2) of k1, if there is any, and of what looks like it in all
-    windows, in pixels; first: standard deviation of k1 before anything was told.
+    windows, in pixels; first: standard deviation of k1 before anything was told; undone: k1 that
+    images are seen without by now, and unsure: how unsure it was when that was chosen.
     """
 
     mean: Array
     covariance: Array
     first: float
+    undone: float = 0.0
+    unsure: float = np.inf
 
     @classmethod
     def unknown(cls, K: Array, shape: tuple[int, ...]) -> SelfCalibration:
@@ -76,11 +79,32 @@ class SelfCalibration:
         none = _RIGHT * self.first / self.sigma * np.exp(-off**2 / 2)
         return float(self.mean[0] / (1 + none))
 
+    @property
+    def left(self) -> float:
+        """Give the k1 to be expected in images as they are seen by now."""
+        return self.k1 - self.undone
+
+    @property
+    def due(self) -> bool:
+        """
+        Whether images are to be seen without another k1 from now on.
+
+        First where there is one for certain, and then each time that it is twice as sure: a few
+        times in all, and never back and forth, as it becomes no less sure.
+        """
+        if np.isinf(self.unsure):
+            return self.certain
+        return self.sigma < self.unsure / 2
+
+    def straightened(self) -> SelfCalibration:
+        """Give the same where images are seen without the k1 that is to be expected."""
+        return replace(self, undone=self.k1, unsure=self.sigma)
+
     def told(self, k1: float, variance: float, left: float) -> SelfCalibration:
         """
         Take in what a window tells, by a Kalman filter.
 
-        k1: that suits it best, variance: by the noise of its observations; left: pixels that a k1
+        k1: that suits it best in images as they are seen, variance: by the noise of its observations; left: pixels that a k1
         of one leaves of itself, in the root mean square, once poses and depths have taken up what
         they can. Where that is little, as on a straight road, it takes little else to look the
         same: that is told from k1 by its being larger there than in turns.
@@ -89,5 +113,6 @@ class SelfCalibration:
         noise = variance + (_ANOTHER * self.first)**2
         gain = self.covariance @ row / (row @ self.covariance @ row + noise)
         covariance = self.covariance - np.outer(gain, row @ self.covariance)
-        return SelfCalibration(self.mean + gain * (k1 - row @ self.mean),
-                               (covariance + covariance.T) / 2, self.first)
+        off = self.undone + k1 - row @ self.mean
+        return replace(self, mean=self.mean + gain * off,
+                       covariance=(covariance + covariance.T) / 2)

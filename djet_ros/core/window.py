@@ -48,7 +48,7 @@ from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import place_all, Placed
-from djet_ros.core.radial import straight_rays, straightened
+from djet_ros.core.radial import straight_image, straight_rays, straightened
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.slants import slopes
 from djet_ros.core.surfaces import (
@@ -157,14 +157,14 @@ class Window:
         self._config, self._tuning = config, tuning
         self._distances = DescriptorDistances(config)
 
-    def start(self, view: View) -> None:
-        """Forget everything; this frame is the first."""
+    def start(self, view: View, lens: SelfCalibration | None = None) -> None:
+        """Forget everything, but what is known of the lens; this frame is the first."""
         self._K, self._views = view.K, [view]
-        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
+        self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
+        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.left)
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
-        self.lens = SelfCalibration.unknown(view.K, view.gray.shape)
         self._scale = 1.0
         # The newest camera as it was told, seen from the oldest keyframe; its pose may have been
         # refined since.
@@ -225,6 +225,30 @@ class Window:
     def tell(self, motion: Array) -> None:
         """Take note of what was told of the newest step, (4, 4), in the unit of the track."""
         self._told = self._told @ motion
+
+    def straighten(self, newest: View) -> None:
+        """
+        Go on with images without the k1 that is to be expected, of which newest is the first.
+
+        What was seen in images by now is where these would have shown it.
+        """
+        before, self.lens = self.lens.undone, self.lens.straightened()
+        self._views = [*(self._straight(view, before) for view in self._views[:-1]), newest]
+        moved = self._landmarks.seen_otherwise(self._K, before, self.lens.undone)
+        # What comes to lie beyond an image tells nothing any more.
+        inside = self._distances.describable(moved.found, newest.tested.shape)
+        self._landmarks = moved.of(inside)
+        self._poses = replace(self._poses, k1=self.lens.left)
+        self._latest = None
+
+    def _straight(self, view: View, before: float) -> View:
+        """
+        Give a view without the k1 that is to be expected, which was without another before.
+
+        As far as it is asked for: where landmarks were found in it, nothing is looked for anew.
+        """
+        gray, _ = straight_image(view.gray, None, self._K, self.lens.undone, before)
+        return replace(view, gray=gray, tested=self._distances.seen(gray))
 
     def landmarks(self) -> Array:
         """Places (M, 3) of landmarks in the newest frame, in the unit of the track."""
@@ -587,7 +611,7 @@ class Window:
             self.lens = self.lens.told(
                 self._poses.k1 + told.step, self._tuning.keyframes / told.curvature,
                 self._scale * np.sqrt(told.curvature / weights.sum()))
-            self._poses = replace(self._poses, k1=self.lens.k1)
+            self._poses = replace(self._poses, k1=self.lens.left)
 
     def _settle(self, chosen: NDArray[np.bool_]) -> None:
         """Take what some landmarks tell into the prior, and drop them, before a frame goes."""

@@ -96,6 +96,7 @@ class OneScale:
         # had in common with others.
         self._was_metric = False
         self._kept: Array = np.ones(2)
+        self.forget_lens()
 
     @property
     def keyframe(self) -> bool | None:
@@ -105,9 +106,25 @@ class OneScale:
     @property
     def lens(self) -> SelfCalibration | None:
         """Tell what distortion landmarks show to be left; None before that is certain."""
-        if not self._carried or self._speed is None or not self._window.lens.certain:
+        if not self._carried or self._speed is None:
             return None
-        return self._window.lens
+        lens = self._window.lens
+        return lens if lens.certain or lens.undone else None
+
+    @property
+    def k1_due(self) -> float | None:
+        """Tell without which k1 images are to be seen from now on; None where nothing changes."""
+        return self._window.lens.k1 if self._carried and self._window.lens.due else None
+
+    def straighten(self, newest: View) -> None:
+        """Go on with images without that k1, of which newest, the last one again, is the first."""
+        self._window.straighten(newest)
+        self._lens = self._window.lens
+
+    def forget_lens(self) -> None:
+        """Forget what is known of the lens, from where the track begins anew."""
+        # What outlasts a track: by what images are seen from now on.
+        self._lens: SelfCalibration | None = None
 
     @property
     def is_new(self) -> bool:
@@ -118,7 +135,7 @@ class OneScale:
         """Begin with a frame that nothing relates to the one before; the scale is a guess then."""
         if not self._carried:
             return
-        self._window.start(view)
+        self._window.start(view, self._lens)
         self._short = np.zeros(5)
         if self._speed is not None:
             self._doubt(_TORN**2)
@@ -227,6 +244,8 @@ class OneScale:
                 addition = self._window.add(view, relative, guess)
             except np.linalg.LinAlgError:  # of matches that do not hold together
                 addition = None
+            if self._lens is not None:
+                self._lens = self._window.lens
             if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
                 return addition
         self.begin(view)

@@ -176,6 +176,7 @@ class Tracker:
             self._camera = None
             self.counts.rejected_infos[problem.reason] += 1
             return self._reject(problem, stamp_ns(message.header))
+        self._odometry.another_lens()
         self.problem = None
         if self.last is None:
             self._await()

@@ -136,7 +136,8 @@ class VisualOdometry:
         """Take other parameters from the next frame on; the trajectory goes on."""
         another = self._last is not None and estimator != self._estimator.config
         self._config = odometry
-        self._estimator: TwoViewEstimator = TwoViewEstimator(estimator)
+        self._estimator: TwoViewEstimator = TwoViewEstimator(
+            estimator, 0.0 if self._last is None else self._estimator.k1)
         if another:  # it sees other features, and by other tests
             self._view = self._reference.view(self._estimator)
         self._scale = scale
@@ -162,9 +163,24 @@ class VisualOdometry:
         self._scale.reset()
         self._begin()
 
+    def another_lens(self) -> None:
+        """Hear that images will have another distortion left, from the next frame on."""
+        if self._last is not None and self._forget_lens():
+            self._view = self._reference.view(self._estimator)
+            self._one_scale.begin(self._view)
+
+    def _forget_lens(self) -> bool:
+        """Take images as they come; tells whether they were taken otherwise."""
+        self._one_scale.forget_lens()
+        straightened = self._estimator.k1 != 0
+        if straightened:
+            self._estimator = TwoViewEstimator(self._estimator.config)
+        return straightened
+
     def _begin(self) -> None:
         self._last = None
         self._one_scale.reset()
+        self._forget_lens()
         self._prior: RelativePose | None = None
         self._bad_pairs = self._since_ns = self._known_ns = 0
         self._standstill = Standstill()
@@ -186,12 +202,14 @@ class VisualOdometry:
         status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
         if last and frame.stamp_ns == last.stamp_ns:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
+        backwards = bool(last and frame.stamp_ns < last.stamp_ns)
+        if (backwards or status is Status.SIZE_CHANGED) and self._forget_lens():
+            view = None
         # Features are found once: now for the current frame, next time for the reference.
         if view is None:
             view = frame.view(self._estimator)
         if status is not Status.OK:
-            return self._start(frame, view, status, backwards=bool(
-                last and frame.stamp_ns < last.stamp_ns))
+            return self._start(frame, view, status, backwards)
 
         # The pair: the motion before it, and what others know, are some of its starting poses.
         known = self._known(frame)
@@ -224,7 +242,22 @@ class VisualOdometry:
         self._known_ns = frame.stamp_ns
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
+        if (k1 := self._one_scale.k1_due) is not None:
+            self._straighten(k1, relative)
         return result
+
+    def _straighten(self, k1: float, relative: RelativePose) -> None:
+        """
+        See images without a distortion that landmarks have shown, from the newest one on.
+
+        Pairs, and the ground of ``camera_height``, go by the images, and what is left is for the
+        window to find.
+        """
+        self._estimator = TwoViewEstimator(self._estimator.config, k1)
+        self._view = self._reference.view(self._estimator)
+        self._one_scale.straighten(self._view)
+        # The camera may go on like this, but what it saw is not where matches were.
+        self._prior = RelativePose(Status.OK, relative.R, relative.t)
 
     def _integrated(self, step: Step, motion: Array) -> tuple[Array, PathCovariance]:
         """Go on by a step: as landmarks have it that outlast pairs, or by the pair alone."""
