@@ -80,6 +80,9 @@ class GroundTuning:
 
 _TUNING = GroundTuning()
 
+# Heights of the camera for which a place on the ground stays in sight, as the camera goes on.
+SIGHT = _TUNING.flat - _TUNING.near
+
 
 @dataclass(frozen=True)
 class GroundMotion:

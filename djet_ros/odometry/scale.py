@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Protocol
 
 from djet_ros.config.sections import OdometryConfig
-from djet_ros.core.ground import Ground, GroundMotion
+from djet_ros.core.ground import Ground, GroundMotion, SIGHT
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
 from djet_ros.odometry.guess import Guess
@@ -117,11 +117,13 @@ class ScaleSource(Protocol):
     What it does not use of what it is shown, and what it does not measure, it leaves as it is.
 
     carried: whether the landmarks that frames share carry its scale from step to step, and on
-    where it falls silent; exact: whether each length that it knows is right as it is.
+    where it falls silent; exact: whether each length that it knows is right as it is; alike: of
+    how many metres in a row lengths err by the same share.
     """
 
     carried: bool = True
     exact: bool = False
+    alike: float = 0.0
 
     def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
                 relative: RelativePose) -> None:
@@ -246,6 +248,8 @@ class CameraHeightScale(ScaleSource):
     def __init__(self, height: float, pitch: float, uncertainty: float = 0.05) -> None:
         """Take the camera's height in metres and its pitch in rad, looking down is positive."""
         self._height, self._pitch, self._uncertainty = height, pitch, uncertainty
+        # A kerb, a lawn or a bump is seen from where it comes into sight until it leaves it.
+        self.alike = height * SIGHT
         self._ground: tuple[Array, tuple[int, ...], Ground] | None = None
         self.reset()
 

@@ -40,6 +40,10 @@ _LEAST_NOISE = 0.02
 # of them in a row are no accident.
 _SURPRISE, _IN_A_ROW = 16.0, 8
 
+# Of how many times as many metres as err alike these have to be: what is as long as that (a lawn as
+# long as the ground that is in sight) surprises for twice as long.
+_AS_LONG = 2.0
+
 # Seconds; chosen: short lengths over which tell together what each does not.
 _TOGETHER = 1.0
 
@@ -89,7 +93,8 @@ class OneScale:
         """Forget the factor; the next step makes a new unit."""
         self._speed: float | None = None
         self._log, self._variance, self._metric = 0.0, 0.0, False
-        self._surprises = 0
+        # How many lengths in a row were not believed, and their metres.
+        self._surprises = np.zeros(2)
         # Of short lengths since one told the factor: see _told.
         self._short = np.zeros(5)
         # Whether the track ever was in metres, and what is left of the errors that the last step
@@ -287,7 +292,7 @@ class OneScale:
             self._log, self._variance = told[0], 0.0
             self._metric, self._kept[0] = True, 0.0
         elif told is not None:
-            self._observe(*told)
+            self._observe(*told, measured.value)
 
     def _told(self, measured: Length, length: float, own: float, seconds: float
               ) -> tuple[float, float] | None:
@@ -313,19 +318,21 @@ class OneScale:
         noise = max(variance / metres**2, _LEAST_NOISE**2) + unsure / length**2
         return float(np.log(metres / length)), noise
 
-    def _observe(self, observed: float, noise: float) -> None:
-        """Take an observation of the logarithm of the factor, with its variance."""
+    def _observe(self, observed: float, noise: float, metres: float) -> None:
+        """Take an observation of the logarithm of the factor over some metres, and its variance."""
         if not self._metric:
             self._log, self._variance, self._metric = observed, noise, True
             self._kept[0] = 0.0
             return
-        off = observed - self._log
+        off, alike = observed - self._log, self._source.alike
         if off**2 > _SURPRISE * (self._variance + noise):
-            self._surprises += 1
-            if self._surprises < _IN_A_ROW:
+            self._surprises += [1, metres]
+            if (self._surprises < [_IN_A_ROW, _AS_LONG * alike]).any():
                 return
             self._variance += off**2
-        self._surprises = 0
+        self._surprises = np.zeros(2)
+        # Of an error that n of them have in common, they make as sure as one: each by an n-th.
+        noise *= max(alike / metres, 1.0)
         gain = self._variance / (self._variance + noise)
         self._log += gain * off
         self._variance *= 1 - gain
