@@ -89,12 +89,12 @@ class SelfCalibration:
         """
         Whether images are to be seen without another k1 from now on.
 
-        First where there is one for certain, and then each time that it is twice as sure: a few
-        times in all, and never back and forth, as it becomes no less sure.
+        First where there is one for certain, and then each time that twice as much is known of it:
+        a few times in all, and never back and forth, as it becomes no less sure.
         """
         if np.isinf(self.unsure):
             return self.certain
-        return self.sigma < self.unsure / 2
+        return 2 * self.sigma**2 < self.unsure**2
 
     def straightened(self) -> SelfCalibration:
         """Give the same where images are seen without the k1 that is to be expected."""
