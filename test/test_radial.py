@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.radial import bending, bent, straightened
+from djet_ros.core.radial import bending, bent, straight_image, straightened
 import numpy as np
+from numpy.typing import NDArray
 import pytest
 
 K = np.array([[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
@@ -27,3 +28,44 @@ def test_a_pixel_is_bent_as_a_lens_does_and_its_neighbours_with_it(k1: float) ->
     for axis, step in enumerate(np.eye(2) * 1e-4):
         moved = (bent(K, pixels + step, k1) - bent(K, pixels - step, k1)) / 2e-4
         assert bending(K, places[:, :2], k1)[:, :, axis] == pytest.approx(moved, abs=1e-6)
+
+
+def clouds() -> NDArray[np.uint8]:
+    """Give a smooth image (480, 640), which interpolation hardly changes."""
+    noise = np.random.default_rng(18).uniform(0, 255, (480, 640)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 6)
+    return np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
+
+
+@pytest.mark.parametrize('k1', [-0.05, 0.05])
+def test_an_image_is_straightened_as_opencv_does_it(k1: float) -> None:
+    gray = clouds()
+    straight, unseen = straight_image(gray, K, k1)
+    expected, whole = (cv2.undistort(image, K, np.array([k1, 0, 0, 0]))
+                       for image in (gray, np.full_like(gray, 255)))
+    # Beside the rim OpenCV goes on in black.
+    assert np.abs(straight.astype(int) - expected)[whole == 255].max() <= 2
+    # A lens that shows the rim farther out shows less of the world, and none of what is beyond.
+    seen = np.ones(gray.shape, bool) if unseen is None else ~unseen
+    assert (unseen is not None) == (k1 > 0)
+    assert (seen != (whole > 0)).mean() < 0.01
+
+
+def test_what_is_straightened_by_and_by_is_as_if_it_were_at_once() -> None:
+    gray = clouds()
+    once, _ = straight_image(gray, K, 0.03)
+    partly, _ = straight_image(gray, K, 0.02)
+    twice, _ = straight_image(partly, K, 0.03, before=0.02)
+    inner = np.s_[40:-40, 40:-40]
+    assert np.abs(once.astype(int) - twice)[inner].max() <= 3
+
+
+def test_what_is_left_out_is_where_it_is_seen_in_the_straight_image() -> None:
+    left_out = np.zeros((480, 640), bool)
+    left_out[30:90, 40:120] = True
+    _, hidden = straight_image(clouds(), K, -0.05, left_out)
+    assert hidden is not None
+    corners = straightened(K, np.array([[40.0, 30], [119, 89]]), -0.05)
+    rows, columns = np.nonzero(hidden)
+    found = np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]])
+    assert np.abs(found - corners).max() < 3

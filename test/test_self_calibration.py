@@ -60,6 +60,33 @@ def test_windows_without_any_noise_do_not_make_it_sure() -> None:
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
 
 
+def test_images_are_straightened_when_it_is_certain_and_again_when_twice_as_much_is_known() -> None:
+    rng, lens, undone = np.random.default_rng(1), SelfCalibration.unknown(K, (376, 1241)), []
+    for _ in range(300):
+        # Of what is undone by now, windows see no more.
+        lens = lens.told(0.01 - lens.undone + 0.004 * rng.normal(), 0.004**2, TURN)
+        if lens.due:
+            lens = lens.straightened()
+            undone.append((lens.undone, lens.sigma))
+            assert not lens.due
+    sigmas = np.array([sigma for _, sigma in undone])
+    assert 2 <= len(undone) <= 6
+    assert undone[0][0] > 3 * sigmas[0]
+    assert (2 * sigmas[1:]**2 < sigmas[:-1]**2).all()
+    assert all(abs(k1 - 0.01) < 3 * sigma for k1, sigma in undone)
+    assert lens.left == pytest.approx(0.01 - lens.undone, abs=3 * lens.sigma)
+    assert lens.k1 == pytest.approx(0.01, abs=2.5 * lens.sigma)
+
+
+def test_a_lens_that_is_right_is_never_straightened() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        lens = SelfCalibration.unknown(K, (376, 1241))
+        for _ in range(100):
+            lens = lens.told(0.004 * rng.normal(), 0.004**2, TURN)
+            assert not lens.due
+
+
 def turned(k1: float, frames: int = 75) -> Tracker:
     """Track a rendered turn that is seen through a lens of which the calibration knows nothing."""
     scene = make_scene('sharp_turn', 0, (620, 188))

@@ -1,6 +1,7 @@
 """One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
@@ -8,10 +9,19 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
-from djet_ros.core.window import _around_patches, _PATCH, Window, WINDOW_TUNING
+from djet_ros.core.self_calibration import SelfCalibration
+from djet_ros.core.window import _around_patches, _PATCH, Addition, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.scale import ConstantScale, Scale, scale_source, SpeedScale, Unmeasured
+from djet_ros.odometry.scale import (
+    ConstantScale,
+    Length,
+    Scale,
+    scale_source,
+    ScaleSource,
+    SpeedScale,
+    Unmeasured,
+)
 from djet_ros.odometry.structure import OneScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
@@ -425,3 +435,54 @@ def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
     assert before.stationary and after.stationary
     assert before.scale_kind is Scale.METRIC
     assert after.scale_kind is Scale.RELATIVE
+
+
+class Ground(ScaleSource):
+    """A source that tells given lengths in metres, one for each second, each to two per cent."""
+
+    def __init__(self, metres, alike):
+        self.metres, self.alike = metres, alike
+
+    def between(self, start_ns, end_ns):
+        metres = self.metres[start_ns // 10**9]
+        return Length(metres, 0.02 * metres, True)
+
+
+def factors(metres, alike):
+    """Logarithms of the metres of a unit after each of some lengths (N,), and their variances."""
+    step = Addition(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
+    scale = OneScale()
+    scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
+    # A window by which each step is as long as the one before, to two thousandths.
+    scale._window = SimpleNamespace(
+        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
+        add=lambda view, relative, guess: step)
+    ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
+    told = []
+    for number in range(len(metres)):
+        scale.of_step((number * 10**9, (number + 1) * 10**9), None, ahead)
+        told.append((scale._log, scale._variance))
+    return np.array(told).T
+
+
+def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_says():
+    rng, squares = np.random.default_rng(0), {0: [], 8: []}
+    for _ in range(60):
+        metres = np.exp(np.repeat(rng.normal(0, 0.02, 20), 8))
+        for alike, ended in squares.items():
+            logs, variances = factors(metres, alike)
+            ended.append(logs[-1]**2 / variances[-1])
+    assert 0.5 < np.mean(squares[8]) < 1.5
+    # Were each taken for itself, it would be far too sure.
+    assert np.mean(squares[0]) > 3
+
+
+def test_a_lawn_as_long_as_the_ground_in_sight_does_not_make_another_scale():
+    metres = np.ones(160)
+    metres[80:95] = 0.8
+    logs, _ = factors(metres, alike=8)
+    assert np.abs(logs).max() < 0.01
+    # What lasts is believed.
+    metres[80:] = 0.8
+    logs, _ = factors(metres, alike=8)
+    assert logs[-1] == pytest.approx(np.log(0.8), abs=0.02)

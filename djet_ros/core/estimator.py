@@ -69,12 +69,16 @@ class TwoViewEstimator:
         bool, pixels that nothing is to be told from.
         """
         if self.k1:
-            gray, left_out = straight_image(gray, left_out, K, self.k1)
+            gray, left_out = straight_image(gray, K, self.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:
             features = self._detected(gray, mask, smoothed)
         return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
+
+    def seen(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
+        """Give an image (H, W) as its views have it, with the pixels that pairs speak of."""
+        return straight_image(gray, K, self.k1)[0] if self.k1 else gray
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
         """Detect all features of a gray image (H, W) uint8, but where a mask (H, W) is True."""

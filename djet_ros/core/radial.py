@@ -69,7 +69,7 @@ class _Undoing(NamedTuple):
     unseen: Mask
 
 
-def straight_image(gray: NDArray[np.uint8], left_out: Mask | None, K: Array, k1: float,
+def straight_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask | None = None,
                    before: float = 0.0) -> tuple[NDArray[np.uint8], Mask | None]:
     """
     Give an image (H, W) without k1, and what is left out of it.

@@ -247,7 +247,7 @@ class Window:
 
         As far as it is asked for: where landmarks were found in it, nothing is looked for anew.
         """
-        gray, _ = straight_image(view.gray, None, self._K, self.lens.undone, before)
+        gray, _ = straight_image(view.gray, self._K, self.lens.undone, before=before)
         return replace(view, gray=gray, tested=self._distances.seen(gray))
 
     def landmarks(self) -> Array:

@@ -194,8 +194,8 @@ def bent(lens: SelfCalibration | None) -> Complaint | None:
         return None
     return Complaint('distortion left', 'WARN', (
         f'by its landmarks the images have a distortion left, of k1 = {lens.k1:.4f} +- '
-        f'{lens.sigma:.4f}; lengths make up for it from where it is found, turns and directions '
-        'do not: djet lens finds it by all of the recording, and says what to do'))
+        f'{lens.sigma:.4f}; from where it is found on they are seen without it, which is too late '
+        'for what was before: djet lens finds it by all of the recording, and says what to do'))
 
 
 def _still(images: int, stamp_ns: int) -> Complaint | None:

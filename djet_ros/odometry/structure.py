@@ -292,12 +292,12 @@ class OneScale:
             self._log, self._variance = told[0], 0.0
             self._metric, self._kept[0] = True, 0.0
         elif told is not None:
-            self._observe(*told, measured.value)
+            self._observe(*told)
 
     def _told(self, measured: Length, length: float, own: float, seconds: float
-              ) -> tuple[float, float] | None:
+              ) -> tuple[float, float, float] | None:
         """
-        Give the logarithm of the factor by a length in metres, and its variance, if it tells any.
+        Give the logarithm of the factor, its variance, and the metres that tell it, if any do.
 
         What may be noise about zero says that the camera stands. Beyond _SURPRISE it is none, and
         the logarithm is that of a length with an error e of at most a quarter of it: what is
@@ -316,7 +316,7 @@ class OneScale:
             return None
         metres, variance, length, unsure, _ = taken.tolist()
         noise = max(variance / metres**2, _LEAST_NOISE**2) + unsure / length**2
-        return float(np.log(metres / length)), noise
+        return float(np.log(metres / length)), noise, metres
 
     def _observe(self, observed: float, noise: float, metres: float) -> None:
         """Take an observation of the logarithm of the factor over some metres, and its variance."""

@@ -383,7 +383,8 @@ class Tracker:
             return None
         return Outgoing('debug_image', self._messages.picture(
             self._frame.stamp_ns, self._frame.frame_id,
-            debug_image(self._frame.gray, self.last.relative)))
+            debug_image(self._odometry.estimator.seen(self._frame.gray, self._frame.K),
+                        self.last.relative)))
 
     def landmarks(self) -> Outgoing | None:
         """Give the landmarks of the last pair; None where none of them carry its scale."""
