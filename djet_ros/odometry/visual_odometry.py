@@ -166,7 +166,7 @@ class VisualOdometry:
     def another_lens(self) -> None:
         """Hear that images will have another distortion left, from the next frame on."""
         if self._last is not None and self._forget_lens():
-            self._view = self._reference.view(self._estimator)
+            self._see_anew()
             self._one_scale.begin(self._view)
 
     def _forget_lens(self) -> bool:
@@ -243,10 +243,20 @@ class VisualOdometry:
         self._prior, self._bad_pairs = relative, 0
         self._standstill.moved()
         if (k1 := self._one_scale.k1_due) is not None:
-            self._straighten(k1, relative)
+            self._straighten(k1)
         return result
 
-    def _straighten(self, k1: float, relative: RelativePose) -> None:
+    def _see_anew(self) -> None:
+        """See the reference frame as the estimator has images by now."""
+        self._view = self._reference.view(self._estimator)
+        self._forget_matches()
+
+    def _forget_matches(self) -> None:
+        """Keep of the motion before that the camera may go on like this, but not what it saw."""
+        if self._prior is not None:
+            self._prior = RelativePose(Status.OK, self._prior.R, self._prior.t)
+
+    def _straighten(self, k1: float) -> None:
         """
         See images without a distortion that landmarks have shown, from the newest one on.
 
@@ -254,10 +264,8 @@ class VisualOdometry:
         window to find.
         """
         self._estimator = TwoViewEstimator(self._estimator.config, k1)
-        self._view = self._reference.view(self._estimator)
+        self._see_anew()
         self._one_scale.straighten(self._view)
-        # The camera may go on like this, but what it saw is not where matches were.
-        self._prior = RelativePose(Status.OK, relative.R, relative.t)
 
     def _integrated(self, step: Step, motion: Array) -> tuple[Array, PathCovariance]:
         """Go on by a step: as landmarks have it that outlast pairs, or by the pair alone."""
@@ -414,10 +422,8 @@ class VisualOdometry:
                 self._one_scale.bridge((self._since_ns, frame.stamp_ns), view, relative, motion)
             self._refer_to(frame, view)
             self._pose, self._path = result.pose, path
-            if self._prior is not None:
-                # Its matches are with an older image: the camera may go on like this, but what
-                # it saw is not where they were.
-                self._prior = RelativePose(Status.OK, self._prior.R, self._prior.t)
+            # Its matches are with an older image.
+            self._forget_matches()
         if given_up:
             self._prior = None
         return result
