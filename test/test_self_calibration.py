@@ -69,7 +69,7 @@ def test_windows_without_any_noise_do_not_make_it_sure() -> None:
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
 
 
-def test_images_are_straightened_when_it_is_certain_and_again_when_twice_as_much_is_known() -> None:
+def test_images_are_straightened_once_it_is_certain_and_again_when_more_is_known() -> None:
     rng, lens, undone = np.random.default_rng(1), SelfCalibration.unknown(K, (376, 1241)), []
     for _ in range(300):
         # Of what is undone by now, windows see no more.

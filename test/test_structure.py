@@ -8,8 +8,8 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.self_calibration import SelfCalibration
+from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import _around_patches, _PATCH, Addition, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame

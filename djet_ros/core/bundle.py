@@ -217,7 +217,7 @@ class Landmarks:
             straight = straightened(K, bent(K, pixels, before), after)
             u = rays(K, straight)[:, :2]
             back = bending(K, rays(K, pixels)[:, :2], before)
-            return straight, np.linalg.solve(back, bending(K, u, after))
+            return straight, np.asarray(np.linalg.solve(back, bending(K, u, after)), float)
 
         found, by_found = moved(self.found)
         minima, by_minima = moved(self.minima.reshape(-1, 2))
@@ -445,12 +445,11 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     """
     if compiled.library is not None:
         o, (root, held) = observed, _through_the_lens(observed)
-        by_k1 = _over_k1(observed) if lens else None
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, root, weights),
-            (held, o.off, weight), by_k1, (o.K, inverse_of(o.K)), (_NEAREST, _TRACE), frames),
-            lens)
+            (held, o.off, weight), _over_k1(o) if lens else None, (o.K, inverse_of(o.K)),
+            (_NEAREST, _TRACE), frames), lens)
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]

@@ -63,7 +63,7 @@ def _pixels(K: Array, u: Array) -> Array:
 
 
 class _Undoing(NamedTuple):
-    """OpenCV's maps to a straight image, and (H, W) what of it the image as it is does not show."""
+    """OpenCV's maps to a straight image, and (H, W) what of that the other one does not show."""
 
     maps: tuple[Any, Any]
     unseen: Mask
@@ -90,9 +90,10 @@ def straight_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask 
 @lru_cache(maxsize=4)
 def _undoing(matrix: bytes, shape: tuple[int, int], k1: float, before: float) -> _Undoing:
     K, (height, width) = np.frombuffer(matrix).reshape(3, 3), shape
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-    x, y = straightened(K, bent(K, pixels, k1), before).T.reshape(2, height, width)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1, dtype=float)
+    x, y = straightened(K, bent(K, pixels.reshape(-1, 2), k1), before).T.reshape(2, height, width)
     # Up to half a pixel beyond the middles of the outermost ones something is seen.
-    unseen = (np.abs(x - (width - 1) / 2) > width / 2) | (np.abs(y - (height - 1) / 2) > height / 2)
+    unseen = ((np.abs(x - (width - 1) / 2) > width / 2)
+              | (np.abs(y - (height - 1) / 2) > height / 2))
     maps = cv2.convertMaps(x.astype(np.float32), y.astype(np.float32), cv2.CV_16SC2)
     return _Undoing(maps, unseen)

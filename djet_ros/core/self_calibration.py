@@ -106,8 +106,9 @@ class SelfCalibration:
 
         k1: that suits it best in images as they are seen, variance: by the noise of its
         observations; left: pixels that a k1 of one leaves of itself, in the root mean square,
-        once poses and depths have taken up what they can. Where that is little, as on a straight road, it takes little else to look the
-        same: that is told from k1 by its being larger there than in turns.
+        once poses and depths have taken up what they can. Where that is little, as on a straight
+        road, it takes little else to look the same: that is told from k1 by its being larger
+        there than in turns.
         """
         row = np.array([1.0, 1 / left])
         noise = variance + (_ANOTHER * self.first)**2

@@ -40,8 +40,8 @@ _LEAST_NOISE = 0.02
 # of them in a row are no accident.
 _SURPRISE, _IN_A_ROW = 16.0, 8
 
-# Of how many times as many metres as err alike these have to be: what is as long as that (a lawn as
-# long as the ground that is in sight) surprises for twice as long.
+# How many times as long as lengths err alike these have to last: what is as long as that (a lawn
+# as long as the ground that is in sight) surprises for twice as long.
 _AS_LONG = 2.0
 
 # Seconds; chosen: short lengths over which tell together what each does not.
@@ -76,6 +76,8 @@ class OneScale:
     def __init__(self) -> None:
         self._estimator: EstimatorConfig | None = None
         self._share, self._carried = 0.0, False
+        # What outlasts a track: by what images are straightened.
+        self._lens: SelfCalibration | None = None
         self.reset()
 
     def configure(self, estimator: EstimatorConfig, source: ScaleSource, share: float) -> bool:
@@ -128,8 +130,7 @@ class OneScale:
 
     def forget_lens(self) -> None:
         """Forget what is known of the lens, from where the track begins anew."""
-        # What outlasts a track: by what images are seen from now on.
-        self._lens: SelfCalibration | None = None
+        self._lens = None
 
     @property
     def is_new(self) -> bool:
@@ -319,7 +320,7 @@ class OneScale:
         return float(np.log(metres / length)), noise, metres
 
     def _observe(self, observed: float, noise: float, metres: float) -> None:
-        """Take an observation of the logarithm of the factor over some metres, and its variance."""
+        """Take an observation of the factor's logarithm over some metres, and its variance."""
         if not self._metric:
             self._log, self._variance, self._metric = observed, noise, True
             self._kept[0] = 0.0
