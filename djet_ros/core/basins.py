@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.covariance import difference
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
 from djet_ros.core.jet import (
@@ -14,6 +15,7 @@ from djet_ros.core.jet import (
     JetProblem,
     Loss,
     minimise,
+    moved,
     Residuals,
     Solution,
 )
@@ -67,6 +69,14 @@ class BasinTuning:
     agreeing: float = 3.0
     # chosen: basins that are left to themselves to see whether they turn away
     turned_starts: int = 5
+    # standard deviations that normal, independent errors would have; chosen: from so far on either
+    # side other minima are looked for, beyond what errors alike let the right one be away
+    beside: float = 20.0
+    # chosen: steps from there
+    steps_beside: int = 6
+    # squared standard deviations, over five degrees of freedom, that one pose of a thousand
+    # exceeds: what is nearer is the same minimum
+    same_minimum: float = 20.5
     # standard deviations by which matches prefer the basin ahead to all others: one wrong of three
     # millions
     clear: float = 5.0
@@ -209,6 +219,61 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
     return solution, tuple(
         Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
         if apart(poses[best], pose) > BASIN_TUNING.same_basin)
+
+
+def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: Loss
+                  ) -> tuple[Solution, tuple[Rival, ...]]:
+    """
+    Take the lowest of the minima that lie beside a solution, and give the others as its rivals.
+
+    A loss that redescends has one for each group of matches that a pose takes for right. Where few
+    decide about a direction, these lie side by side along it, within what is one basin elsewhere.
+    So some matches are led back from either side along the two directions that are told least, to
+    the minimum that they were at, but for few; the others are refined on all.
+    """
+    J, squared = solution.residuals.jacobian, solution.residuals.r**2
+    _, weights = loss(squared)
+    information = (J * weights) @ J.T / max(float((weights * squared).sum() / weights.sum()), 1e-18)
+    if not np.isfinite(information).all():
+        return solution, ()
+    told, axes = np.linalg.eigh(information)
+    if told[0] <= 1e-12 * told[-1]:
+        return solution, ()
+    steps = (axes[:, :2] * BASIN_TUNING.beside / np.sqrt(told[:2])).T
+    starts = [Pose(*moved(solution.R, solution.t, solution.residuals.tangents, step))
+              for step in np.concatenate([steps, -steps])]
+    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.few_matches))
+    led = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_beside).poses()
+    bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(some.blur)
+    others = _unlike(led, solution, information, bound)[1:]
+    minima = [solution, *(minimise(problem, led[number].R, led[number].t, loss)
+                          for number in others)]
+    minima = [minima[number] for number in _unlike(
+        [minimum.pose for minimum in minima], solution, information, BASIN_TUNING.same_minimum)]
+    if len(minima) == 1:
+        return solution, ()
+    poses = [minimum.pose for minimum in minima]
+    losses = losses_at(problem, poses, loss)
+    best = int(losses.sum(1).argmin())
+    preferred = preferences(losses, places, best)
+    return minima[best], tuple(Rival(pose, float(preference)) for number, (pose, preference)
+                               in enumerate(zip(poses, preferred)) if number != best)
+
+
+def _unlike(poses: Sequence[Pose], solution: Solution, information: Array, bound: float
+            ) -> list[int]:
+    """
+    Number the poses that are farther from all before them than a bound has it.
+
+    information: (5, 5) in the parameters of the solution, by which squared distances are taken.
+    """
+    off = np.array([difference(solution.R, solution.t, pose) for pose in poses])
+    kept: list[int] = []
+    for number in range(len(poses)):
+        apart_from = off[kept] - off[number]
+        if ((apart_from @ information * apart_from).sum(1) > bound).all():
+            kept.append(number)
+    return kept
 
 
 def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose | None) -> int:

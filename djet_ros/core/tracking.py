@@ -13,6 +13,7 @@ from djet_ros.core.basins import (
     judged,
     LEAST_SCALE,
     likeliest,
+    lowest_around,
     right_basin,
 )
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -102,8 +103,9 @@ class Track:
     where gray levels have y (N, 2), through the last warp, or y itself where that was not asked;
     minima: (N, 2) the surfaces' own minima y*, joined with these for matches that voted; y_opt:
     (N, 2) the final step onto the epipolar line; losses: (N,) last known surface values; rounds:
-    what led there; rivals: other motions that explain the voting matches; guess: whether that is
-    so because two bodies move, and nothing tells which is the world.
+    what led there; rivals: other motions that explain the voting matches; beside: other minima in
+    the basin of the pose; guess: whether there are rivals because two bodies move, and nothing
+    tells which is the world.
     """
 
     pose: Pose
@@ -118,6 +120,7 @@ class Track:
     indefinite: int
     rounds: tuple[Round, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    beside: tuple[Rival, ...] = ()
     guess: bool = False
 
     @property
@@ -312,7 +315,7 @@ class _Algorithm:
                 self.first = found
             last = (found.converged and self._seen_as_it_has_them) or number == most
             if last:
-                found, placed, rivals = self._concluded(found)
+                found, placed, rivals, beside = self._concluded(found)
             # Keypoints go towards their optimum on the epipolar line of the new pose.
             pose = found.solution.pose
             if by_places and (self._noise_of_matches(pose)
@@ -329,7 +332,7 @@ class _Algorithm:
         minima = paraboloids.minima()
         minima[voting] = (self._K @ found.problem.rays_y)[:2].T
         return Track(pose, found.problem, found.loss, found.solution.residuals, voting, minima,
-                     placed, optimum, self._losses, no_minimum, tuple(rounds), rivals)
+                     placed, optimum, self._losses, no_minimum, tuple(rounds), rivals, beside)
 
     @property
     def _seen_as_it_has_them(self) -> bool:
@@ -372,7 +375,8 @@ class _Algorithm:
             self._ours[voting] = np.abs(solution.residuals.r) < TRACK_TUNING.by_itself * loss.scale
         return _Optimised(voting, places, problem, loss, solution, converged, basin.rivals)
 
-    def _concluded(self, found: _Optimised) -> tuple[_Optimised, Placed, tuple[Rival, ...]]:
+    def _concluded(self, found: _Optimised
+                   ) -> tuple[_Optimised, Placed, tuple[Rival, ...], tuple[Rival, ...]]:
         """Take in at the end where matches are found, and hold the pose against its rivals."""
         pair, voting = self._pair, found.voting
         rivals: tuple[Rival, ...] = ()
@@ -388,7 +392,12 @@ class _Algorithm:
             solution, rivals = judged(found.problem, found.places, found.solution,
                                       self.first.rivals, found.loss, pair.before)
             found = replace(found, solution=solution)
-        return found, placed, rivals
+        beside: tuple[Rival, ...] = ()
+        if self._config.loss != 'none':
+            solution, beside = lowest_around(found.problem, found.places, found.solution,
+                                             found.loss)
+            found = replace(found, solution=solution)
+        return found, placed, rivals, beside
 
     def _noise_of_matches(self, pose: Pose) -> float:
         """Tell how far matches are from their epipolar lines, in pixels."""

@@ -140,7 +140,7 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: 
     """
     status = Status.TWO_MOTIONS if track.guess else Status.OK
     unsure: list[Array] = []
-    for rival in track.rivals:
+    for rival in (*track.rivals, *track.beside):
         off = difference(pose.R, pose.t, rival.pose)
         if squared_distance(covariances[0], off) < _SURPRISING:
             continue
