@@ -7,11 +7,19 @@ from functools import cached_property
 
 from djet_ros.core.cells import beginnings
 from djet_ros.core.geometry import rotation_log, sphere_tangents
-from djet_ros.core.jet import LEAST_CURVED, Loss, Residuals
+from djet_ros.core.jet import (
+    epipolar_residuals,
+    JetProblem,
+    LEAST_CURVED,
+    Loss,
+    moved,
+    Residuals,
+)
+from djet_ros.core.sketch import refine_all
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr
+from scipy.special import chdtri, fdtri
 
 # Matches in one cell of this side (pixels) are taken to err together: corners are found in several
 # sizes, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
@@ -20,19 +28,28 @@ CELL = 32
 # Into so many cells the matches are cut too: none of these may hold all that is known either.
 LARGE_CELLS = 20
 
-# What two small cells err alike, by whether they share one of 64, 128, 256 or 512 pixels. Chosen:
-# it halves from one to the next; on scenes rendered with seeds 0-4 it fell to 0.2 to 0.55.
-_FARTHER = np.array([1, 1 / 2, 1 / 4, 1 / 8])
+# Matches err alike most where their patches overlap: pairs are told apart by whether they share a
+# cell of 16, 32, 64, 128, 256 or 512 pixels, twice the side of the smallest cells and so on.
+_SMALLEST, _SIDES = 8, 6
 
-# Squared errors over a covariance that v normal errors tell are Hotelling's T^2: its bound of 99.9
-# % in five directions is that of chi^2 times 1 + 13 / v + 220 / v^2 + 4e6 / v^6, to a tenth of
-# what is above 1, where v is above 8. C cells that are alike tell v = 5 C errors; their shares of
-# the whole, squared and summed up, are 1 / C = 5 / v.
-_HOTELLING = 13 / 5, 220 / 5**2, 4e6 / 5**6
+# Chosen: what matches err alike falls by so much from one of these to the next, as the distance to
+# the power of -1.5. On scenes rendered with seeds 0-4 residuals fall faster from 32 on; but what
+# stays the same over the whole image is not seen in them, as the pose follows it.
+_FALL = 2**-1.5
 
-# chosen: errors with longer tails than normal ones tell a variance as fewer of those would; 1.5
-# times fewer where the kurtosis is 4, not 3.
-_LONG_TAILS = 1.5
+# From which of them on it is told in turn, and from which on no small cell holds it.
+_TOLD_FROM, _BEYOND = (0, 2, 3, 4), 2
+
+# Bound of chi^2 in five directions that holds 95 %.
+_BOUND = float(chdtri(5, 0.05))
+
+# At this probability bounds are those of Fisher's F of (5, v): then the bound of 95 % holds 95 to
+# 98 %, and that of 99.9 % all but 0.1 to 0.4 %, for any v from 7 on. At 99.9 % itself the first
+# would hold more than 99 % where v is 7; at 95 %, or by the expected square, the second too little.
+_TOLD_AT = 0.99
+
+# chosen: no direction is taken to be told more than twenty times as badly as the curvature says.
+_LEAST_RISE = 0.05
 
 # Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
 # what the pose's was before patches were warped, and has not been measured anew.
@@ -77,18 +94,21 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all() or np.linalg.cond(H) > 1e12:
         return UNKNOWN
-    flattened = _flattened(H, (J * loss.curvature(squared)) @ J.T)
-    cells = _Cells.of(H, places, J, weights, residuals.r)
-    large = cells.in_larger(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS))
-    if flattened is None or cells.without is None or large.without is None:
+    curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
+    fine = _Cells.of(H, places, J, weights, residuals.r)
+    cells = fine.in_larger(CELL)
+    large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
+    if curved is None or cells.without is None or large.without is None:
         return UNKNOWN
     moves = np.einsum('cij,jc->ic', cells.without, cells.gradients)
     size = cells.size(moves)
     by_itself = _jackknife(cells, cells.without, moves)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = by_itself + _alike(cells, by_itself, size, noise)
+    covariance = by_itself + _alike(fine, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
     covariance += growth * size * _hardly_told(cells, growth)
+    # What a pose moves by over what it would by H, the loss's weights.
+    flattened = np.linalg.solve(curved, H)
     covariance = flattened @ covariance @ flattened.T
     covariance = (covariance + covariance.T) / 2
     # t and -t share their essential matrix: where one moves forwards, the other moves back.
@@ -98,9 +118,37 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
-def _flattened(H: Array, curvature: Array) -> Array | None:
+def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss
+                      ) -> tuple[Array, Array]:
     """
-    Give what a pose moves by (5, 5) over what it would by H, the loss's weights (5, 5).
+    Widen a covariance (5, 5) where the loss does not rise as its curvature at the minimum says.
+
+    Noise pulls a pose until the loss pulls back as much, so that it goes by the mean curvature on
+    its way. A loss that redescends bends where matches cease to agree, and those that decide about
+    a direction may be few. So the loss is looked at where each axis of the ellipsoid meets the
+    bound of 95 %, on both sides: where on one of them it has risen by a share of what a parabola
+    would have, the pose is off by the inverse of that share. (As profiles of the likelihood are
+    held against their parabolas: Bates and Watts, Nonlinear Regression Analysis, chapter 6.)
+    Gives it with that over (rotation vector, t), (6, 6).
+    """
+    residuals = epipolar_residuals(problem, pose.R, pose.t)
+    J, squared = residuals.jacobian, residuals.r**2
+    curved = _curved((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
+    variances, axes = np.linalg.eigh(covariance)
+    if curved is None or variances[0] <= 0:
+        return _lifted(covariance, pose.t)
+    ways = (axes * np.sqrt(_BOUND * variances)).T
+    around = [Pose(*moved(pose.R, pose.t, residuals.tangents, way))
+              for way in np.concatenate([ways, -ways])]
+    costs = refine_all(problem, [pose, *around], loss, 0).costs
+    rises = (costs[1:] - costs[0]).reshape(2, 5).min(0)
+    share = np.clip(rises / (ways @ curved * ways).sum(1), _LEAST_RISE, 1.0)
+    return _lifted((axes * variances / share**2) @ axes.T, pose.t)
+
+
+def _curved(H: Array, curvature: Array) -> Array | None:
+    """
+    Give how a loss curves (5, 5), by its second derivatives (5, 5) and its weights H (5, 5).
 
     A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6), and
     least along a direction that uncertain matches tell. None where it does not curve upwards.
@@ -110,7 +158,8 @@ def _flattened(H: Array, curvature: Array) -> Array | None:
     shares, axes = np.linalg.eigh(inverse @ curvature @ inverse.T)
     if shares.sum() <= 0:
         return None
-    return np.asarray(inverse.T @ (axes / np.maximum(shares, LEAST_CURVED)) @ axes.T @ root.T)
+    half = root @ axes
+    return np.asarray((half * np.maximum(shares, LEAST_CURVED)) @ half.T)
 
 
 @dataclass(frozen=True)
@@ -131,20 +180,19 @@ class _Cells:
 
     @classmethod
     def of(cls, H: Array, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
-        """Sum matches at pixels (N, 2) by small cells, with their J (5, N), weights and r (N,)."""
-        order, first = _by_cell(places, CELL)
+        """Sum matches at pixels (N, 2) by the smallest cells; J: (5, N), weights and r: (N,)."""
+        order, first = _by_cell(places, _SMALLEST)
         J, weights, r = J.take(order, axis=1), weights[order], r[order]
         weighed = J * weights
         rows, columns = _UPPER
         terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed,
                                 [weights * r, weights]])
         return cls(H, np.asarray(np.linalg.inv(H)),
-                   (places[order[first]] // CELL + 0.5) * CELL,
+                   (places[order[first]] // _SMALLEST + 0.5) * _SMALLEST,
                    np.add.reduceat(terms, first, axis=1))
 
     def in_larger(self, side: float) -> _Cells:
-        """Give larger cells, each made of whole small ones; places are those of one of them."""
-        side = max(side, CELL)
+        """Give larger cells, each made of whole ones; places are those of one of them."""
         order, first = _by_cell(self.places, side)
         return _Cells(self.whole, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
@@ -269,47 +317,49 @@ def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
     return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
 
 
-def _alike(cells: _Cells, by_itself: Array, size: float, noise: float) -> Array:
+def _alike(smallest: _Cells, by_itself: Array, size: float, noise: float) -> Array:
     """
     Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
 
-    Residuals of pairs of cells are multiplied; as the pose follows what all have in common, too
-    little is left of that, by what its covariance and its own share make of the pulls. The product
-    over its weight falls with distance as `_FARTHER` has it; how large it is, one number, is told
-    with an error that is about normal, and it is not below zero: of that the mean is taken, so
-    that pairs are less sure where few cells tell it. noise: variance of a match, which bounds it.
+    Residuals of pairs of the smallest cells are multiplied; as the pose follows what all have in
+    common, too little is left of that, by what its covariance and its own share make of the pulls.
+    The product over its weight falls with distance. How large it is, is told best by patches that
+    overlap; then by pairs farther and farther apart, whether there is more between these than that
+    lets expect. noise: variance of a match, which bounds it.
     """
-    larger = [cells, *(cells.in_larger(2 * CELL * 2**k) for k in range(len(_FARTHER)))]
+    larger = [smallest, *(smallest.in_larger(2 * _SMALLEST * 2**k) for k in range(_SIDES))]
     products, pulls = (np.diff(parts, axis=0) for parts in zip(*(one.pairs() for one in larger)))
-    field = np.tensordot(_FARTHER, pulls, 1)
-    left = cells.inverse @ field @ cells.inverse
+    inverse, sides, amounts = smallest.inverse, np.arange(_SIDES), np.zeros(_SIDES)
     found = products[:, 0] + (pulls * by_itself).sum((1, 2))
-    expected = _FARTHER * products[:, 1] - (pulls * left).sum((1, 2))
-    weighed = expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
-    known = float(weighed @ expected)
-    if known <= 0:
-        return np.zeros((5, 5))
-    return min(_mean_above_zero(float(weighed @ found) / known, known**-0.5), noise) * left
-
-
-def _mean_above_zero(value: float, deviation: float) -> float:
-    """Give the mean of a normal distribution, cut off below zero."""
-    x = value / deviation
-    return float(value + deviation * np.exp(-x * x / 2 - log_ndtr(x)) / np.sqrt(2 * np.pi))
+    for nearest in _TOLD_FROM:
+        fall = np.where(sides < nearest, 0.0, _FALL**(sides - nearest))
+        left = inverse @ np.tensordot(fall, pulls, 1) @ inverse
+        expected = fall * products[:, 1] - (pulls * left).sum((1, 2))
+        weighed = (fall > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
+        known = float(weighed @ expected)
+        if known > 0:
+            amount = float(np.clip(weighed @ found / known, 0.0, noise))
+            amounts += amount * fall
+            found -= amount * expected
+    field = np.tensordot(amounts[_BEYOND:], pulls[_BEYOND:], 1)
+    return np.asarray(inverse @ field @ inverse)
 
 
 def _hardly_told(cells: _Cells, growth: float) -> Array:
     """
     Give by what (5, 5), over a size of one, few cells make a covariance less sure.
 
-    growth: by what the variances grow as cells err alike; chosen: that leaves its root fewer.
+    How large the noise is, v errors tell, and the squared error over what they say is Fisher's F
+    of (5, v), whose bounds are wider than those of chi^2. C cells that are alike tell v = 5 C
+    errors; their shares of the whole, squared and summed up, are 1 / C. growth: by what the
+    variances grow as cells err alike; chosen: that leaves its root fewer.
     """
-    shares = cells.inverse @ cells.H
-    few = _LONG_TAILS * np.sqrt(growth) * (shares @ shares).sum(0)
-    first, second, sixth = _HOTELLING
-    square = few @ few
-    return np.asarray((first * few + second * square + sixth * square @ square @ square)
-                      @ cells.inverse)
+    root = np.linalg.cholesky(cells.inverse)
+    shares = root.T @ cells.H @ root
+    few, axes = np.linalg.eigh(np.sqrt(growth) * (shares @ shares).sum(0))
+    wider = 5 * fdtri(5, 5 / np.maximum(few, 1e-9), _TOLD_AT) / chdtri(5, 1 - _TOLD_AT)
+    half = root @ axes
+    return np.asarray((half * (wider - 1)) @ half.T)
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from djet_ros.core.covariance import (
+    as_far_as_claimed,
     difference,
     pose_covariance,
     spanning,
@@ -62,6 +63,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
 
     voting = x[track.voting]
     covariances = pose_covariance(track.residuals, track.loss, voting, t, sign < 0)
+    if np.isfinite(covariances[0]).all():
+        covariances = as_far_as_claimed(covariances[0], track.problem, Pose(R, t), track.loss)
     hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
                               None if pair.bits is None else (pair.y, pair.bits))
     status = Status.OK
