@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from djet_ros.core.covariance import pose_covariance
+from djet_ros.core.covariance import as_far_as_claimed, pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import sphere_log, sphere_tangents, unit
-from djet_ros.core.jet import Loss, Residuals
-from djet_ros.core.surfaces import DescriptorSurface, with_minimum
-from djet_ros.core.types import Status
+from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, Residuals
+from djet_ros.core.surfaces import DescriptorSurface, ReprojectionSurface, with_minimum
+from djet_ros.core.types import Pose, Status
 from djet_ros.lab.scenes.pair import render_pair
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from two_view import two_views
 import yaml
 
 BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
@@ -152,3 +153,36 @@ def test_errors_that_reach_over_many_patches_are_counted_as_the_few_that_they_ar
     assert np.mean(np.array(squares) < chi2.ppf(0.95, 5)) > 0.9
     # Nor are they taken to be far larger than they are.
     assert np.median(squares) / chi2.median(5) > 0.4
+
+
+@pytest.mark.parametrize(('share', 'least', 'most'), [(0.01, 1.0, 1.02), (1.0, 1.0, 1.1),
+                                                      (100.0, 2.0, 400.0)])
+def test_what_is_claimed_beyond_where_matches_cease_to_agree_is_less_sure(share, least, most):
+    rng = np.random.default_rng(4)
+    views = two_views(rng, 400)
+    surface = ReprojectionSurface(views.x, views.y)
+    problem = jet_problem(views.K, views.x, surface.around(views.y))
+    loss, pose = Loss('geman_mcclure', 0.3), Pose(views.R, views.t)
+    J = epipolar_residuals(problem, views.R, views.t).jacobian
+    # Of noise of a tenth of where the loss bends: what is claimed is within that, or far beyond.
+    claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
+    told, _ = as_far_as_claimed(claimed, problem, pose, loss)
+    wider = np.linalg.eigvals(np.linalg.solve(claimed, told)).real
+    assert wider.min() > least - 1e-9 and wider.max() < most
+    # A sum of squares rises as its curvature says, as long as the pose is bent by a little only.
+    squares, _ = as_far_as_claimed(claimed, problem, pose, Loss())
+    assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
+
+
+def test_few_errors_tell_a_covariance_whose_bounds_hold_nevertheless():
+    # As many cells as matches, and few of them: errors over what they say are no Gaussian.
+    rng, t, squares = np.random.default_rng(5), np.array([0.0, 0, 1]), []
+    for _ in range(1000):
+        J, noise = rng.normal(size=(5, 16)), rng.normal(size=16)
+        error = np.linalg.solve(J @ J.T, J @ noise)
+        residuals = Residuals(noise - error @ J, np.ones(16), J, sphere_tangents(t))
+        covariance = pose_covariance(residuals, Loss(), 40 * np.arange(32.0).reshape(16, 2), t,
+                                     False)[0]
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(np.array(squares) < chi2.ppf(0.95, 5)) > 0.92
+    assert np.mean(np.array(squares) > chi2.ppf(0.999, 5)) <= 0.005

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import cv2
+from djet_ros.core.basins import lowest_around
 from djet_ros.core.covariance import difference, spanning, squared_distance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
-from djet_ros.core.jet import jet_problem, Loss
+from djet_ros.core.jet import jet_problem, Loss, minimise
 from djet_ros.core.pair import Pair
-from djet_ros.core.rivals import false_alarms, goes_on, lie_on_a_plane, preferences
+from djet_ros.core.rivals import apart, false_alarms, goes_on, lie_on_a_plane, preferences
 from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import all_round
 from djet_ros.core.surfaces import ReprojectionSurface
@@ -27,6 +28,7 @@ from two_view import (
     project,
     SIDEWAYS,
     SIZE,
+    TURN,
     two_views,
     TwoViews,
     uniform_view,
@@ -319,3 +321,38 @@ def test_directions_all_round_leave_no_large_gap() -> None:
     assert np.allclose(np.linalg.norm(starts, axis=1), 1)
     sphere = unit(np.random.default_rng(6).normal(size=(500, 3)))
     assert np.degrees(np.arccos(np.abs(sphere @ starts.T).max(1)).max()) < 45
+
+
+@pytest.mark.parametrize(('ours', 'others'), [(3, 5), (5, 3), (3, 6), (6, 3)])
+def test_of_minima_beside_one_another_the_lowest_is_taken_and_no_pose_is_sure_of_it(
+        ours: int, others: int) -> None:
+    # What is far tells the rotation, and the few that are near the direction: some of them are
+    # wrong by some widths of the loss. Each group has a minimum, all in one basin.
+    rng = np.random.default_rng(3)
+    one = Pose(rotation_exp(np.array(TURN)), unit(np.array(SIDEWAYS)))
+    other = Pose(one.R, rotation_exp(np.array([0, 0, 0.005])) @ one.t)
+    parts = [two_views(rng, 300, one.t, near=300, far=1000),
+             two_views(rng, ours, one.t, near=5, far=6),
+             two_views(rng, others, other.t, near=5, far=6)]
+    x, y = (np.concatenate([getattr(part, name) for part in parts]) for name in 'xy')
+    y += rng.normal(0, 0.05, y.shape)
+    problem = jet_problem(K, x, ReprojectionSurface(x, y).around(y))
+    loss = Loss('geman_mcclure', 0.2)
+    right, wrong = (one, other) if ours > others else (other, one)
+    for pose in (right, wrong):
+        end = minimise(problem, pose.R, pose.t, loss)
+        solution, beside = lowest_around(problem, x, end, loss)
+        assert apart(solution.pose, right) < 0.003
+        assert all(0 < rival.preference < 2.33 for rival in beside)
+    assert apart(end.pose, right) > 0.003
+    assert min(apart(rival.pose, end.pose) for rival in beside) < 1e-9
+
+
+def test_a_lone_minimum_has_none_beside_it() -> None:
+    rng = np.random.default_rng(6)
+    views = two_views(rng, 300)
+    y = views.y + rng.normal(0, 0.05, views.y.shape)
+    problem = jet_problem(K, views.x, ReprojectionSurface(views.x, y).around(y))
+    loss = Loss('geman_mcclure', 0.2)
+    end = minimise(problem, views.R, views.t, loss)
+    assert lowest_around(problem, views.x, end, loss) == (end, ())

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.covariance import difference
+from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
 from djet_ros.core.jet import (
@@ -233,7 +233,8 @@ def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: 
     """
     J, squared = solution.residuals.jacobian, solution.residuals.r**2
     _, weights = loss(squared)
-    information = (J * weights) @ J.T / max(float((weights * squared).sum() / weights.sum()), 1e-18)
+    noise = max(float((weights * squared).sum() / weights.sum()), LEAST_SCALE**2)
+    information = (J * weights) @ J.T / noise
     if not np.isfinite(information).all():
         return solution, ()
     told, axes = np.linalg.eigh(information)
@@ -263,7 +264,7 @@ def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: 
 def _unlike(poses: Sequence[Pose], solution: Solution, information: Array, bound: float
             ) -> list[int]:
     """
-    Number the poses that are farther from all before them than a bound has it.
+    Find the numbers of poses that are farther from all before them than a bound has it.
 
     information: (5, 5) in the parameters of the solution, by which squared distances are taken.
     """

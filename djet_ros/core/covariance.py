@@ -44,8 +44,8 @@ _TOLD_FROM, _BEYOND = (0, 2, 3, 4), 2
 _BOUND = float(chdtri(5, 0.05))
 
 # At this probability bounds are those of Fisher's F of (5, v): then the bound of 95 % holds 95 to
-# 98 %, and that of 99.9 % all but 0.1 to 0.4 %, for any v from 7 on. At 99.9 % itself the first
-# would hold more than 99 % where v is 7; at 95 %, or by the expected square, the second too little.
+# 98 %, and that of 99.9 % all but 0.1 to 0.4 %, for any v from 7 on. At 99.9 % the first would
+# hold more than 99 % where v is 7; at 95 %, or by the expected square, the second too little.
 _TOLD_AT = 0.99
 
 # chosen: no direction is taken to be told more than twenty times as badly as the curvature says.
@@ -95,8 +95,8 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     if not np.isfinite(H).all() or np.linalg.cond(H) > 1e12:
         return UNKNOWN
     curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
-    fine = _Cells.of(H, places, J, weights, residuals.r)
-    cells = fine.in_larger(CELL)
+    smallest = _Cells.of(H, places, J, weights, residuals.r)
+    cells = smallest.in_larger(CELL)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or cells.without is None or large.without is None:
         return UNKNOWN
@@ -104,7 +104,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     size = cells.size(moves)
     by_itself = _jackknife(cells, cells.without, moves)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = by_itself + _alike(fine, by_itself, size, noise)
+    covariance = by_itself + _alike(smallest, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
     covariance += growth * size * _hardly_told(cells, growth)
     # What a pose moves by over what it would by H, the loss's weights.
