@@ -15,13 +15,19 @@ from djet_ros.core.jet import (
     JetProblem,
     Loss,
     minimise,
-    moved,
     Residuals,
     Solution,
 )
 from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
-from djet_ros.core.sketch import costs_in_front, Held, losses_at, refine_all, Sketch
+from djet_ros.core.sketch import (
+    costs_in_front,
+    Held,
+    losses_at,
+    moved_all,
+    refine_all,
+    Sketch,
+)
 from djet_ros.core.starts import all_round, around, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -241,8 +247,8 @@ def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: 
     if told[0] <= 1e-12 * told[-1]:
         return solution, ()
     steps = (axes[:, :2] * BASIN_TUNING.beside / np.sqrt(told[:2])).T
-    starts = [Pose(*moved(solution.R, solution.t, solution.residuals.tangents, step))
-              for step in np.concatenate([steps, -steps])]
+    starts = map(Pose, *moved_all(solution.R, solution.t, solution.residuals.tangents,
+                                  np.concatenate([steps, -steps])))
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.few_matches))
     led = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_beside).poses()
     bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(some.blur)

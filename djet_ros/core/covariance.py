@@ -12,10 +12,9 @@ from djet_ros.core.jet import (
     JetProblem,
     LEAST_CURVED,
     Loss,
-    moved,
     Residuals,
 )
-from djet_ros.core.sketch import refine_all
+from djet_ros.core.sketch import moved_all, refine_all
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +28,20 @@ CELL = 32
 LARGE_CELLS = 20
 
 # Matches err alike most where their patches overlap: pairs are told apart by whether they share a
-# cell of 16, 32, 64, 128, 256 or 512 pixels, twice the side of the smallest cells and so on.
-_SMALLEST, _SIDES = 8, 6
+# cell of 8, 16, 32, 64, 128, 256 or 512 pixels, and not the one before.
+_SMALLEST, _SIDES = 8, 7
+
+# Of these, the one of small cells.
+_SMALL = (CELL // _SMALLEST).bit_length() - 1
 
 # Chosen: what matches err alike falls by so much from one of these to the next, as the distance to
 # the power of -1.5. On scenes rendered with seeds 0-4 residuals fall faster from 32 on; but what
 # stays the same over the whole image is not seen in them, as the pose follows it.
 _FALL = 2**-1.5
 
-# From which of them on it is told in turn, and from which on no small cell holds it.
-_TOLD_FROM, _BEYOND = (0, 2, 3, 4), 2
+# From which of them on it is told in turn: from all, from those that no small cell holds, and then
+# from farther and farther.
+_TOLD_FROM = 0, _SMALL, _SMALL + 1, _SMALL + 2
 
 # Bound of chi^2 in five directions that holds 95 %.
 _BOUND = float(chdtri(5, 0.05))
@@ -95,8 +98,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     if not np.isfinite(H).all() or np.linalg.cond(H) > 1e12:
         return UNKNOWN
     curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
-    smallest = _Cells.of(H, places, J, weights, residuals.r)
-    cells = smallest.in_larger(CELL)
+    order, nested = _nested(places)
+    terms = _terms(J.take(order, axis=1), weights[order], residuals.r[order])
+    cells = _Cells.of(H, places[order], terms, nested[_SMALL])
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or cells.without is None or large.without is None:
         return UNKNOWN
@@ -104,7 +108,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     size = cells.size(moves)
     by_itself = _jackknife(cells, cells.without, moves)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = by_itself + _alike(smallest, by_itself, size, noise)
+    covariance = by_itself + _alike(terms[20:], nested, cells.inverse, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
     covariance += growth * size * _hardly_told(cells, growth)
     # What a pose moves by over what it would by H, the loss's weights.
@@ -138,8 +142,8 @@ def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: 
     if curved is None or variances[0] <= 0:
         return _lifted(covariance, pose.t)
     ways = (axes * np.sqrt(_BOUND * variances)).T
-    around = [Pose(*moved(pose.R, pose.t, residuals.tangents, way))
-              for way in np.concatenate([ways, -ways])]
+    around = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
+                                  np.concatenate([ways, -ways])))
     costs = refine_all(problem, [pose, *around], loss, 0).costs
     rises = (costs[1:] - costs[0]).reshape(2, 5).min(0)
     share = np.clip(rises / (ways @ curved * ways).sum(1), _LEAST_RISE, 1.0)
@@ -179,20 +183,13 @@ class _Cells:
     sums: Array
 
     @classmethod
-    def of(cls, H: Array, places: Array, J: Array, weights: Array, r: Array) -> _Cells:
-        """Sum matches at pixels (N, 2) by the smallest cells; J: (5, N), weights and r: (N,)."""
-        order, first = _by_cell(places, _SMALLEST)
-        J, weights, r = J.take(order, axis=1), weights[order], r[order]
-        weighed = J * weights
-        rows, columns = _UPPER
-        terms = np.concatenate([J[rows] * weighed[columns], weighed * r, weighed,
-                                [weights * r, weights]])
-        return cls(H, np.asarray(np.linalg.inv(H)),
-                   (places[order[first]] // _SMALLEST + 0.5) * _SMALLEST,
+    def of(cls, H: Array, places: Array, terms: Array, first: NDArray[np.int64]) -> _Cells:
+        """Sum the terms (27, N) of matches at pixels (N, 2) by cells, given the first of each."""
+        return cls(H, np.asarray(np.linalg.inv(H)), (places[first] // CELL + 0.5) * CELL,
                    np.add.reduceat(terms, first, axis=1))
 
     def in_larger(self, side: float) -> _Cells:
-        """Give larger cells, each made of whole ones; places are those of one of them."""
+        """Give larger cells, each made of whole small ones; places are those of one of them."""
         order, first = _by_cell(self.places, side)
         return _Cells(self.whole, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
@@ -209,11 +206,6 @@ class _Cells:
     def gradients(self) -> Array:
         """Give (5, C)."""
         return self.sums[15:20]
-
-    @property
-    def pulls(self) -> Array:
-        """Give (5, C)."""
-        return self.sums[20:25]
 
     @cached_property
     def without(self) -> Array | None:
@@ -232,10 +224,6 @@ class _Cells:
             if (shares > 1 - _LEAST_SUPPORT).any():
                 return None
         return np.asarray(np.linalg.inv(self.whole - self.H))
-
-    def pairs(self) -> tuple[Array, Array]:
-        """Sum products of residuals, of weights (2,) and of pulls (5, 5) within the same cell."""
-        return (self.sums[25:]**2).sum(1), self.pulls @ self.pulls.T
 
     def size(self, moves: Array) -> float:
         """
@@ -317,19 +305,24 @@ def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
     return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
 
 
-def _alike(smallest: _Cells, by_itself: Array, size: float, noise: float) -> Array:
+def _alike(terms: Array, nested: list[NDArray[np.int64]], inverse: Array, by_itself: Array,
+           size: float, noise: float) -> Array:
     """
     Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
 
-    Residuals of pairs of the smallest cells are multiplied; as the pose follows what all have in
-    common, too little is left of that, by what its covariance and its own share make of the pulls.
+    Residuals of pairs of matches are multiplied; as the pose follows what all have in common, too
+    little is left of that, by what its covariance and its own share make of the pulls.
     The product over its weight falls with distance. How large it is, is told best by patches that
     overlap; then by pairs farther and farther apart, whether there is more between these than that
-    lets expect. noise: variance of a match, which bounds it.
+    lets expect.
+
+    terms: (7, N) the last of those of matches; nested: the first of each cell, from the smallest
+    on; inverse: (5, 5) that of H; noise: variance of a match, which bounds what is told.
     """
-    larger = [smallest, *(smallest.in_larger(2 * _SMALLEST * 2**k) for k in range(_SIDES))]
-    products, pulls = (np.diff(parts, axis=0) for parts in zip(*(one.pairs() for one in larger)))
-    inverse, sides, amounts = smallest.inverse, np.arange(_SIDES), np.zeros(_SIDES)
+    by_side = [np.add.reduceat(terms, first, axis=1) for first in nested]
+    pulls = np.diff([sums[:5] @ sums[:5].T for sums in by_side], axis=0)
+    products = np.diff([(sums[5:]**2).sum(1) for sums in by_side], axis=0)
+    sides, amounts = np.arange(len(pulls)), np.zeros(len(pulls))
     found = products[:, 0] + (pulls * by_itself).sum((1, 2))
     for nearest in _TOLD_FROM:
         fall = np.where(sides < nearest, 0.0, _FALL**(sides - nearest))
@@ -341,7 +334,7 @@ def _alike(smallest: _Cells, by_itself: Array, size: float, noise: float) -> Arr
             amount = float(np.clip(weighed @ found / known, 0.0, noise))
             amounts += amount * fall
             found -= amount * expected
-    field = np.tensordot(amounts[_BEYOND:], pulls[_BEYOND:], 1)
+    field = np.tensordot(amounts[_SMALL:], pulls[_SMALL:], 1)
     return np.asarray(inverse @ field @ inverse)
 
 
@@ -360,6 +353,28 @@ def _hardly_told(cells: _Cells, growth: float) -> Array:
     wider = 5 * fdtri(5, 5 / np.maximum(few, 1e-9), _TOLD_AT) / chdtri(5, 1 - _TOLD_AT)
     half = root @ axes
     return np.asarray((half * (wider - 1)) @ half.T)
+
+
+def _terms(J: Array, weights: Array, r: Array) -> Array:
+    """Give what ``_Cells`` sums up (27, N) of matches, by their J (5, N), weights and r (N,)."""
+    weighed, (rows, columns) = J * weights, _UPPER
+    return np.concatenate([J[rows] * weighed[columns], weighed * r, weighed,
+                           [weights * r, weights]])
+
+
+def _nested(places: Array) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """
+    Order points (N, 2) by cells in cells in cells, and give where each begins in that, by side.
+
+    Along Morton's curve, which interleaves the bits of columns and rows, points of one cell of any
+    of the sides come one after the other.
+    """
+    cells = np.floor(places / _SMALLEST).astype(np.int64) + 2**15
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        cells = (cells | cells << shift) & mask
+    code = cells[:, 0] | cells[:, 1] << 1
+    order = np.argsort(code, kind='stable')
+    return order, [beginnings(code[order] >> 2 * side) for side in range(_SIDES)]
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:

@@ -102,7 +102,7 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     damping = np.full(len(R), DAMPING_AT_FIRST)
     for _ in range(steps):
         tangents, H, gradient = _slopes(products, R, t, here, held)
-        R_new, t_new = _moved(R, t, tangents, _damped_steps(H, gradient, damping))
+        R_new, t_new = moved_all(R, t, tangents, _damped_steps(H, gradient, damping))
         there = _look(problem, products, R_new, t_new, loss, held)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
@@ -212,6 +212,6 @@ def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
     return np.asarray(-np.linalg.solve(H, gradient[..., None])[..., 0])
 
 
-def _moved(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
-    """Move poses by steps (S, 5), as ``jet.moved`` does one."""
+def moved_all(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
+    """Move one or S poses by steps (S, 5), as ``jet.moved`` does one by one."""
     return rotation_exp(steps[:, :3]) @ R, unit(t + (tangents @ steps[:, 3:, None])[..., 0])
