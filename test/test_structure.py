@@ -8,9 +8,10 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
+from djet_ros.core.landmark_choice import around_patches, PATCH
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
-from djet_ros.core.window import _around_patches, _PATCH, Addition, Window, WINDOW_TUNING
+from djet_ros.core.window import Addition, Window, WINDOW_TUNING
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import (
@@ -337,11 +338,11 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
 def test_near_is_told_by_what_is_beyond_a_patch():
     rng = np.random.default_rng(3)
     points, values = rng.uniform(0, (600, 180), (300, 2)), rng.normal(size=300)
-    cells = np.floor((points - np.minimum(points.min(0), 0)) / _PATCH)
+    cells = np.floor((points - np.minimum(points.min(0), 0)) / PATCH)
     apart = np.abs(cells[:, None] - cells).max(2)
     expected = [values[mask].mean() if mask.any() else values.mean() for mask in apart == 2]
-    assert _around_patches(points, values) == pytest.approx(expected)
-    assert not len(_around_patches(points[:0], values[:0]))
+    assert around_patches(points, values) == pytest.approx(expected)
+    assert not len(around_patches(points[:0], values[:0]))
 
 
 @pytest.mark.slow

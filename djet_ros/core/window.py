@@ -2,11 +2,8 @@
 A window of frames and of the landmarks that they share: what ties the lengths of steps together.
 
 A landmark keeps the descriptor of the frame that saw it first, its anchor, and its inverse depth
-there. Each later frame samples the landmark's surface anew where pose and depth let it be
-expected, seen through the warp that they imply, and compares gray levels there: nothing is
-detected again, so nothing wanders. The warp is that of a surface that leans as depths around the
-landmark say (`core.slants`): were all taken to face the camera, a road's places would be off by up
-to half a pixel, alike in all.
+there. Each later frame samples the landmark's surface anew (`core.sighting`): nothing is detected
+again, so nothing wanders.
 `djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
 what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
 al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015). So does
@@ -31,34 +28,22 @@ from djet_ros.core.bundle import (
     projected,
     Reduced,
 )
-from djet_ros.core.cells import cells_of, rank_in_cells
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
-    patch_warp,
     rotation_exp,
     rotation_log,
     skew,
-    slant_warp,
     sphere_tangents,
     unit,
 )
 from djet_ros.core.jet import Loss
-from djet_ros.core.joining import joined_places
-from djet_ros.core.masks import at
-from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import place_all, Placed
+from djet_ros.core.landmark_choice import choose_landmarks
 from djet_ros.core.radial import straight_image, straight_rays, straightened
 from djet_ros.core.self_calibration import SelfCalibration
+from djet_ros.core.sighting import Sighting
 from djet_ros.core.slants import slopes
-from djet_ros.core.surfaces import (
-    CLOSE,
-    comparable,
-    contrast_of,
-    DescriptorDistances,
-    no_paraboloids,
-    with_minimum,
-)
+from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
@@ -79,8 +64,6 @@ class WindowTuning:
     gone: float = 0.4
     # chosen: side of the cells over which landmarks spread, as a share of that with one in each
     cell: float = 0.75
-    # octaves of depth that count as equally near, when landmarks are chosen
-    classes: float = 2.0
     # chosen: Gauss-Newton steps for each frame; four come to the same
     steps: int = 2
     # chosen: how often a step that would cost more is halved: where the camera hardly moved, or
@@ -113,9 +96,6 @@ class WindowTuning:
 
 
 WINDOW_TUNING = WindowTuning()
-
-# Side in pixels of a patch, by which its landmark is told: points nearer than that err alike.
-_PATCH = 26
 
 # By which share the first length may be off, which is the unit of the track.
 _EXACT = 1e-4
@@ -413,12 +393,7 @@ class Window:
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
         present = self._projected(in_frame(self._K, self._poses, here, anchor))
         side = tuning.cell * np.sqrt(self._views[anchor].tested.size / tuning.landmarks)
-        # Near ones tell most, but by their own noisy depths those would be chosen that err most,
-        # and each step come out shorter: by 6 % in 300 small pictures. Others tell where is near.
-        nearest = np.argsort(-np.floor(_around_patches(x, np.log2(rho)) / tuning.classes),
-                             kind='stable')
-        x, rho = x[nearest], rho[nearest]
-        chosen = _spread(x, present, side, tuning.landmarks - len(here))
+        chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(here))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
             x, rho / length, anchor, len(self._views),
@@ -426,83 +401,13 @@ class Window:
             self._distances.strengths(self._views[anchor].tested, np.rint(x).astype(np.int64))))
 
     def _measure(self) -> None:
-        """Sample the surfaces of landmarks in the newest frame, where they are expected."""
-        landmarks, newest = self._landmarks, len(self._views) - 1
-        places = in_frame(self._K, self._poses, landmarks, newest)
-        expected = self._projected(places)
-        radius = self._config.window // 2
-        here = self._views[newest]
-        wanted = (places[:, 2] > 0) & ~at(here.mask, expected) & self._distances.describable(
-            expected, here.tested.shape, radius)
-        # One that neither of the last two frames saw is gone.
-        wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
-        warps = np.empty((len(landmarks), 3, 2))
-        R, t = (motions[newest] for motions in self._poses.between())
-        lean = landmarks.rho[:, None] * landmarks.slopes
-        for anchor in np.unique(landmarks.anchors[wanted]):
-            mine = wanted & (landmarks.anchors == anchor)
-            seen = expected[mine], 1 / places[mine, 2]
-            warps[mine] = patch_warp(self._K, R[anchor], *seen) + slant_warp(
-                self._K, t[anchor], *seen, lean[mine])
-        mine = np.argsort(landmarks.anchors, kind='stable')
-        mine = mine[wanted[mine]]
-        mine = mine[comparable(warps[mine])]
-        # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, as
-        # what undoes the locking is made for close ones: all would swing about where they were
-        # expected. Close ones around it do not.
-        mine, fits = self._around(mine, warps[mine], expected[mine], radius)
-        close = fits.minima()
-        good = ~at(here.mask, close) & self._distances.describable(
-            close, here.tested.shape, CLOSE // 2)
-        mine = mine[good]
-        mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
-        if len(mine):
-            self._take(mine, fits, self._placed(mine, warps[mine], fits.minima()))
-
-    def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
-                ) -> tuple[NDArray[np.int64], Paraboloids]:
-        """
-        Sample surfaces of landmarks (M,) around places (M, 2) in the newest frame.
-
-        They come ordered by their anchors, for images are sampled one by one, surfaces at once.
-        Gives those that have a minimum within the window, and their paraboloids.
-        """
-        if not len(mine):
-            return mine, no_paraboloids(0)
-        here, (anchors, counts) = self._views[-1].tested, self._anchored(mine)
-        # Of where they are sampled: that of where they were expected would bend the scale.
-        strengths = self._distances.strengths(here, np.rint(places).astype(np.int64))
-        split = np.cumsum(counts)[:-1]
-        contrasts = [contrast_of(*parts) for parts in zip(
-            np.split(strengths, split), np.split(self._landmarks.strengths[mine], split))]
-        references = self._distances.shifted(
-            [(self._views[anchor].floating, count) for anchor, count in zip(anchors, counts)],
-            self._landmarks.found[mine], places, warps, np.repeat(contrasts, counts))
-        fits, _ = with_minimum(self._distances.around(references, here, places, radius), 'drop')
-        good = fits.usable & fits.minimum_within(radius)
-        return mine[good], fits.of(good)
-
-    def _placed(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
-        """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
-        images = [(self._views[anchor].gray_levels, count)
-                  for anchor, count in zip(*self._anchored(mine))]
-        return place_all(images, self._landmarks.found[mine], warps, self._views[-1].gray, places)
-
-    def _anchored(self, mine: NDArray[np.int64]) -> tuple[list[int], list[int]]:
-        """Give the anchors of landmarks (M,), which they are ordered by, and how many each has."""
-        anchors, counts = np.unique(self._landmarks.anchors[mine], return_counts=True)
-        return anchors.tolist(), counts.tolist()
-
-    def _take(self, mine: NDArray[np.int64], fits: Paraboloids, placed: Placed) -> None:
-        """Take as observations where surfaces and gray levels have landmarks (M,) together."""
-        minima = fits.minima()
-        # As in any least squares, what the best fit leaves over tells the noise.
-        left = np.maximum(fits.values(minima), 1e-3)
-        places, spread = joined_places(minima, fits.inverses * left[:, None, None], placed)
-        self._landmarks.minima[mine, -1] = places
-        self._landmarks.roots[mine, -1] = np.linalg.cholesky(
-            np.linalg.inv(spread)).transpose(0, 2, 1)
-        self._landmarks.seen[mine, -1] = True
+        """Look for landmarks in the newest frame, and take where they are seen as observations."""
+        sighted = Sighting(self._distances, self._K, self._views, self._poses,
+                           self._landmarks).look(self._config.window // 2)
+        if sighted is not None:
+            self._landmarks.minima[sighted.which, -1] = sighted.places
+            self._landmarks.roots[sighted.which, -1] = sighted.roots
+            self._landmarks.seen[sighted.which, -1] = True
 
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
@@ -638,36 +543,3 @@ def _weighted_median(values: Array, weights: Array) -> float:
     order = np.argsort(values, kind='stable')
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, total[-1] / 2)])
-
-
-def _around_patches(points: Array, values: Array) -> Array:
-    """
-    Means (N,) of the values of other points (N, 2) next to each, but beyond its own patch.
-
-    The mean of all where there are none.
-    """
-    cells = np.floor((points - points.min(0, initial=0.0)) / _PATCH).astype(np.int64) + 2
-    shape = *(cells.max(0, initial=0) + 3), 2
-    sums = np.zeros(shape)
-    np.add.at(sums, (cells[:, 0], cells[:, 1]), np.stack([values, np.ones_like(values)], axis=1))
-    total = np.cumsum(np.cumsum(np.pad(sums, ((3, 2), (3, 2), (0, 0))), axis=0), axis=1)
-    x, y = cells.T + 2
-
-    def within(reach: int) -> Array:
-        """Sum up, and count, what is in a square of cells around each, (N, 2)."""
-        return np.asarray(total[x + reach + 1, y + reach + 1] - total[x - reach, y + reach + 1]
-                          - total[x + reach + 1, y - reach] + total[x - reach, y - reach])
-
-    there, count = (within(2) - within(1)).T
-    return np.where(count > 0, there / np.maximum(count, 1), values.mean() if len(values) else 0)
-
-
-def _spread(chosen_from: Array, present: Array, side: float, room: int) -> NDArray[np.int64]:
-    """
-    Choose points (N, 2), the first of each cell before others.
-
-    Cells in which there are present ones come later.
-    """
-    cells, taken = (cells_of(points, side) for points in (chosen_from, present))
-    rank = rank_in_cells(cells) + np.isin(cells, taken)
-    return np.asarray(np.argsort(rank, kind='stable')[:max(room, 0)])
