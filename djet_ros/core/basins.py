@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from djet_ros.core.covariance import difference
+from djet_ros.core.covariance import difference, SURPRISING
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
@@ -80,9 +80,8 @@ class BasinTuning:
     beside: float = 20.0
     # chosen: steps from there
     steps_beside: int = 6
-    # squared standard deviations, over five degrees of freedom, that one pose of a thousand
-    # exceeds: what is nearer is the same minimum
-    same_minimum: float = 20.5
+    # squared distance: what is nearer is the same minimum
+    same_minimum: float = SURPRISING
     # standard deviations by which matches prefer the basin ahead to all others: one wrong of three
     # millions
     clear: float = 5.0

@@ -239,7 +239,8 @@ def _of_size(gray: Image, octave: int, most: int, contrast: float, mask: Mask | 
 
     @cache
     def describe() -> Image:
-        # Made anew, which is seldom: views that are kept would keep it.
+        # The image is made anew, which is seldom: views that are kept would keep it. What comes of
+        # it is asked for twice, by the pair of a view with the one before and with the next.
         seen = (smoothed if scale == 1 and smoothed is not None
                 else smooth(_made_smaller(gray, scale)))
         return dense_descriptors(seen, _pixels(points))

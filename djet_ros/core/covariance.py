@@ -43,6 +43,9 @@ _FALL = 2**-1.5
 # from farther and farther.
 _TOLD_FROM = 0, _SMALL, _SMALL + 1, _SMALL + 2
 
+# Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
+SURPRISING = 20.5
+
 # Bound of chi^2 in five directions that holds 95 %.
 _BOUND = float(chdtri(5, 0.05))
 

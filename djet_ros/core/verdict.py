@@ -8,6 +8,7 @@ from djet_ros.core.covariance import (
     pose_covariance,
     spanning,
     squared_distance,
+    SURPRISING,
     widened,
 )
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -36,9 +37,6 @@ _CHANCE_BITS = 112
 
 # Parallax has to exceed the noise of the matches by this factor to be believed.
 _OUT_OF_NOISE = 3.0
-
-# Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
-_SURPRISING = 20.5
 
 # chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
 _TRUSTED = 0.5
@@ -145,7 +143,7 @@ def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: 
     unsure: list[Array] = []
     for rival in (*track.rivals, *track.beside):
         off = difference(pose.R, pose.t, rival.pose)
-        if squared_distance(covariances[0], off) < _SURPRISING:
+        if squared_distance(covariances[0], off) < SURPRISING:
             continue
         undecided = rival.preference < DECIDED and not _goes_on(before, pose, rival.pose)
         if undecided and np.linalg.norm(off) > _FAR and not track.guess:
