@@ -63,8 +63,9 @@ class BasinTuning:
     refined_starts: int = 3
     # rad; chosen: poses nearer than this lie in one basin
     same_basin: float = 0.02
-    # chosen: steps on all matches before costs are compared
-    steps_to_compare: int = 7
+    # chosen: steps before costs are compared, by which nearly all rest; after 7 some had not yet
+    # come to the right basin, and were passed over
+    steps_to_compare: int = 15
     # rad; chosen: what a rotation that was measured is not trusted with, and for how many matches'
     # worth of surprise it counts
     turn_slack: float = 2e-4
