@@ -237,10 +237,7 @@ def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: 
     So some matches are led back from either side along the two directions that are told least, to
     the minimum that they were at, but for few; the others are refined on all.
     """
-    J, squared = solution.residuals.jacobian, solution.residuals.r**2
-    _, weights = loss(squared)
-    noise = max(float((weights * squared).sum() / weights.sum()), LEAST_SCALE**2)
-    information = (J * weights) @ J.T / noise
+    information = _information(solution.residuals, loss)
     if not np.isfinite(information).all():
         return solution, ()
     told, axes = np.linalg.eigh(information)
@@ -325,13 +322,34 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
                possible: NDArray[np.bool_] | None = None) -> list[Pose]:
     """Choose the cheapest poses that lie in different basins, up to a number of them."""
     chosen: list[int] = []
+    told: list[Array] = []
     R = sketch.R.reshape(-1, 9)
     # Squares of what `apart` gives, of all at once.
     off = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T)
     for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
-        if (possible is None or possible[number]) and (
-                off[number, chosen] > BASIN_TUNING.same_basin**2).all():
-            chosen.append(number)
-            if len(chosen) == most:
-                break
+        pose = sketch.pose(number)
+        if ((possible is not None and not possible[number])
+                or (off[number, chosen] <= BASIN_TUNING.same_basin**2).any()
+                # A valley has room for several that matches do not tell from one another.
+                or any(_squared(sketch.pose(other), pose, information)
+                       <= BASIN_TUNING.same_minimum for other, information in zip(chosen, told))):
+            continue
+        chosen.append(number)
+        if len(chosen) == most:
+            break
+        told.append(_information(epipolar_residuals(problem, pose.R, pose.t), loss))
     return [sketch.pose(number) for number in chosen]
+
+
+def _information(residuals: Residuals, loss: Loss) -> Array:
+    """Information (5, 5) of matches about a pose, were their errors normal and independent."""
+    J, squared = residuals.jacobian, residuals.r**2
+    _, weights = loss(squared)
+    noise = max(float((weights * squared).sum() / weights.sum()), LEAST_SCALE**2)
+    return np.asarray((J * weights) @ J.T / noise)
+
+
+def _squared(pose: Pose, other: Pose, information: Array) -> float:
+    """Squared distance of another pose, by the information (5, 5) about one."""
+    off = difference(pose.R, pose.t, other)
+    return float(off @ information @ off)
