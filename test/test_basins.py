@@ -17,7 +17,7 @@ NOISE = 0.5
 
 @pytest.mark.parametrize('seed', range(16))
 def test_the_basins_of_a_pair_are_told_apart_by_its_matches(seed):
-    """Far from all that it sees, where turning makes up for going sideways, many minima lie in one valley."""
+    """Where all is far, and turning makes up for going sideways, many minima lie in one valley."""
     rng = np.random.default_rng(seed)
     views = two_views(rng, 100, SIDEWAYS, near=30.0)
     y = views.y + rng.normal(0, NOISE, views.y.shape)
