@@ -164,9 +164,10 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     """
     Choose among the basins around the motion before: its own, and of directions all round.
 
-    Some matches lead to them, and all choose. Where these are not clearly for one, they
-    are led on, for some may have been on the way to one and the same; where that does not help,
-    they are held against others. Where a turn alone explains the matches, none of that matters.
+    Some matches lead to them, and all choose. Where these are not clearly for one, basins are led
+    to until they rest, for some may have been on the way to one and the same; where that does not
+    help, they are held against others. Where a turn alone explains the matches, none of that
+    matters.
     """
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_ahead))
     tight = Loss()
@@ -180,7 +181,9 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     if (_is_clear(problem, places, basins, tight)
             or _mere_turn(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
-    basins = _promising(some, refine_all(some, basins, tight, BASIN_TUNING.steps_to_compare),
+    # All of them again: those that cost least so far may be of one valley.
+    starts = [*basins, *around(ahead.pose, BASIN_TUNING.directions)]
+    basins = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare),
                         tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
