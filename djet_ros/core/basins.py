@@ -178,10 +178,10 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
         tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
         if steps:
             basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
-    if (_is_clear(problem, places, basins, tight)
+    if ((len(basins) > 1 and _is_clear(problem, places, basins, tight))
             or _mere_turn(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
-    # All of them again: those that cost least so far may be of one valley.
+    # All of them again: those that cost least so far may be, or all have been, of one valley.
     starts = [*basins, *around(ahead.pose, BASIN_TUNING.directions)]
     basins = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare),
                         tight, BASIN_TUNING.refined_starts)
