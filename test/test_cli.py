@@ -166,3 +166,27 @@ def test_a_reader_that_leaves_early_is_no_error(body: str) -> None:
     probe.stdin.close()
     assert probe.stderr.read() == b''
     assert probe.wait(timeout=60) == 141
+
+
+# Ends by itself, unless a signal waits for what it interrupted.
+SIGNALS = """
+import os, signal, time
+from threading import Thread
+from djet_ros.cli.graph_options import stop_by_signal
+
+def send():
+    for _ in range(2000):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(2e-4)
+
+stop = stop_by_signal()
+sender = Thread(target=send)
+sender.start()
+while sender.is_alive():
+    stop.wait(1e-3)
+assert stop.is_set()
+"""
+
+
+def test_a_signal_at_any_moment_stops_a_command_on_the_graph():
+    assert subprocess.run([sys.executable, '-c', SIGNALS], timeout=60).returncode == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from _thread import start_new_thread
 import argparse
 import signal
 from threading import Event
@@ -20,8 +21,13 @@ def add_remappings(parser: argparse.ArgumentParser) -> None:
 
 
 def stop_by_signal() -> Event:
-    """Give an event that SIGINT and SIGTERM set, instead of ending the process."""
+    """
+    Give an event that SIGINT and SIGTERM set, instead of ending the process.
+
+    Another thread sets it: a signal may come while the main thread holds the event's lock, as it
+    does at each look, and a handler that waits for that would wait for itself.
+    """
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: start_new_thread(stop.set, ()))
     return stop

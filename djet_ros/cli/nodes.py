@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from importlib import import_module
 from importlib.util import find_spec
-import signal
 import sys
-from threading import Event
 
+from djet_ros.cli.graph_options import stop_by_signal
 from djet_ros.libraries import how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
@@ -41,10 +40,8 @@ def _run(name: str, description: str, *, without_ros: str,
     """
     one_blas_thread()
     sleep_while_waiting()
-    stop = Event()
     # First of all: the imports take their time, and end no worse than anything later.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_by_signal()
     if find_spec('rclpy') is None:
         return _fail(name, "rclpy is missing: install ROS 2 and 'source "
                            f"/opt/ros/jazzy/setup.bash'; {without_ros}")
