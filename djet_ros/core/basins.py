@@ -171,7 +171,7 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     """
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_ahead))
     tight = Loss()
-    basins = around(ahead.pose, BASIN_TUNING.directions)
+    basins = starts = around(ahead.pose, BASIN_TUNING.directions)
     for steps in (0, *BASIN_TUNING.steps_ahead):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), LEAST_SCALE)
@@ -182,9 +182,8 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
             or _mere_turn(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
     # All of them again: those that cost least so far may be, or all have been, of one valley.
-    starts = [*basins, *around(ahead.pose, BASIN_TUNING.directions)]
-    basins = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare),
-                        tight, BASIN_TUNING.refined_starts)
+    found = refine_all(some, [*basins, *starts], tight, BASIN_TUNING.steps_to_compare)
+    basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
     before = ahead.pose if ahead.pose.t.any() else None
