@@ -29,5 +29,5 @@ def stop_by_signal() -> Event:
     """
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: start_new_thread(stop.set, ()))
+        signal.signal(number, lambda *_: stop.is_set() or start_new_thread(stop.set, ()))
     return stop
