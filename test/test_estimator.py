@@ -419,23 +419,6 @@ def test_stage_times_add_up_to_the_time_it_took(pair, threads):
     assert 0.8 * took < sum(stages.values()) < took
 
 
-def test_starts_that_are_sought_amid_the_optimisation_count_as_starts():
-    scene = make_scene('road', size=(620, 188))
-    estimator = TwoViewEstimator()
-    a, b = (estimator.view(scene.render(pose, i), scene.K)
-            for i, pose in enumerate(scene.trajectory(2)))
-    alone = estimator.estimate(a, b)
-    # A motion ahead that is none, of a camera that flies sideways and looks up; and matches too
-    # few to be clearly for one basin.
-    astray = Pose(Rotation.from_rotvec([0.2, 0.0, 0.0]).as_matrix(), np.array([1.0, 0.0, 0.0]))
-    x, y = alone.x[:30], alone.y[:30]
-    began = perf_counter()
-    stages = estimator.estimate_pair(Pair(a, b, x, y, ahead=astray)).timings
-    took = perf_counter() - began
-    assert stages['starts'] > 0
-    assert 0.8 * took < sum(stages.values()) < took
-
-
 @pytest.mark.parametrize(('limit', 'value'), [('noise', 0.7), ('agreeing', 1.0)])
 def test_a_pair_is_given_up_beyond_its_limits_before_it_is_judged(limit, value):
     scene = make_scene('road', size=(620, 188))
@@ -509,7 +492,7 @@ def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_
     assert len(foreseen.x) > 0.9 * len(estimator.estimate(a, c).x)
 
 
-def test_after_a_jerk_features_are_foreseen_by_the_turn_that_the_largest_tell():
+def test_after_a_jerk_features_are_found_by_the_turn_that_the_largest_tell():
     scene = make_scene('road', size=(620, 376))
     estimator = TwoViewEstimator()
     poses = scene.trajectory(3)
@@ -517,8 +500,8 @@ def test_after_a_jerk_features_are_foreseen_by_the_turn_that_the_largest_tell():
     a, b, c = (estimator.view(scene.render(pose, i), scene.K) for i, pose in enumerate(poses))
     alone = estimator.estimate(b, c)
     result = estimator.estimate(b, c, estimator.estimate(a, b))
-    assert 'starts' in alone.timings and 'starts' not in result.timings
-    # As many as are asked for.
+    # Nothing foresees them.
+    assert 'starts' in result.timings
     assert len(result.x) / result.sought > 0.8 * len(alone.x) / alone.sought
     true = np.linalg.inv(poses[2]) @ poses[1]
     assert np.degrees(rotation_angle(result.R, true[:3, :3])) < 0.02

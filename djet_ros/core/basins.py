@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.covariance import difference, SURPRISING
@@ -106,27 +106,13 @@ class Basin:
     rivals: tuple[Pose, ...] = ()
 
 
-@dataclass(frozen=True)
-class Ahead:
-    """
-    A pose by which the camera likely goes on, its t zeros where the direction is not known.
-
-    others: gives the starts where it may not.
-    """
-
-    pose: Pose
-    others: Callable[[], list[Pose]]
-
-
 def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                config: EstimatorConfig, prior: Pose | None, turn: Turn | None,
-                sought: bool = False) -> Basin:
+                config: EstimatorConfig, prior: Pose | None, turn: Turn | None) -> Basin:
     """
-    Choose among starts by what they come to.
+    Choose among starts, and directions all round, by what they come to.
 
     places: (N, 2) pixels of the matches; prior: the motion before, which decides where the matches
-    do not; turn: a rotation that was measured, which all of them have to have; sought: whether
-    basins were looked for in all directions already, and are among the starts.
+    do not; turn: a rotation that was measured, which all of them have to have.
     """
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_to_sketch))
     scale = max(refine_all(some, starts, Loss(), 0).scales().min(), LEAST_SCALE)
@@ -140,12 +126,17 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
                                              _held(turn, scale)), tight,
                             BASIN_TUNING.turned_starts)
     elif len(problem.blur) > BASIN_TUNING.few_matches:
-        more = 0 if sought else BASIN_TUNING.directions_of_many
-        starts = [*starts, *all_round(starts[0].R, more)]
+        starts = [*starts, *all_round(starts[0].R, BASIN_TUNING.directions_of_many)]
         starts = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch),
                             tight, BASIN_TUNING.refined_starts)
     else:
         starts = [*starts, *all_round(starts[0].R, BASIN_TUNING.directions)]
+    return _likeliest_basin(problem, places, starts, tight, prior, turn)
+
+
+def _likeliest_basin(problem: JetProblem, places: Array, starts: list[Pose], tight: Loss,
+                     prior: Pose | None, turn: Turn | None = None) -> Basin:
+    """Refine starts on all matches, and take the one that comes to the least, as right_basin."""
     refined = refine_all(problem, starts, tight, BASIN_TUNING.steps_to_compare)
     possible, others_move = np.ones(len(refined), bool), False
     if turn is not None and (turned_so := _turned_so(turn, refined)).any():
@@ -159,19 +150,19 @@ def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
     return Basin(best, max(scale, LEAST_SCALE), residuals, others_move, tuple(basins))
 
 
-def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
+def basin_ahead(problem: JetProblem, places: Array, ahead: Pose,
                 config: EstimatorConfig) -> Basin:
     """
     Choose among the basins around the motion before: its own, and of directions all round.
 
-    Some matches lead to them, and all choose. Where these are not clearly for one, basins are led
-    to until they rest, for some may have been on the way to one and the same; where that does not
-    help, they are held against others. Where a turn alone explains the matches, none of that
-    matters.
+    ahead: t zeros where its direction is not known. Some matches lead to the basins, and all
+    choose. Where these are not clearly for one, basins are led to until they rest, for some may
+    have been on the way to one and the same; where that does not help, all matches lead them on.
+    Where a turn alone explains the matches, none of that matters.
     """
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_ahead))
     tight = Loss()
-    basins = starts = around(ahead.pose, BASIN_TUNING.directions)
+    basins = starts = around(ahead, BASIN_TUNING.directions)
     for steps in (0, *BASIN_TUNING.steps_ahead):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), LEAST_SCALE)
@@ -186,9 +177,7 @@ def basin_ahead(problem: JetProblem, places: Array, ahead: Ahead,
     basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
-    before = ahead.pose if ahead.pose.t.any() else None
-    return right_basin(problem, places, [*basins, *ahead.others()], config, before, None,
-                       sought=True)
+    return _likeliest_basin(problem, places, basins, tight, ahead if ahead.t.any() else None)
 
 
 def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:

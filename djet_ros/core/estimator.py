@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
-from djet_ros.core.basins import Ahead, BASIN_TUNING
+from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
@@ -220,11 +220,7 @@ class TwoViewEstimator:
 
     def _track(self, pair: Pair, surface: ResidualSurface, starts: list[Pose]) -> Track | None:
         """Run Algorithm 1 from some starts; from those around the motion ahead without any."""
-        def others() -> list[Pose]:
-            with _timed(pair.timings, 'starts', within='jet'):
-                return self._starts(pair)
-
-        ahead = None if starts or pair.ahead is None else Ahead(pair.ahead, others)
+        ahead = None if starts else pair.ahead
         with _timed(pair.timings, 'jet'):
             if self.config.method == 'five_point':
                 return hold(surface, pair.current.K, pair.y, starts[0])
@@ -270,13 +266,10 @@ def _pose(prior: RelativePose | None) -> Pose | None:
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str, within: str = '') -> Iterator[None]:
-    """Add to the seconds of a stage; of one within another, that other does not have them."""
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    """Add to the seconds of a stage."""
     start = perf_counter()
     try:
         yield
     finally:
-        spent = perf_counter() - start
-        timings[stage] = timings.get(stage, 0.0) + spent
-        if within:
-            timings[within] = timings.get(within, 0.0) - spent
+        timings[stage] = timings.get(stage, 0.0) + perf_counter() - start

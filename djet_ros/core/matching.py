@@ -11,10 +11,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from djet_ros.core.features import match_everywhere, match_nearby
-from djet_ros.core.flow import FAR, follow, NEAR, reach_of_levels
+from djet_ros.core.flow import follow, NEAR, reach_of_levels
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.paraboloid import quantile
-from djet_ros.core.prediction import foresee, likely_rotation, predict, reach_of
+from djet_ros.core.prediction import foresee, predict, reach_of
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
@@ -52,8 +52,7 @@ class Foreseen(NamedTuple):
     """
     Matches that a motion foresaw, and in how many bits (N,) their descriptors differ.
 
-    motion: where the camera turns otherwise than before, with the turn that the largest features
-    tell.
+    motion: the one before, with the turn that is guessed where one is.
     """
 
     matches: Matches
@@ -72,14 +71,19 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     if (prior is None or known.turn is not None or search_radius >= 1
             or prior.inliers.sum() < _MANY or prior.inliers.mean() < RIGID):
         return None
-    near, far = (min(reach_of_levels(levels), search_radius * max(current.gray.shape))
-                 for levels in (NEAR, FAR))
-    R = prior.R if known.guess is None else known.guess.R
-    found = _follow_on(previous, current, prior, R, near, NEAR)
-    if found is None:
-        R = likely_rotation(previous.features, current.features, current.K, [R], far)
-        found = _follow_on(previous, current, prior, R, far, FAR)
-    return found
+    reach = min(reach_of_levels(NEAR), search_radius * max(current.gray.shape))
+    motion = Pose(prior.R if known.guess is None else known.guess.R, prior.t)
+    foreseen = foresee(previous.features, current.K, motion.R, prior)
+    y, bits = follow(previous, current, foreseen, reach, NEAR)
+    found = np.isfinite(bits)
+    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
+        return None
+    # Where many are far off, as after a step twice as long, others are farther than the reach.
+    off = np.linalg.norm((y - foreseen)[found], axis=1)
+    if quantile(off, _NEARLY_ALL) > reach / 2:
+        return None
+    first = _surest(bits)
+    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first], motion)
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
@@ -103,23 +107,6 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
     return Matches(there.points[first], y[first])
-
-
-def _follow_on(previous: View, current: View, prior: RelativePose, R: Array, reach: float,
-               levels: int) -> Foreseen | None:
-    """Follow features from where they are seen after a turn R (3, 3) and a way as before."""
-    foreseen = foresee(previous.features, current.K, R, prior)
-    y, bits = follow(previous, current, foreseen, reach, levels)
-    found = np.isfinite(bits)
-    if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
-        return None
-    # Where many are far off, as after a step twice as long, others are farther than the reach.
-    off = np.linalg.norm((y - foreseen)[found], axis=1)
-    if quantile(off, _NEARLY_ALL) > reach / 2:
-        return None
-    first = _surest(bits)
-    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first],
-                    Pose(R, prior.t))
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from djet_ros.core.basins import (
-    Ahead,
     basin_ahead,
     basin_of,
     BASIN_TUNING,
@@ -141,7 +140,7 @@ class Track:
 
 
 def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
-                  config: EstimatorConfig, ahead: Ahead | None = None) -> Track | None:
+                  config: EstimatorConfig, ahead: Pose | None = None) -> Track | None:
     """
     Optimise the pose and the keypoints' places on their epipolar lines jointly.
 
@@ -180,7 +179,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
 
 
 def _contested(algorithm: _Algorithm, track: Track, pair: Pair, surface: ResidualSurface,
-               config: EstimatorConfig, ahead: Ahead | None) -> tuple[_Algorithm, Track]:
+               config: EstimatorConfig, ahead: Pose | None) -> tuple[_Algorithm, Track]:
     """
     Lead all basins to their own ends where the matches decide between none, and choose once more.
 
@@ -287,7 +286,7 @@ class _Algorithm:
         self._plausible, self._ours = np.ones(len(pair.y), bool), np.ones(len(pair.y), bool)
         self._warp: Array | None = None
 
-    def run(self, starts: list[Pose], ahead: Ahead | None = None,
+    def run(self, starts: list[Pose], ahead: Pose | None = None,
             limits: Limits | None = None) -> Track | None:
         """
         Take rounds until the pose rests; None where too few matches have a surface.
@@ -355,7 +354,7 @@ class _Algorithm:
         return np.asarray(self._alive & self._plausible & self._ours & within)
 
     def _optimised(self, paraboloids: Paraboloids, voting: NDArray[np.bool_], poses: list[Pose],
-                   ahead: Ahead | None, steps: int) -> _Optimised:
+                   ahead: Pose | None, steps: int) -> _Optimised:
         """Find the pose in the right basin of some."""
         config, places = self._config, self._surface.x[voting]
         problem = jet_problem(self._K, places, paraboloids.of(voting), config.epipole_blur,
