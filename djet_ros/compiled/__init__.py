@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import ctypes
-from ctypes import addressof, c_char, c_double, c_float, c_int, c_void_p
+from ctypes import c_char, c_double, c_float, c_int, c_void_p
 from importlib.util import find_spec
 import os
 from typing import Any
@@ -62,11 +62,10 @@ def place(there: Gray, here: NDArray[np.uint8], points: Gray, inverse: Gray, beg
     """
     n = len(points)
     places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
-    given = _Given()
-    _call('djet_place', given(there, np.float32), c_int(there.shape[0]), c_int(there.shape[1]),
-          given(here, np.uint8), c_int(here.shape[1]), c_int(n), given(points, np.float32),
-          given(inverse, np.float32), given(began), given(inside, np.bool_), given(tuning),
-          given(places), given(variances), given(inverses))
+    _call('djet_place', _given(there, np.float32), c_int(there.shape[0]), c_int(there.shape[1]),
+          _given(here, np.uint8), c_int(here.shape[1]), c_int(n), _given(points, np.float32),
+          _given(inverse, np.float32), _given(began), _given(inside, np.bool_), _given(tuning),
+          _given(places), _given(variances), _given(inverses))
     return places, variances, inverses
 
 
@@ -81,12 +80,12 @@ def grades_through(image: Gray, looks: tuple[Gray, Gray], points: Gray, contrast
     test has; reach: the largest grade; most_nearer: by which factor depths grow at most.
     """
     n, tests = len(points), ends[1].shape[1]
-    grades, given = np.empty((tests, n), np.int16), _Given()
-    _call('djet_grades_through', given(image, np.float32), c_int(image.shape[0]),
-          c_int(image.shape[1]), c_int(n), given(looks[0], np.float32),
-          given(looks[1], np.float32), c_float(most_nearer), given(points, np.float32),
-          given(contrast, np.float32), c_int(ends[0].shape[1]), given(ends[0].T, np.float32),
-          c_int(tests), given(ends[1], np.int64), c_int(reach), given(grades, np.int16))
+    grades = np.empty((tests, n), np.int16)
+    _call('djet_grades_through', _given(image, np.float32), c_int(image.shape[0]),
+          c_int(image.shape[1]), c_int(n), _given(looks[0], np.float32),
+          _given(looks[1], np.float32), c_float(most_nearer), _given(points, np.float32),
+          _given(contrast, np.float32), c_int(ends[0].shape[1]), _given(ends[0].T, np.float32),
+          c_int(tests), _given(ends[1], np.int64), c_int(reach), _given(grades, np.int16))
     return grades
 
 
@@ -100,11 +99,11 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
     (T, 4), which look at most `far` pixels away; reach: the largest grade.
     """
     n, side = len(centres), 2 * radius + 1
-    distances, given = np.empty((side, side, n), np.float32), _Given()
-    _call('djet_graded_surfaces', given(reference, np.int16), given(image, np.int16),
-          c_int(image.shape[1]), c_int(n), given(centres, np.int64), c_int(radius),
-          c_int(len(tests)), given(tests, np.int64), c_int(far), c_int(reach),
-          given(distances, np.float32))
+    distances = np.empty((side, side, n), np.float32)
+    _call('djet_graded_surfaces', _given(reference, np.int16), _given(image, np.int16),
+          c_int(image.shape[1]), c_int(n), _given(centres, np.int64), c_int(radius),
+          c_int(len(tests)), _given(tests, np.int64), c_int(far), c_int(reach),
+          _given(distances, np.float32))
     return distances
 
 
@@ -116,11 +115,11 @@ def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> 
     direction; unit: that slopes are told in.
     """
     height, width = image.shape
-    slopes, given = np.empty((height // 2, width // 2), np.float32), _Given()
-    _call('djet_corner_slopes', given(image, np.uint8), c_int(height), c_int(width),
+    slopes = np.empty((height // 2, width // 2), np.float32)
+    _call('djet_corner_slopes', _given(image, np.uint8), c_int(height), c_int(width),
           c_float(least_ratio), c_float(unit),
-          given(np.empty((_SUMS, width // 2 + 1), np.int32), np.int32),
-          given(np.empty((4, width + 2), np.int16), np.int16), given(slopes, np.float32))
+          _given(np.empty((_SUMS, width // 2 + 1), np.int32), np.int32),
+          _given(np.empty((4, width + 2), np.int16), np.int16), _given(slopes, np.float32))
     return slopes
 
 
@@ -131,9 +130,9 @@ def describe(image: NDArray[np.uint8], pixels: NDArray[np.int64], tests: NDArray
 
     tests: (256, 4); all that they see lies in the image.
     """
-    descriptors, given = np.empty((len(pixels), len(tests) // 8), np.uint8), _Given()
-    _call('djet_describe', given(image, np.uint8), c_int(image.shape[1]), c_int(len(pixels)),
-          given(pixels, np.int64), given(tests, np.int64), given(descriptors, np.uint8))
+    descriptors = np.empty((len(pixels), len(tests) // 8), np.uint8)
+    _call('djet_describe', _given(image, np.uint8), c_int(image.shape[1]), c_int(len(pixels)),
+          _given(pixels, np.int64), _given(tests, np.int64), _given(descriptors, np.uint8))
     return descriptors
 
 
@@ -145,10 +144,10 @@ def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8],
     x, y: (N, 2); tests: (256, 4), which look at most `reach` pixels away.
     """
     n = len(x)
-    distances, given = np.empty(n), _Given()
-    _call('djet_match_distances', given(there, np.uint8), given(here, np.uint8),
-          *map(c_int, there.shape), c_int(n), given(x), given(y), given(tests, np.int64),
-          c_int(reach), given(distances))
+    distances = np.empty(n)
+    _call('djet_match_distances', _given(there, np.uint8), _given(here, np.uint8),
+          *map(c_int, there.shape), c_int(n), _given(x), _given(y), _given(tests, np.int64),
+          c_int(reach), _given(distances))
     return distances
 
 
@@ -163,11 +162,10 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
     strips, (n, m) = strips.reshape(-1, 4), (len(there[0]), len(here[0]))
     nearest, best_there, best_here = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(
         m, np.float32)
-    given = _Given()
-    _call('djet_most_similar', c_int(len(strips)), given(strips, np.int64), c_int(n), c_int(m),
-          given(there[0], np.uint8), given(there[1], np.float32), given(here[0], np.uint8),
-          given(here[1], np.float32), given(nearest, np.int64), given(best_there, np.float32),
-          given(best_here, np.float32))
+    _call('djet_most_similar', c_int(len(strips)), _given(strips, np.int64), c_int(n), c_int(m),
+          _given(there[0], np.uint8), _given(there[1], np.float32), _given(here[0], np.uint8),
+          _given(here[1], np.float32), _given(nearest, np.int64), _given(best_there, np.float32),
+          _given(best_here, np.float32))
     return nearest, best_there, best_here
 
 
@@ -185,10 +183,8 @@ def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float]
     n = len(matches[3])
     R, t = np.array(R, float, order='C'), np.array(t, float)
     left = np.empty(n), np.empty(n), np.empty((5, n)), np.empty((2, 3))
-    given = _Given()
-    _call('djet_minimise', c_int(n), *map(given, matches), c_int(loss[0]), c_double(loss[1]),
-          c_int(steps), c_double(damping), given(limits), given(R), given(t), *map(given, left),
-          given(_memory(n)))
+    _call('djet_minimise', c_int(n), *map(_given, matches), c_int(loss[0]), c_double(loss[1]),
+          c_int(steps), c_double(damping), *map(_given, (limits, R, t, *left, _memory(n))))
     return R, t, (*left[:3], left[3].T)
 
 
@@ -202,10 +198,9 @@ def refine_all(matches: tuple[Array, Array, Array, Array], loss: tuple[int, floa
     n, starts = len(matches[3]), len(R)
     R, t = np.array(R, float, order='C'), np.array(t, float, order='C')
     costs, r, sign = np.empty(starts), np.empty((starts, n)), np.empty((starts, n))
-    given = _Given()
-    _call('djet_refine_all', c_int(n), *map(given, matches), c_int(loss[0]), c_double(loss[1]),
-          c_int(steps), c_double(damping), c_int(starts), given(R), given(t), given(costs),
-          given(r), given(sign), given(_memory(n)))
+    _call('djet_refine_all', c_int(n), *map(_given, matches), c_int(loss[0]), c_double(loss[1]),
+          c_int(steps), c_double(damping), c_int(starts),
+          *map(_given, (R, t, costs, r, sign, _memory(n))))
     return R, t, costs, r, sign
 
 
@@ -219,11 +214,11 @@ def losses_in_front(matches: tuple[Array, Array, Array, Array], loss: tuple[int,
     signs of curvature; signs: of t that are tried.
     """
     n, starts = len(matches[3]), len(poses[0])
-    losses, given = np.empty((starts, n)), _Given()
-    _call('djet_losses_in_front', c_int(n), *map(given, matches), c_int(loss[0]),
-          c_double(loss[1]), c_int(starts), *map(given, poses), *map(given, residuals),
-          c_int(len(signs)), given(np.array(signs, float)), given(losses),
-          given(np.empty((3, n))))
+    losses = np.empty((starts, n))
+    _call('djet_losses_in_front', c_int(n), *map(_given, matches), c_int(loss[0]),
+          c_double(loss[1]), c_int(starts), *map(_given, poses), *map(_given, residuals),
+          c_int(len(signs)), _given(np.array(signs, float)), _given(losses),
+          _given(np.empty((3, n))))
     return losses
 
 
@@ -237,10 +232,9 @@ def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: flo
     """
     n, columns, rows = len(u), int(u.max()) + 3, int(v.max()) + 3
     off, found, fitting = np.empty(n), np.empty((n, 4)), np.empty(n)
-    given = _Given()
-    _call('djet_planes', c_int(n), *map(given, (u, v, r, trusted)), c_int(columns), c_int(rows),
-          c_int(rounds), c_double(usual), given(np.empty((_OF_SQUARES, rows * columns))),
-          *map(given, (off, found, fitting)))
+    _call('djet_planes', c_int(n), *map(_given, (u, v, r, trusted)), c_int(columns), c_int(rows),
+          c_int(rounds), c_double(usual), _given(np.empty((_OF_SQUARES, rows * columns))),
+          *map(_given, (off, found, fitting)))
     return found, off, fitting
 
 
@@ -263,28 +257,19 @@ def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int6
     H, g = np.zeros((size, size)), np.zeros(size)
     coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
     slopes, gain = np.zeros((n, 3)), np.empty((3, size))
-    given = _Given()
-    lens = (c_void_p(None),) * 2 if by_k1 is None else (given(one) for one in by_k1)
+    lens = (c_void_p(None),) * 2 if by_k1 is None else (_given(one) for one in by_k1)
     _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames),
-          *(given(one, np.int64) for one in which), *map(given, observed),
-          *map(given, of_points), c_double(weight), *lens, *map(given, K),
-          *map(c_double, least), *map(given, (H, g, coupling, variances, slopes, gain)))
+          *(_given(one, np.int64) for one in which), *map(_given, observed),
+          *map(_given, of_points), c_double(weight), *lens, *map(_given, K),
+          *map(c_double, least), *map(_given, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 
 
-class _Given:
-    """Gives where arrays lie, in C's order and of a type, and keeps them as long as itself."""
-
-    def __init__(self) -> None:
-        self._kept: list[NDArray[Any]] = []
-
-    def __call__(self, array: NDArray[Any], dtype: Any = np.float64) -> c_void_p:
-        ordered = np.ascontiguousarray(array, dtype)
-        self._kept.append(ordered)
-        if not ordered.flags.writeable:
-            return c_void_p(ordered.ctypes.data)
-        # The same, in a fifth of the time: hundreds are given a frame.
-        return c_void_p(addressof(_NOTHING.from_buffer(ordered.data)))
+def _given(array: NDArray[Any], dtype: Any = np.float64) -> Any:
+    """Give where an array lies, in C's order and of a type; what is given keeps it there."""
+    ordered = np.ascontiguousarray(array, dtype)
+    # Where it may be written to, in a third of the time: hundreds are given a frame.
+    return _NOTHING.from_buffer(ordered.data) if ordered.flags.writeable else ordered.ctypes
 
 
 def _memory(n: int) -> Array:
