@@ -14,7 +14,7 @@ from typing import TypeVar
 import cv2
 from djet_ros import compiled
 from djet_ros.core.bundle import eliminate, observe
-from djet_ros.core.corners import corner_slopes
+from djet_ros.core.corners import _peaks, corner_slopes
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.features import most_similar
@@ -25,6 +25,7 @@ from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss,
 from djet_ros.core.orb_pattern import pattern, reach
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.patches import place_exactly
+from djet_ros.core.prediction import nearest
 from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import planes_at
 from djet_ros.core.starts import around
@@ -138,6 +139,30 @@ def test_slopes_of_corners_are_those_of_numpy_to_the_last_bit(size: tuple[int, i
     for gray in (noise, image(1, size)):
         ours, numpys = both(partial(corner_slopes, gray))
         np.testing.assert_array_equal(ours, numpys)
+
+
+@pytest.mark.parametrize('size', [(320, 200), (321, 203), (36, 35), (30, 9)])
+def test_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, size[::-1]).astype(np.uint8)
+    # Slopes of few values are as large as those beside them.
+    for gray, steps in ((noise, 1e-3), (image(1, size), 1e-3), (noise, 300.0)):
+        slopes = np.rint(corner_slopes(gray) / steps).astype(np.float32)
+        for ours, numpys in zip(*both(partial(_peaks, slopes, 0.5, gray.shape))):
+            np.testing.assert_array_equal(ours, numpys)
+            assert len(ours) or min(size) < 40
+
+
+@pytest.mark.parametrize('count', [1, 2, 700])
+@pytest.mark.parametrize('spread', [(0, 0), (90, 0), (90, 30)])
+def test_the_nearest_points_are_those_of_numpy(count: int, spread: tuple[int, int]) -> None:
+    rng = np.random.default_rng(count)
+    points = 7 + rng.uniform(0, 1, (count, 2)) * spread
+    # Some of them in one place, and some others far from all.
+    points[count // 2:] = 0.1 * points[count // 2:] + 60
+    others = rng.uniform(-90, 180, (900, 2))
+    off = [np.linalg.norm(points[index] - others, axis=1)
+           for index in both(partial(nearest, points, others))]
+    np.testing.assert_array_equal(*off)
 
 
 def test_descriptors_are_those_of_numpy_to_the_last_bit() -> None:

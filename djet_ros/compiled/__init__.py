@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 4
+_INTERFACE = 5
 
 _NOTHING = c_char * 0
 
@@ -121,6 +121,32 @@ def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> 
           _given(np.empty((_SUMS, width // 2 + 1), np.int32), np.int32),
           _given(np.empty((4, width + 2), np.int16), np.int16), _given(slopes, np.float32))
     return slopes
+
+
+def peaks(slopes: Gray, least: float, margin: int, after: tuple[int, int]
+          ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """
+    Find the strongest of all slopes (H, W) that are so near: `core.corners._peaks`.
+
+    least: that they are above; margin: where the first of them may be, along both axes; after:
+    column and row after the last. Gives places (M,) in the flat array, and (M,) whether they are
+    the strongest of their wider surroundings.
+    """
+    places, around = np.empty(slopes.size, np.int64), np.empty(slopes.size, np.bool_)
+    count = _call('djet_peaks', _given(slopes, np.float32), c_int(slopes.shape[1]),
+                  c_float(least), c_int(margin), *map(c_int, after),
+                  _given(np.empty(slopes.shape[1], np.uint8), np.uint8),
+                  _given(places, np.int64), _given(around, np.bool_))
+    return places[:count], around[:count]
+
+
+def nearest(points: Array, others: Array) -> NDArray[np.int64]:
+    """Tell which of points (N, 2), one at least, is next to others (M, 2), (M,)."""
+    indices = np.empty(len(others), np.int64)
+    memory = np.empty(4 * len(points) + 2, np.int32)
+    _call('djet_nearest', c_int(len(points)), _given(points), c_int(len(others)), _given(others),
+          _given(memory, np.int32), _given(indices, np.int64))
+    return indices
 
 
 def describe(image: NDArray[np.uint8], pixels: NDArray[np.int64], tests: NDArray[np.int64]
@@ -276,5 +302,5 @@ def _memory(n: int) -> Array:
     return np.empty((_ROWS, n + _FILLED_UP))
 
 
-def _call(name: str, *arguments: Any) -> None:
-    getattr(library, name)(*arguments)
+def _call(name: str, *arguments: Any) -> int:
+    return int(getattr(library, name)(*arguments))

@@ -102,3 +102,43 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
         to_slopes(of_three, n, least_ratio, unit, slopes + (int64_t)(row - 1) * n);
     }
 }
+
+/* Corners are the strongest of all that are next to them, or of those that are so near. */
+enum { AROUND = 3 };
+
+/* Whether a value is the largest of all around it. */
+INLINE int is_highest(const float *value, int width)
+{
+    int higher = 0;
+    for (int j = -AROUND; j <= AROUND && !higher; j++)
+        for (int i = -AROUND; i <= AROUND; i++)
+            higher |= value[(int64_t)j * width + i] > *value;
+    return !higher;
+}
+
+/* Slopes (height, width) above a least one that are the strongest of those next to them, `margin`
+   or more from the left and above, before a last column and row: core.corners._peaks. Gives how
+   many, their places in the flat array, and whether they are the strongest around too. memory:
+   (width,). */
+WIDE int djet_peaks(const float *slopes, int width, float least, int margin, int after_column,
+                    int after_row, uint8_t *restrict memory, int64_t *restrict places,
+                    uint8_t *restrict around)
+{
+    int count = 0;
+    for (int row = margin; row < after_row; row++) {
+        const float *here = slopes + (int64_t)row * width, *above = here - width,
+                    *below = here + width;
+        for (int x = margin; x < after_column; x++)
+            memory[x] = (here[x] > least) & (here[x] >= here[x - 1]) & (here[x] >= here[x + 1])
+                        & (here[x] >= above[x - 1]) & (here[x] >= above[x])
+                        & (here[x] >= above[x + 1]) & (here[x] >= below[x - 1])
+                        & (here[x] >= below[x]) & (here[x] >= below[x + 1]);
+        const uint8_t *end = memory + after_column, *next = memory + margin;
+        while (next < end && (next = memchr(next, 1, (size_t)(end - next)))) {
+            const int x = (int)(next++ - memory);
+            places[count] = (int64_t)row * width + x;
+            around[count++] = (uint8_t)is_highest(here + x, width);
+        }
+    }
+    return count;
+}

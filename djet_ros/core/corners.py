@@ -220,21 +220,14 @@ def _of_size(gray: Image, octave: int, most: int, contrast: float, mask: Mask | 
     slopes, contrast = corner_slopes(image), max(contrast, _ABOVE_NOISE * noise_of(image))
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
 
-    def peaks(apart: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        found = _peaks(slopes, apart, contrast, image.shape)
-        points = _exact_peaks(slopes, found)
-        if mask is None:
-            return found, points
-        free = ~at(mask, (points + 0.5) * zoom - 0.5)
-        return found[free], points.compress(free, axis=0)
-
-    found, points = peaks(_APART)
-    lonely = np.zeros(slopes.size, bool)
-    lonely[found] = True
-    if len(found) < _ENOUGH * most:
-        found, points = peaks(_AT_LEAST_APART)
-    strengths = slopes.ravel()[found]
-    chosen = spread_out(_pixels(points), strengths, most, lonely[found])
+    found, strongest = _peaks(slopes, contrast, image.shape)
+    points = _exact_peaks(slopes, found)
+    # Others beside the strongest come where there are not enough of these.
+    wanted = np.ones(len(found), bool) if mask is None else ~at(mask, (points + 0.5) * zoom - 0.5)
+    if (strongest & wanted).sum() >= _ENOUGH * most:
+        wanted &= strongest
+    points, strengths = points.compress(wanted, axis=0), slopes.ravel()[found[wanted]]
+    chosen = spread_out(_pixels(points), strengths, most, strongest[wanted])
     points, strengths = points.take(chosen, axis=0), strengths[chosen]
 
     @cache
@@ -257,16 +250,29 @@ def _made_smaller(gray: Image, scale: float) -> Image:
     return np.asarray(cv2.resize(gray, (width, height)), np.uint8)
 
 
-def _peaks(slopes: NDArray[np.float32], apart: int, contrast: float, shape: tuple[int, ...]
-           ) -> NDArray[np.int64]:
-    """Find slopes that are the strongest of all that are so near; places in the flat array."""
-    side = 2 * apart + 1
-    highest = cv2.dilate(slopes, np.ones((side, side), np.uint8))
+def _peaks(slopes: NDArray[np.float32], contrast: float, shape: tuple[int, ...]
+           ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """
+    Find slopes that are the strongest of all that are at least so near, in an image of a shape.
+
+    Gives their places (M,) in the flat array, and (M,) whether they are of their wider
+    surroundings too. Wherever the corner is in there, up to a pixel off, its descriptor has room.
+    """
+    if compiled.library is not None:
+        margin = REACH + 1
+        height, width = (max(side - margin, 0) // 2 for side in shape)
+        return compiled.peaks(slopes, contrast**2, margin // 2, (width, height))
+    above = slopes > contrast**2
     # Of a flat array, five times as fast.
-    found = np.flatnonzero((slopes == highest) & (slopes > contrast**2))
+    found = np.flatnonzero(_highest(slopes, _AT_LEAST_APART) & above)
     rows, columns = np.divmod(found, slopes.shape[1])
-    # Wherever the corner is in there, up to a pixel off, its descriptor has room.
-    return found[describable(2 * np.stack([columns, rows], axis=1) + 1, shape, 1)]
+    found = found[describable(2 * np.stack([columns, rows], axis=1) + 1, shape, 1)]
+    return found, _highest(slopes, _APART).ravel()[found]
+
+
+def _highest(slopes: NDArray[np.float32], apart: int) -> NDArray[np.bool_]:
+    side = 2 * apart + 1
+    return np.asarray(slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8)))
 
 
 def _exact_peaks(slopes: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from djet_ros import compiled
 from djet_ros.core.features import factor
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.types import Array, Features, RelativePose
@@ -57,7 +58,14 @@ def foresee(previous: Features, K: Array, R: Array, before: RelativePose) -> Arr
     # With z = 1 of x: of the same length as rho, whatever the depth.
     there = (seen @ before.R.T + step) @ R.T
     shift = _seen(K, there + step) - _seen(K, there)
-    return np.asarray(_seen(K, turned) + shift[cKDTree(y).query(previous.points)[1]])
+    return np.asarray(_seen(K, turned) + shift[nearest(y, previous.points)])
+
+
+def nearest(points: Array, others: Array) -> NDArray[np.int64]:
+    """Tell which (M,) of points (N, 2) is next to each of others (M, 2)."""
+    if compiled.library is not None:
+        return compiled.nearest(points, others)
+    return np.asarray(cKDTree(points).query(others)[1])
 
 
 def _seen(K: Array, places: Array) -> Array:

@@ -1,0 +1,106 @@
+/* Which of some points is next to each of others: see core/prediction.py. */
+#include <string.h>
+
+#include "common.h"
+
+/* Square cells that hold about one point each. */
+typedef struct {
+    double left, top, side;
+    int columns, rows;
+} Cells;
+
+static Cells cells_around(int n, const double (*points)[2])
+{
+    double least[2] = {INFINITY, INFINITY}, most[2] = {-INFINITY, -INFINITY};
+    for (int k = 0; k < n; k++)
+        for (int axis = 0; axis < 2; axis++) {
+            least[axis] = fmin(least[axis], points[k][axis]);
+            most[axis] = fmax(most[axis], points[k][axis]);
+        }
+    const double width = most[0] - least[0], height = most[1] - least[1];
+    /* No more than (n + 1) of them either way, and 3 n + 1 in all. */
+    double side = fmax(sqrt(width * height / n), fmax(width, height) / n);
+    side = side > 0 ? side : 1;
+    const Cells cells = {least[0], least[1], side, (int)(width / side) + 1,
+                         (int)(height / side) + 1};
+    return cells;
+}
+
+static int place_in(double way, int count)
+{
+    return way > 0 ? way < count ? (int)way : count - 1 : 0;
+}
+
+static int column_of(const Cells *cells, double x)
+{
+    return place_in((x - cells->left) / cells->side, cells->columns);
+}
+
+static int row_of(const Cells *cells, double y)
+{
+    return place_in((y - cells->top) / cells->side, cells->rows);
+}
+
+/* Sort points (n, 2) by cells: `order` (n,), in which those of a cell begin at `first` of its number
+   and end where those of the next begin. */
+static void sort_into(const Cells *cells, int n, const double (*points)[2], int32_t *first,
+                      int32_t *order)
+{
+    const int count = cells->columns * cells->rows;
+    memset(first, 0, (size_t)(count + 1) * sizeof *first);
+    for (int k = 0; k < n; k++)
+        first[row_of(cells, points[k][1]) * cells->columns + column_of(cells, points[k][0])]++;
+    for (int c = 1; c <= count; c++)
+        first[c] += first[c - 1];
+    for (int k = n - 1; k >= 0; k--) {
+        const int row = row_of(cells, points[k][1]), column = column_of(cells, points[k][0]);
+        order[--first[row * cells->columns + column]] = k;
+    }
+}
+
+/* The indices (m,) of those of n points that are next to m others, all (n, 2), n > 0, and finite.
+   memory: room for 4 n + 2. */
+WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*others)[2],
+                       int32_t *memory, int64_t *nearest)
+{
+    const Cells cells = cells_around(n, points);
+    int32_t *order = memory, *first = memory + n;
+    sort_into(&cells, n, points, first, order);
+    for (int k = 0; k < m; k++) {
+        const double x = others[k][0], y = others[k][1];
+        const int column = column_of(&cells, x), row = row_of(&cells, y);
+        double least = INFINITY;
+        nearest[k] = 0;
+        /* Square rings of cells around its own, until what is beyond them is farther off. */
+        for (int ring = 0;; ring++) {
+            const int left = column - ring, right = column + ring, top = row - ring,
+                      bottom = row + ring;
+            for (int j = top > 0 ? top : 0; j <= bottom && j < cells.rows; j++) {
+                const int whole = j == top || j == bottom;
+                for (int i = left; i <= right; i += whole || !ring ? 1 : 2 * ring) {
+                    if (i < 0 || i >= cells.columns)
+                        continue;
+                    const int cell = j * cells.columns + i;
+                    for (int o = first[cell]; o < first[cell + 1]; o++) {
+                        const double *point = points[order[o]];
+                        const double dx = point[0] - x, dy = point[1] - y;
+                        const double squared = dx * dx + dy * dy;
+                        nearest[k] = squared < least ? order[o] : nearest[k];
+                        least = squared < least ? squared : least;
+                    }
+                }
+            }
+            double room = INFINITY;
+            if (left > 0)
+                room = fmin(room, x - (cells.left + left * cells.side));
+            if (right < cells.columns - 1)
+                room = fmin(room, cells.left + (right + 1) * cells.side - x);
+            if (top > 0)
+                room = fmin(room, y - (cells.top + top * cells.side));
+            if (bottom < cells.rows - 1)
+                room = fmin(room, cells.top + (bottom + 1) * cells.side - y);
+            if (room == INFINITY || (room > 0 && least < room * room))
+                break;
+        }
+    }
+}
