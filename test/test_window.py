@@ -134,8 +134,7 @@ def inside(places: Numbers) -> NDArray[np.bool_]:
 
 def blank() -> Any:
     image: Image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    return SimpleNamespace(K=K, gray=image, gray_levels=image, tested=image, floating=image,
-                           mask=None)
+    return SimpleNamespace(K=K, gray=image, tested=image, mask=None)
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])

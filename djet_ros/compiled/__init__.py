@@ -50,8 +50,8 @@ def _loaded() -> ctypes.CDLL | None:
 library = _loaded()
 
 
-def place(there: Gray, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
-          inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
+def place(there: NDArray[np.uint8], here: NDArray[np.uint8], points: Gray, inverse: Gray,
+          began: Array, inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """
     Find N patches of one gray image (H, W) in another one: `core.patches.Expected.stepped`.
 
@@ -62,16 +62,16 @@ def place(there: Gray, here: NDArray[np.uint8], points: Gray, inverse: Gray, beg
     """
     n = len(points)
     places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
-    _call('djet_place', _given(there, np.float32), c_int(there.shape[0]), c_int(there.shape[1]),
+    _call('djet_place', _given(there, np.uint8), c_int(there.shape[0]), c_int(there.shape[1]),
           _given(here, np.uint8), c_int(here.shape[1]), c_int(n), _given(points, np.float32),
           _given(inverse, np.float32), _given(began), _given(inside, np.bool_), _given(tuning),
           _given(places), _given(variances), _given(inverses))
     return places, variances, inverses
 
 
-def grades_through(image: Gray, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
-                   ends: tuple[Gray, NDArray[np.int64]], reach: int, most_nearer: float
-                   ) -> NDArray[np.int16]:
+def grades_through(image: NDArray[np.int16], looks: tuple[Gray, Gray], points: Gray,
+                   contrast: Gray, ends: tuple[Gray, NDArray[np.int64]], reach: int,
+                   most_nearer: float) -> NDArray[np.int16]:
     """
     Grades (T, N) of tests on patches seen through warps: `core.graded.grades_through`.
 
@@ -81,7 +81,7 @@ def grades_through(image: Gray, looks: tuple[Gray, Gray], points: Gray, contrast
     """
     n, tests = len(points), ends[1].shape[1]
     grades = np.empty((tests, n), np.int16)
-    _call('djet_grades_through', _given(image, np.float32), c_int(image.shape[0]),
+    _call('djet_grades_through', _given(image, np.int16), c_int(image.shape[0]),
           c_int(image.shape[1]), c_int(n), _given(looks[0], np.float32),
           _given(looks[1], np.float32), c_float(most_nearer), _given(points, np.float32),
           _given(contrast, np.float32), c_int(ends[0].shape[1]), _given(ends[0].T, np.float32),

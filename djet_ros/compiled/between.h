@@ -12,8 +12,6 @@ enum { LANES = 8 };
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
 typedef int32_t Whole __attribute__((vector_size(LANES * sizeof(int32_t))));
 
-typedef uint64_t Pairs __attribute__((vector_size(LANES * sizeof(uint64_t))));
-
 /* Numbers that lie so far apart, side by side. Where there are fewer than lanes, the last one stands
    in for those that are lacking. */
 INLINE Lanes gathered(const float *values, int apart, int count)
@@ -40,33 +38,51 @@ INLINE Lanes clipped(Lanes values, float least, float most)
     return (Lanes)((below & raised) | (~below & (Whole)highest));
 }
 
-/* The first or the second of pairs of numbers. */
-INLINE Lanes one_of(Pairs pairs, int number)
+/* An image of so many bytes a pixel: unsigned ones, or two with a sign. */
+typedef struct {
+    const void *pixels;
+    int bytes, height, width;
+} Image;
+
+/* What is at so many pixels, and next to them on the right, in one number. */
+INLINE Whole pairs_at(Image image, Whole pixels)
+{
+    Whole pairs = {0};
+    for (int l = 0; l < LANES; l++)
+        if (image.bytes == 1) {
+            uint16_t pair;
+            memcpy(&pair, (const uint8_t *)image.pixels + pixels[l], sizeof pair);
+            pairs[l] = pair;
+        } else
+            memcpy((int32_t *)&pairs + l, (const int16_t *)image.pixels + pixels[l],
+                   sizeof(int32_t));
+    return pairs;
+}
+
+/* The first or the second of pairs. */
+INLINE Lanes one_of(Image image, Whole pairs, int number)
 {
     const int is_low = (__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__) == (number == 0);
-    return (Lanes)__builtin_convertvector(is_low ? pairs : pairs >> 32, Whole);
+    const Whole one = image.bytes == 1 ? (is_low ? pairs & 255 : pairs >> 8)
+                                       : (is_low ? pairs << 16 : pairs) >> 16;
+    return __builtin_convertvector(one, Lanes);
 }
 
 /* Gray levels between pixels; beyond the image its border goes on. */
-INLINE Lanes between(const float *image, int height, int width, Lanes x, Lanes y)
+INLINE Lanes between(Image image, Lanes x, Lanes y)
 {
-    x = clipped(x, 0, width - 1);
-    y = clipped(y, 0, height - 1);
-    const Whole left = __builtin_convertvector(clipped(x, 0, width - 2), Whole);
-    const Whole top = __builtin_convertvector(clipped(y, 0, height - 2), Whole);
-    const Whole first = top * width + left;
-    Pairs pairs[2];
-    for (int l = 0; l < LANES; l++)
-        for (int row = 0; row < 2; row++) {
-            uint64_t pair;
-            memcpy(&pair, image + first[l] + row * width, sizeof pair);
-            pairs[row][l] = pair;
-        }
+    x = clipped(x, 0, image.width - 1);
+    y = clipped(y, 0, image.height - 1);
+    const Whole left = __builtin_convertvector(clipped(x, 0, image.width - 2), Whole);
+    const Whole top = __builtin_convertvector(clipped(y, 0, image.height - 2), Whole);
+    const Whole first = top * image.width + left;
+    const Whole of_above = pairs_at(image, first),
+                of_below = pairs_at(image, first + image.width);
     x -= __builtin_convertvector(left, Lanes);
     y -= __builtin_convertvector(top, Lanes);
-    const Lanes left_above = one_of(pairs[0], 0), left_below = one_of(pairs[1], 0);
-    const Lanes above = left_above + x * (one_of(pairs[0], 1) - left_above);
-    const Lanes below = left_below + x * (one_of(pairs[1], 1) - left_below);
+    const Lanes left_above = one_of(image, of_above, 0), left_below = one_of(image, of_below, 0);
+    const Lanes above = left_above + x * (one_of(image, of_above, 1) - left_above);
+    const Lanes below = left_below + x * (one_of(image, of_below, 1) - left_below);
     return above + y * (below - above);
 }
 

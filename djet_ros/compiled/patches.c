@@ -32,13 +32,12 @@ INLINE void take_mean_off(Lanes *values)
 }
 
 /* Patches (ROOM x ROOM) around points, each dy from a point seen at x + inverse dy. */
-INLINE void sample(const float *image, int height, int width, const Lanes points[2],
-                   const Lanes inverse[2][2], Lanes *wide)
+INLINE void sample(Image image, const Lanes points[2], const Lanes inverse[2][2], Lanes *wide)
 {
     for (int j = 0; j < ROOM; j++)
         for (int i = 0; i < ROOM; i++) {
             const float x = i - (RADIUS + 1), y = j - (RADIUS + 1);
-            wide[j * ROOM + i] = between(image, height, width,
+            wide[j * ROOM + i] = between(image,
                                          inverse[0][0] * x + inverse[0][1] * y + points[0],
                                          inverse[1][0] * x + inverse[1][1] * y + points[1]);
         }
@@ -150,12 +149,13 @@ INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double 
    room for the steps. tuning: least slope and noise, how many steps, and the farthest;
    inside: (n,) those that may move. Gives places (n, 2), variances (n,) of a pixel, and
    inverses (n, 2, 2). */
-WIDE void djet_place(const float *there, int there_height, int there_width, const uint8_t *here,
+WIDE void djet_place(const uint8_t *there, int there_height, int there_width, const uint8_t *here,
                      int here_width, int n, const float (*points)[2],
                      const float (*inverse)[2][2], const double (*began)[2],
                      const uint8_t *inside, const double *tuning, double (*places)[2],
                      double *variances, double (*inverses)[2][2])
 {
+    const Image image = {there, 1, there_height, there_width};
     const double least_noise = tuning[1], steps = tuning[2], farthest = tuning[3], fitted = 4;
     for (int first = 0; first < n; first += LANES) {
         const int count = n - first < LANES ? n - first : LANES;
@@ -172,7 +172,7 @@ WIDE void djet_place(const float *there, int there_height, int there_width, cons
         const Lanes inverse_of[2][2] = {
             {gathered(W, 4, count), gathered(W + 1, 4, count)},
             {gathered(W + 2, 4, count), gathered(W + 3, 4, count)}};
-        sample(there, there_height, there_width, points_of, inverse_of, wide);
+        sample(image, points_of, inverse_of, wide);
         expect(wide, (float)tuning[0], &expected);
         for (int l = 0; l < LANES; l++)
             gather(here, here_width, at[l], l, &seen);

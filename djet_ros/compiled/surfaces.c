@@ -14,7 +14,7 @@ typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
 /* Grades (T, n) of T tests on patches seen through warps: dx = u / (1 - nearer . u), with
    u = inverse dy, for the places dy of their ends. inverse: (n, 2, 2); nearer: (n, 2), which is 0
    where it does not matter; contrast: (n,); ends: (E, 2); of_tests: (2, T) which a test has. */
-WIDE void djet_grades_through(const float *image, int height, int width, int n,
+WIDE void djet_grades_through(const int16_t *pixels, int height, int width, int n,
                               const float *inverse, const float *nearer, float most_nearer,
                               const float *points, const float *contrast, int E,
                               const float (*ends)[2], int T, const int64_t *of_tests, int reach,
@@ -22,6 +22,7 @@ WIDE void djet_grades_through(const float *image, int height, int width, int n,
 {
     /* Added and taken away again, it leaves whole numbers of all that are far below it. */
     const float whole = 3 << 22;
+    const Image image = {pixels, sizeof *pixels, height, width};
     for (int first = 0; first < n; first += LANES) {
         const int count = n - first < LANES ? n - first : LANES;
         const float *W = inverse + 4 * first, *c = nearer + 2 * first, *at = points + 2 * first;
@@ -35,7 +36,7 @@ WIDE void djet_grades_through(const float *image, int height, int width, int n,
             const float dx = ends[e][0], dy = ends[e][1];
             const Lanes depth = clipped(1 - (by_x * dx + by_y * dy), 1 / most_nearer,
                                         most_nearer);
-            seen[e] = between(image, height, width, x + (xx * dx + xy * dy) / depth,
+            seen[e] = between(image, x + (xx * dx + xy * dy) / depth,
                               y + (yx * dx + yy * dy) / depth);
         }
         for (int t = 0; t < T; t++) {

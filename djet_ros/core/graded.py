@@ -74,7 +74,7 @@ def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading:
     places, ends = points.astype(np.float32), ends_of(tests)
     of_each = np.broadcast_to(np.float32(contrast), len(points))
 
-    def look(task: tuple[NDArray[np.float32], slice]) -> Grades:
+    def look(task: tuple[Grades, slice]) -> Grades:
         image, some = task
         return compiled.grades_through(
             image, (inverse[some], nearer[some]), places[some], of_each[some], ends,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 from djet_ros import compiled
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import blocks, gather_patches, Image, Shown
+from djet_ros.core.hamming import blocks, floating, gather_patches, Image, Shown
 from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
@@ -75,11 +75,11 @@ def as_matched(y: Array) -> Placed:
     return Placed(y.copy(), np.tile(np.eye(2), (len(y), 1, 1)))
 
 
-def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> Placed:
+def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Placed:
     """
     Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2).
 
-    there: (H, W), as float32 it need not be converted; here: (H, W) uint8;
+    there, here: (H, W) uint8;
     warp: (N, 3, 2) how they are seen there, see `geometry.patch_warp`; so small a patch needs but
     the derivatives dy/dx, its first two rows, which must not be singular. By Gauss-Newton steps on
     the differences of gray levels under the slopes of the warped patch ("inverse compositional",
@@ -87,12 +87,11 @@ def place_exactly(there: Gray, here: Image, x: Array, y: Array, warp: Array) -> 
     them. What would go far, or lies at the border, stays at y.
     """
     places, covariances = y.copy(), np.empty((len(y), 2, 2))
-    floating = there.astype(np.float32, copy=False)
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
         places[block], covariances[block] = place_all(
-            [(floating, len(x[block]))], x[block], warp[block], here, y[block])
+            [(there, len(x[block]))], x[block], warp[block], here, y[block])
 
     each(refine, range(0, len(y), _BLOCK))
     return Placed(places, covariances)
@@ -199,7 +198,7 @@ def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
     x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first: what is near one another in the image comes one after the other.
     by_point = np.empty_like(x)
-    for image, these in blocks(images):
+    for image, these in blocks(floating(images)):
         cv2.remap(image, x[these], y[these], cv2.INTER_LINEAR, by_point[these],
                   cv2.BORDER_REPLICATE)
     wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)

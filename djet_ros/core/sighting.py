@@ -118,7 +118,7 @@ class Sighting:
         contrasts = [contrast_of(*parts) for parts in zip(
             np.split(strengths, split), np.split(self.landmarks.strengths[mine], split))]
         references = self.distances.shifted(
-            [(self.views[anchor].floating, count) for anchor, count in zip(anchors, counts)],
+            [(self.views[anchor].tested, count) for anchor, count in zip(anchors, counts)],
             self.landmarks.found[mine], places, warps, np.repeat(contrasts, counts))
         fits, _ = with_minimum(self.distances.around(references, here, places, radius), 'drop')
         good = fits.usable & fits.minimum_within(radius)
@@ -126,7 +126,7 @@ class Sighting:
 
     def _placed(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
         """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
-        images = [(self.views[anchor].gray_levels, count)
+        images = [(self.views[anchor].gray, count)
                   for anchor, count in zip(*self._anchored(mine))]
         return place_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
 

@@ -99,7 +99,7 @@ class _OfImages:
 
     def __init__(self, previous: View, current: View, x: Array) -> None:
         self.x = x
-        self._there, self._here = previous.gray_levels, current.gray
+        self._there, self._here = previous.gray, current.gray
 
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """Places by gray levels, as they are seen through the warp; just y without one."""
@@ -148,7 +148,7 @@ class DescriptorSurface(_OfImages):
         self._is_warped |= anew
         there, here, seen = (values.compress(anew, axis=0) for values in (self.x, y, warp))
         return self._kept(anew, usable, y, self._distances.between_pixels(
-            self._previous.floating, there, self._current, here, seen,
+            self._previous.tested, there, self._current, here, seen,
             self._contrast_around(y, usable), CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:

@@ -125,16 +125,6 @@ class View:
     tested: NDArray[Any]
     mask: NDArray[np.bool_] | None = None
 
-    @cached_property
-    def floating(self) -> NDArray[np.float32]:
-        """Give `tested` as places between pixels are read from it; converted once for all."""
-        return self.tested.astype(np.float32)
-
-    @cached_property
-    def gray_levels(self) -> NDArray[np.float32]:
-        """Give `gray` in the same way."""
-        return self.gray.astype(np.float32)
-
 
 @dataclass(frozen=True)
 class Pose:
