@@ -41,7 +41,11 @@ _FALL = 2**-1.5
 
 # From which of them on it is told in turn: from all, from those that no small cell holds, and then
 # from farther and farther.
-_TOLD_FROM = 0, _SMALL, _SMALL + 1, _SMALL + 2
+_TOLD_FROM = np.array([0, _SMALL, _SMALL + 1, _SMALL + 2])
+
+# By what it falls from there on (4, 6); nothing is told of what is nearer.
+_FALLS = np.where(np.arange(_SIDES - 1) < _TOLD_FROM[:, None], 0.0,
+                  _FALL**(np.arange(_SIDES - 1.0) - _TOLD_FROM[:, None]))
 
 # Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
 SURPRISING = 20.5
@@ -49,8 +53,10 @@ SURPRISING = 20.5
 # Bound of chi^2 in five directions that holds 95 %.
 _BOUND = float(chdtri(5, 0.05))
 
-# At this probability, the most that is promised, bounds are those of Fisher's F of (5, v).
+# At this probability, the most that is promised, bounds are those of Fisher's F of (5, v), and of
+# chi^2 where v is large.
 _TOLD_AT = 0.999
+_BOUND_TOLD = float(chdtri(5, 1 - _TOLD_AT))
 
 # chosen: errors with longer tails than normal ones tell a variance as fewer of those would; 1.5
 # times fewer where the kurtosis is 4, not 3.
@@ -100,18 +106,22 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     squared = residuals.r**2
     _, weights = loss(squared)
     H = (J * weights) @ J.T
-    if not np.isfinite(H).all() or np.linalg.cond(H) > 1e12:
+    if not np.isfinite(H).all():
+        return UNKNOWN
+    told = np.linalg.eigvalsh(H)
+    if told[0] <= 1e-12 * told[-1]:
         return UNKNOWN
     curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
     order, nested = _nested(places)
     terms = _terms(J.take(order, axis=1), weights[order], residuals.r[order])
     cells = _Cells.of(H, places[order], terms, nested[_SMALL])
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
-    if curved is None or cells.without is None or large.without is None:
+    if curved is None or not (cells.suffice() and large.suffice()):
         return UNKNOWN
-    moves = np.einsum('cij,jc->ic', cells.without, cells.gradients)
+    without = np.asarray(np.linalg.inv(H - cells.H))
+    moves = np.einsum('cij,jc->ic', without, cells.gradients)
     size = cells.size(moves)
-    by_itself = _jackknife(cells, cells.without, moves)
+    by_itself = _jackknife(cells, without, moves)
     noise = float((weights * squared).sum() / weights.sum())
     covariance = by_itself + _alike(terms[20:], nested, cells.inverse, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
@@ -127,8 +137,8 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
-def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss
-                      ) -> tuple[Array, Array]:
+def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
+                      residuals: Residuals | None = None) -> tuple[Array, Array]:
     """
     Widen a covariance (5, 5) where the loss does not rise as its curvature at the minimum says.
 
@@ -138,9 +148,10 @@ def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: 
     bound of 95 %, on both sides: where on one of them it has risen by a share of what a parabola
     would have, the pose is off by the inverse of that share. (As profiles of the likelihood are
     held against their parabolas: Bates and Watts, Nonlinear Regression Analysis, chapter 6.)
-    Gives it with that over (rotation vector, t), (6, 6).
+    residuals: those at the pose, where they are known. Gives it with that over (rotation vector,
+    t), (6, 6).
     """
-    residuals = epipolar_residuals(problem, pose.R, pose.t)
+    residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
     J, squared = residuals.jacobian, residuals.r**2
     curved = _curved((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
     variances, axes = np.linalg.eigh(covariance)
@@ -212,23 +223,17 @@ class _Cells:
         """Give (5, C)."""
         return self.sums[15:20]
 
-    @cached_property
-    def without(self) -> Array | None:
-        """
-        Inverses (C, 5, 5) of what is left of the whole without each cell.
-
-        None where cells are too few, or one alone decides.
-        """
+    def suffice(self) -> bool:
+        """Tell whether there are enough cells, and something is left without any one of them."""
         if len(self) <= 5:  # so many are gone with the pose's own freedom
-            return None
+            return False
         # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
         weighty = self.H[self.H.reshape(-1, 25) @ self.inverse.ravel() > _WEIGHTY]
-        if len(weighty):
-            whitening = np.linalg.inv(np.linalg.cholesky(self.whole))
-            shares = np.linalg.eigvalsh(whitening @ weighty @ whitening.T)
-            if (shares > 1 - _LEAST_SUPPORT).any():
-                return None
-        return np.asarray(np.linalg.inv(self.whole - self.H))
+        if not len(weighty):
+            return True
+        whitening = np.linalg.inv(np.linalg.cholesky(self.whole))
+        shares = np.linalg.eigvalsh(whitening @ weighty @ whitening.T)
+        return bool((shares <= 1 - _LEAST_SUPPORT).all())
 
     def size(self, moves: Array) -> float:
         """
@@ -299,7 +304,8 @@ def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
-    without: (C, 5, 5), see ``_Cells``; moves: (5, C). A delete-a-group jackknife, to first order
+    without: (C, 5, 5) inverses of what is left of the whole without each cell; moves: (5, C) of
+    the pose without its matches. A delete-a-group jackknife, to first order
     (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their
     moves say little; so the mean is taken of the moves that are seen and of those that noise would
     make, which are large there, at the size that has the seen ones on average.
@@ -327,20 +333,21 @@ def _alike(terms: Array, nested: list[NDArray[np.int64]], inverse: Array, by_its
     by_side = [np.add.reduceat(terms, first, axis=1) for first in nested]
     pulls = np.diff([sums[:5] @ sums[:5].T for sums in by_side], axis=0)
     products = np.diff([(sums[5:]**2).sum(1) for sums in by_side], axis=0)
-    sides, amounts = np.arange(len(pulls)), np.zeros(len(pulls))
     found = products[:, 0] + (pulls * by_itself).sum((1, 2))
-    for nearest in _TOLD_FROM:
-        fall = np.where(sides < nearest, 0.0, _FALL**(sides - nearest))
-        left = inverse @ np.tensordot(fall, pulls, 1) @ inverse
-        expected = fall * products[:, 1] - (pulls * left).sum((1, 2))
-        weighed = (fall > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
-        known = float(weighed @ expected)
-        if known > 0:
-            amount = float(np.clip(weighed @ found / known, 0.0, noise))
-            amounts += amount * fall
-            found -= amount * expected
-    field = np.tensordot(amounts[_SMALL:], pulls[_SMALL:], 1)
-    return np.asarray(inverse @ field @ inverse)
+    left = inverse @ _in_all(_FALLS, pulls) @ inverse
+    expected = _FALLS * products[:, 1] - left.reshape(-1, 25) @ pulls.reshape(-1, 25).T
+    weighed = (_FALLS > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
+    known, amounts = (weighed * expected).sum(1), np.zeros(len(pulls))
+    for nearest in np.flatnonzero(known > 0):
+        amount = min(max(weighed[nearest] @ found / known[nearest], 0.0), noise)
+        amounts += amount * _FALLS[nearest]
+        found -= amount * expected[nearest]
+    return np.asarray(inverse @ _in_all(amounts[_SMALL:], pulls[_SMALL:]) @ inverse)
+
+
+def _in_all(shares: Array, parts: Array) -> Array:
+    """Sum up shares (..., S) of parts (S, 5, 5), (..., 5, 5)."""
+    return np.asarray(shares @ parts.reshape(-1, 25)).reshape(*shares.shape[:-1], 5, 5)
 
 
 def _hardly_told(cells: _Cells, growth: float) -> Array:
@@ -357,7 +364,7 @@ def _hardly_told(cells: _Cells, growth: float) -> Array:
     few, axes = np.linalg.eigh(_LONG_TAILS * np.sqrt(growth) * (shares @ shares).sum(0))
     # One error is the least that tells a variance.
     told = 5 / np.clip(few, 1e-9, 5.0)
-    wider = 5 * fdtri(5, told, _TOLD_AT) / chdtri(5, 1 - _TOLD_AT)
+    wider = 5 * fdtri(5, told, _TOLD_AT) / _BOUND_TOLD
     half = root @ axes
     return np.asarray((half * (wider - 1)) @ half.T)
 
@@ -381,7 +388,10 @@ def _nested(places: Array) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
         cells = (cells | cells << shift) & mask
     code = cells[:, 0] | cells[:, 1] << 1
     order = np.argsort(code, kind='stable')
-    return order, [beginnings(code[order] >> 2 * side) for side in range(_SIDES)]
+    ordered = code[order]
+    # Cells of a side are the same where all bits above those of the places in them are.
+    differing = np.append(-1, ordered[1:] ^ ordered[:-1]).view(np.uint64)
+    return order, [np.flatnonzero(differing >= 4**side) for side in range(_SIDES)]
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:

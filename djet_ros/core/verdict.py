@@ -55,14 +55,16 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     x, K, R = pair.x, pair.current.K, track.pose.R
     inliers = track.inliers()
     # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
-    rays_x, rays_y = rays(K, x[inliers]), rays(K, track.minima[inliers])
-    sign, other_way = _sign(track.pose, rays_x, rays_y, x[inliers], pair.before)
+    seen, minima = (places.compress(inliers, axis=0) for places in (x, track.minima))
+    rays_x, rays_y = rays(K, seen), rays(K, minima)
+    sign, other_way = _sign(track.pose, rays_x, rays_y, seen, pair.before)
     t = sign * track.pose.t
 
-    voting = x[track.voting]
+    voting = x.compress(track.voting, axis=0)
     covariances = pose_covariance(track.residuals, track.loss, voting, t, sign < 0)
     if np.isfinite(covariances[0]).all():
-        covariances = as_far_as_claimed(covariances[0], track.problem, Pose(R, t), track.loss)
+        covariances = as_far_as_claimed(covariances[0], track.problem, Pose(R, t), track.loss,
+                                        track.residuals if sign > 0 else None)
     hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
                               None if pair.bits is None else (pair.y, pair.bits))
     status = Status.OK
@@ -74,7 +76,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     else:
         # Where a rotation alone explains the matches, any direction of t would do.
         R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale()
-        parallax = _parallax(K, R_alone, rays_x, track.minima[inliers])
+        parallax = _parallax(K, R_alone, rays_x, minima)
         if parallax < max(config.min_parallax, noise):
             if parallax >= noise:
                 # What is out of noise is a way, which the turn by itself makes up for.
