@@ -9,6 +9,16 @@ typedef struct {
     double e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
 } Row;
 
+INLINE int64_t least(int64_t a, int64_t b)
+{
+    return a < b ? a : b;
+}
+
+INLINE int64_t most(int64_t a, int64_t b)
+{
+    return a > b ? a : b;
+}
+
 static void cross(const double a[3], const double b[3], double product[3])
 {
     product[0] = a[1] * b[2] - a[2] * b[1];
@@ -69,21 +79,23 @@ static void invert(const double *A, double *inverse)
     inverse[8] = 1 / d2;
 }
 
-/* Take a landmark out of the equations over the poses: it is coupled with these by C (3, size). */
-INLINE void eliminate(int size, const double *C, const double *variances, const double *slopes,
-                      double *gain, double *H, double *g)
+/* Take a landmark out of the equations over the poses: it is coupled with these by C (3, size),
+   between two columns alone. */
+INLINE void eliminate(int64_t size, int64_t from, int64_t to, const double *C,
+                      const double *variances, const double *slopes, double *gain, double *H,
+                      double *g)
 {
     for (int i = 0; i < 3; i++)
-        for (int k = 0; k < size; k++)
+        for (int64_t k = from; k < to; k++)
             gain[i * size + k] = variances[3 * i] * C[k] + variances[3 * i + 1] * C[size + k]
                                  + variances[3 * i + 2] * C[2 * size + k];
-    for (int j = 0; j < size; j++) {
+    for (int64_t j = from; j < to; j++) {
         const double a = gain[j], b = gain[size + j], c = gain[2 * size + j];
         if (a == 0 && b == 0 && c == 0)
             continue;
         g[j] -= a * slopes[0] + b * slopes[1] + c * slopes[2];
-        for (int k = 0; k < size; k++)
-            H[(int64_t)j * size + k] -= a * C[k] + b * C[size + k] + c * C[2 * size + k];
+        for (int64_t k = from; k < to; k++)
+            H[j * size + k] -= a * C[k] + b * C[size + k] + c * C[2 * size + k];
     }
 }
 
@@ -106,6 +118,8 @@ WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int
         double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace};
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
         const double *gone = off + 2 * n, *by = lens ? held_by_k1 + 2 * n : NULL;
+        /* All frames that see a landmark lie between two of them. */
+        int64_t from = lens ? 0 : size, to = lens;
         if (lens) {
             H[0] += weight * (by[0] * by[0] + by[1] * by[1]);
             g[0] += weight * (by[0] * gone[0] + by[1] * gone[1]);
@@ -125,6 +139,8 @@ WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int
             differentiate(K, K_inverse, nearest, residuals + 2 * m, R + 9 * m, t + 3 * m,
                           ray + 3 * m, rho[m], place + 3 * m, root + 4 * m, root_of_weight, &row);
             const int64_t f = lens + 6 * frame[m], a = lens + 6 * anchor[m];
+            from = least(from, least(f, a));
+            to = most(to, most(f, a) + 6);
             const double *by_frame = row.by_frame[0], *by_anchor = row.by_anchor[0],
                          *by_own = row.by_own[0];
             add_block(H + f * size + f, size, by_frame, 6, by_frame, 6);
@@ -150,6 +166,6 @@ WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int
             }
         }
         invert(information, variances + 9 * n);
-        eliminate((int)size, C, variances + 9 * n, slope, gain, H, g);
+        eliminate(size, from, to, C, variances + 9 * n, slope, gain, H, g);
     }
 }
