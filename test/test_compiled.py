@@ -24,7 +24,7 @@ from djet_ros.core.hamming import dense_descriptors, match_distances
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, minimise
 from djet_ros.core.orb_pattern import pattern, reach
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import place_exactly
+from djet_ros.core.patches import place_all, place_exactly
 from djet_ros.core.prediction import nearest
 from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import planes_at
@@ -114,6 +114,21 @@ def test_patches_are_found_where_numpy_finds_them(count: int) -> None:
     assert (off > PIXELS).sum() <= 0.05 * count
     sizes = (np.linalg.det(placed.covariances) for placed in (ours, numpys))
     np.testing.assert_allclose(np.log(next(sizes)), np.log(next(sizes)), atol=300 * PIXELS)
+
+
+# Together in one pass, and more than that takes.
+@pytest.mark.parametrize('counts', [(3, 4, 9), (200, 90, 40)])
+def test_patches_of_several_images_are_those_of_each(counts: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(sum(counts))
+    images, here = [image(seed).astype(np.float32) for seed in range(3)], image(3)
+    x = rng.uniform(20, 180, (sum(counts), 2))
+    warp, y, ends = warps(rng, len(x)), x + rng.uniform(-2, 2, x.shape), np.cumsum(counts)
+    together = place_all(list(zip(images, counts)), x, warp, here, y)
+    for there, count, end in zip(images, counts, ends):
+        some = slice(end - count, end)
+        alone = place_all([(there, count)], x[some], warp[some], here, y[some])
+        for mine, others in zip(together, alone):
+            np.testing.assert_array_equal(mine[some], others)
 
 
 @pytest.mark.parametrize('count', [0, 1, 7, 16, 17, 400])

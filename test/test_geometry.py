@@ -18,6 +18,7 @@ from djet_ros.core.geometry import (
     rotation_angle,
     rotation_exp,
     skew,
+    slant_warp,
     sphere_tangents,
     stretches,
     unit,
@@ -154,6 +155,17 @@ def test_a_patch_that_faces_one_camera_is_warped_as_its_points_move(t):
         there, _ = project(K, (rays(K, seen.x + step) * seen.points[:, 2:]) @ seen.R.T + seen.t)
         moved = warp @ step
         assert np.allclose(there - seen.y, moved[:, :2] / (1 + moved[:, 2:]), atol=1e-8)
+
+
+def test_patches_of_several_cameras_are_warped_as_those_of_each():
+    rng = np.random.default_rng(8)
+    R, t = rotation_exp(rng.normal(0, 0.1, (5, 3))), rng.normal(size=(5, 3))
+    y, grown, slope = rng.uniform(0, 300, (5, 2)), rng.uniform(0.5, 2, 5), rng.normal(size=(5, 2))
+    together = patch_warp(K, R, y, grown) + slant_warp(K, t, y, grown, slope)
+    for i, some in enumerate(np.arange(5)[:, None]):
+        seen = y[some], grown[some]
+        alone = patch_warp(K, R[i], *seen) + slant_warp(K, t[i], *seen, slope[some])
+        assert np.allclose(together[some], alone, rtol=1e-12)
 
 
 def test_stretches_are_the_singular_values():

@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 
+# Images (H, W) of one size, each with how many of the points are in it.
+Images = Sequence[tuple[NDArray[Any], int]]
+
 # That of what is built, see interface.c: sources in place may be newer than it.
 _INTERFACE = 5
 
@@ -50,42 +53,43 @@ def _loaded() -> ctypes.CDLL | None:
 library = _loaded()
 
 
-def place(there: NDArray[np.uint8], here: NDArray[np.uint8], points: Gray, inverse: Gray,
-          began: Array, inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
+def place(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
+          inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """
-    Find N patches of one gray image (H, W) in another one: `core.patches.Expected.stepped`.
+    Find N patches of some gray images in another one (H, W): `core.patches.Expected.stepped`.
 
-    points: (N, 2) in `there`; inverse: (N, 2, 2) of their warps; began: (N, 2) in `here`, with
-    room for the patches and all steps; inside: (N,) those that may move; tuning: (4,) least slope,
-    least noise, steps and the farthest. Gives places (N, 2), variances (N,) of a pixel, and
-    inverses (N, 2, 2).
+    points: (N, 2) in `there`, one image after the other; inverse: (N, 2, 2) of their warps;
+    began: (N, 2) in `here`, with room for the patches and all steps; inside: (N,) those that may
+    move; tuning: (4,) least slope, least noise, steps and the farthest. Gives places (N, 2),
+    variances (N,) of a pixel, and inverses (N, 2, 2).
     """
     n = len(points)
     places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
-    _call('djet_place', _given(there, np.uint8), c_int(there.shape[0]), c_int(there.shape[1]),
-          _given(here, np.uint8), c_int(here.shape[1]), c_int(n), _given(points, np.float32),
-          _given(inverse, np.float32), _given(began), _given(inside, np.bool_), _given(tuning),
-          _given(places), _given(variances), _given(inverses))
+    _call('djet_place', *_images(there, np.uint8), _given(here, np.uint8), c_int(here.shape[1]),
+          _given(points, np.float32), _given(inverse, np.float32), _given(began),
+          _given(inside, np.bool_), _given(tuning), _given(places), _given(variances),
+          _given(inverses))
     return places, variances, inverses
 
 
-def grades_through(image: NDArray[np.int16], looks: tuple[Gray, Gray], points: Gray,
-                   contrast: Gray, ends: tuple[Gray, NDArray[np.int64]], reach: int,
-                   most_nearer: float) -> NDArray[np.int16]:
+def grades_through(images: Images, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
+                   ends: tuple[Gray, NDArray[np.int64]], reach: int, most_nearer: float
+                   ) -> NDArray[np.int16]:
     """
     Grades (T, N) of tests on patches seen through warps: `core.graded.grades_through`.
 
-    image: (H, W); looks: (N, 2, 2) inverse warps, and (N, 2) by which share depths grow a pixel;
-    points: (N, 2); contrast: (N,); ends: (2, E) places at which tests look, and (2, T) which a
-    test has; reach: the largest grade; most_nearer: by which factor depths grow at most.
+    looks: (N, 2, 2) inverse warps, and (N, 2) by which share depths grow a pixel; points: (N, 2)
+    in the images, one after the other; contrast: (N,); ends: (2, E) places at which tests look,
+    and (2, T) which a test has; reach: the largest grade; most_nearer: by which factor depths grow
+    at most.
     """
     n, tests = len(points), ends[1].shape[1]
     grades = np.empty((tests, n), np.int16)
-    _call('djet_grades_through', _given(image, np.int16), c_int(image.shape[0]),
-          c_int(image.shape[1]), c_int(n), _given(looks[0], np.float32),
-          _given(looks[1], np.float32), c_float(most_nearer), _given(points, np.float32),
-          _given(contrast, np.float32), c_int(ends[0].shape[1]), _given(ends[0].T, np.float32),
-          c_int(tests), _given(ends[1], np.int64), c_int(reach), _given(grades, np.int16))
+    _call('djet_grades_through', *_images(images, np.int16), c_int(n),
+          _given(looks[0], np.float32), _given(looks[1], np.float32), c_float(most_nearer),
+          _given(points, np.float32), _given(contrast, np.float32), c_int(ends[0].shape[1]),
+          _given(ends[0].T, np.float32), c_int(tests), _given(ends[1], np.int64), c_int(reach),
+          _given(grades, np.int16))
     return grades
 
 
@@ -296,6 +300,16 @@ def _given(array: NDArray[Any], dtype: Any = np.float64) -> Any:
     ordered = np.ascontiguousarray(array, dtype)
     # Where it may be written to, in a third of the time: hundreds are given a frame.
     return _NOTHING.from_buffer(ordered.data) if ordered.flags.writeable else ordered.ctypes
+
+
+def _images(images: Images, dtype: Any) -> tuple[Any, ...]:
+    """Give how many images there are, where they lie, how many points each has, and their size."""
+    kept = [np.ascontiguousarray(image, dtype) for image, _ in images]
+    places = (c_void_p * len(kept))(*(image.ctypes.data for image in kept))
+    # As long as these are given, so are the images.
+    places.kept = kept  # type: ignore[attr-defined]
+    counts = np.array([count for _, count in images], np.int64)
+    return c_int(len(kept)), places, _given(counts, np.int64), *map(c_int, kept[0].shape)
 
 
 def _memory(n: int) -> Array:

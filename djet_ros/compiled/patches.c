@@ -145,20 +145,17 @@ INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double 
     return products(patches, patches) - alike * alike / expected->contrast;
 }
 
-/* Find n patches of a gray image `there` in another one, next to `began` (n, 2), where there is
-   room for the steps. tuning: least slope and noise, how many steps, and the farthest;
-   inside: (n,) those that may move. Gives places (n, 2), variances (n,) of a pixel, and
-   inverses (n, 2, 2). */
-WIDE void djet_place(const uint8_t *there, int there_height, int there_width, const uint8_t *here,
-                     int here_width, int n, const float (*points)[2],
-                     const float (*inverse)[2][2], const double (*began)[2],
-                     const uint8_t *inside, const double *tuning, double (*places)[2],
-                     double *variances, double (*inverses)[2][2])
+/* djet_place, of the patches of one image: those from one number up to another. */
+INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there_height,
+                       int there_width, const uint8_t *here, int here_width,
+                       const float (*points)[2], const float (*inverse)[2][2],
+                       const double (*began)[2], const uint8_t *inside, const double *tuning,
+                       double (*places)[2], double *variances, double (*inverses)[2][2])
 {
     const Image image = {there, 1, there_height, there_width};
     const double least_noise = tuning[1], steps = tuning[2], farthest = tuning[3], fitted = 4;
-    for (int first = 0; first < n; first += LANES) {
-        const int count = n - first < LANES ? n - first : LANES;
+    for (int64_t first = from; first < to; first += LANES) {
+        const int count = to - first < LANES ? (int)(to - first) : LANES;
         double at_first[LANES][2], at[LANES][2];
         for (int l = 0; l < LANES; l++)
             for (int axis = 0; axis < 2; axis++)
@@ -208,4 +205,19 @@ WIDE void djet_place(const uint8_t *there, int there_height, int there_width, co
             }
         }
     }
+}
+
+/* Find patches of some gray images `there` in another one, next to `began` (n, 2), where there is
+   room for the steps. there: (I,) of one size, each of so many of the patches, one after the
+   other; tuning: least slope and noise, how many steps, and the farthest; inside: (n,) those that
+   may move. Gives places (n, 2), variances (n,) of a pixel, and inverses (n, 2, 2). */
+WIDE void djet_place(int I, const uint8_t *const *there, const int64_t *counts, int there_height,
+                     int there_width, const uint8_t *here, int here_width,
+                     const float (*points)[2], const float (*inverse)[2][2],
+                     const double (*began)[2], const uint8_t *inside, const double *tuning,
+                     double (*places)[2], double *variances, double (*inverses)[2][2])
+{
+    for (int64_t i = 0, first = 0; i < I; first += counts[i++])
+        place_some(there[i], first, first + counts[i], there_height, there_width, here, here_width,
+                   points, inverse, began, inside, tuning, places, variances, inverses);
 }

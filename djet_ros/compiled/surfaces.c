@@ -11,20 +11,17 @@ enum { POINTS = 16, MOST_WINDOW = 15 };
 typedef int16_t Grades __attribute__((vector_size(POINTS * sizeof(int16_t))));
 typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
 
-/* Grades (T, n) of T tests on patches seen through warps: dx = u / (1 - nearer . u), with
-   u = inverse dy, for the places dy of their ends. inverse: (n, 2, 2); nearer: (n, 2), which is 0
-   where it does not matter; contrast: (n,); ends: (E, 2); of_tests: (2, T) which a test has. */
-WIDE void djet_grades_through(const int16_t *pixels, int height, int width, int n,
-                              const float *inverse, const float *nearer, float most_nearer,
-                              const float *points, const float *contrast, int E,
-                              const float (*ends)[2], int T, const int64_t *of_tests, int reach,
-                              int16_t *grades)
+/* djet_grades_through, of the patches of one image: those from one number up to another. */
+INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int height, int width, int n,
+                       const float *inverse, const float *nearer, float most_nearer,
+                       const float *points, const float *contrast, int E, const float (*ends)[2],
+                       int T, const int64_t *of_tests, int reach, int16_t *grades)
 {
     /* Added and taken away again, it leaves whole numbers of all that are far below it. */
     const float whole = 3 << 22;
     const Image image = {pixels, sizeof *pixels, height, width};
-    for (int first = 0; first < n; first += LANES) {
-        const int count = n - first < LANES ? n - first : LANES;
+    for (int64_t first = from; first < to; first += LANES) {
+        const int count = to - first < LANES ? (int)(to - first) : LANES;
         const float *W = inverse + 4 * first, *c = nearer + 2 * first, *at = points + 2 * first;
         const Lanes xx = gathered(W, 4, count), xy = gathered(W + 1, 4, count),
                     yx = gathered(W + 2, 4, count), yy = gathered(W + 3, 4, count),
@@ -46,6 +43,21 @@ WIDE void djet_grades_through(const int16_t *pixels, int height, int width, int 
                 grades[(int64_t)t * n + first + l] = (int16_t)rounded[l];
         }
     }
+}
+
+/* Grades (T, n) of T tests on patches seen through warps: dx = u / (1 - nearer . u), with
+   u = inverse dy, for the places dy of their ends. images: (I,) of one size, each of so many of
+   the patches, one after the other; inverse: (n, 2, 2); nearer: (n, 2), which is 0 where it does
+   not matter; contrast: (n,); ends: (E, 2); of_tests: (2, T) which a test has. */
+WIDE void djet_grades_through(int I, const int16_t *const *images, const int64_t *counts, int height,
+                              int width, int n, const float *inverse, const float *nearer,
+                              float most_nearer, const float *points, const float *contrast, int E,
+                              const float (*ends)[2], int T, const int64_t *of_tests, int reach,
+                              int16_t *grades)
+{
+    for (int64_t i = 0, first = 0; i < I; first += counts[i++])
+        grade_some(images[i], first, first + counts[i], height, width, n, inverse, nearer,
+                   most_nearer, points, contrast, E, ends, T, of_tests, reach, grades);
 }
 
 /* Copy what tests see around some centres, side x side pixels: points last. */

@@ -20,11 +20,12 @@ calibration may leave some radial distortion: it moves points u = (X/Z, Y/Z) to 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
-from djet_ros.core.paraboloid import times
+from djet_ros.core.paraboloid import median, times
 from djet_ros.core.radial import bending, bent, straightened, stretch
 from djet_ros.core.types import Array
 import numpy as np
@@ -49,7 +50,7 @@ _TRACE = 1e-9
 _OPEN = 1e-7
 
 
-@dataclass
+@dataclass(frozen=True)
 class Poses:
     """Poses of F frames: R (F, 3, 3), t (F, 3), and the k1 of their lens, see above."""
 
@@ -57,6 +58,7 @@ class Poses:
     t: Array
     k1: float = 0.0
 
+    @cached_property
     def between(self) -> tuple[Array, Array]:
         """Motions from frame a to frame f: R (F, F, 3, 3) and t (F, F, 3), indexed [f, a]."""
         R = np.einsum('fij,akj->faik', self.R, self.R)
@@ -91,6 +93,13 @@ class Poses:
         return np.concatenate([rotation_log(turns), shifts], axis=1).ravel()
 
 
+class OfPrior(NamedTuple):
+    """What poses cost by a prior, and the slope (6 F,) of that there."""
+
+    cost: float
+    slope: Array
+
+
 @dataclass
 class PosePrior:
     """
@@ -108,14 +117,11 @@ class PosePrior:
         """Hold a first pose where it is."""
         return cls(np.eye(6) * _HELD, np.zeros(6), pose)
 
-    def cost(self, poses: Poses) -> float:
-        """Tell what some poses cost."""
+    def at(self, poses: Poses) -> OfPrior:
+        """Tell what it has some poses cost."""
         step = poses.step_from(self.since)
-        return float(step @ (self.H @ step / 2 + self.g))
-
-    def gradient(self, poses: Poses) -> Array:
-        """Slope (6 F,) of that at some poses."""
-        return np.asarray(self.g + self.H @ poses.step_from(self.since))
+        pull = self.H @ step
+        return OfPrior(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
         """Add what is known around poses."""
@@ -183,7 +189,9 @@ class Landmarks:
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
         """Give some of the landmarks."""
-        return Landmarks(*(array[chosen] for array in vars(self).values()))
+        # To take is three to six times as fast as to index, of whatever has several axes.
+        places = np.flatnonzero(chosen)
+        return Landmarks(*(array.take(places, axis=0) for array in vars(self).values()))
 
     def joined(self, other: Landmarks) -> Landmarks:
         """Give these landmarks and others of the same frames."""
@@ -237,7 +245,7 @@ class Landmarks:
 
 def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
     """Give places (N, 3) of landmarks in a frame, times their inverse depths in their anchors."""
-    R, t = poses.between()
+    R, t = poses.between
     turned = R[frame, landmarks.anchors]
     places = times(turned, rays(K, landmarks.points))
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
@@ -281,8 +289,7 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     """Take the residuals of all observations, in the unit of their roots."""
     landmark, frame = np.nonzero(landmarks.seen)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
-    motions = poses.between()
-    R, t = motions[0][frame, anchor], motions[1][frame, anchor]
+    R, t = (motions[frame, anchor] for motions in poses.between)
     rays_of_points = rays(K, landmarks.points)
     ray = rays_of_points[landmark]
     place = times(R, ray) + rho[:, None] * t
@@ -380,7 +387,7 @@ def noise_scale(observed: Observed) -> float:
     seen = count > 0
     # Wilson and Hilferty's median of the chi-square distribution.
     freedom = 2 * count[seen] - 1
-    return float(np.sqrt(np.median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
+    return float(np.sqrt(median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
 
 
 class OfK1(NamedTuple):

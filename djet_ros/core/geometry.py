@@ -223,8 +223,9 @@ def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     """
     (N, 3, 2) local homographies: how patches that face camera A are seen in B.
 
-    y: (N, 2) pixels in B; growth: (N,) see there. Depth is taken to be the same all over a patch,
-    so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B, a step dx leads exactly to
+    R: (3, 3), or (N, 3, 3) from several cameras A; y: (N, 2) pixels in B; growth: (N,) see there.
+    Depth is taken to be the same all over a patch, so that with M = K R K^-1 and
+    y = (M x Z_A + K t) / Z_B, a step dx leads exactly to
 
         dy = W dx / (1 + c^T dx),   W = Z_A / Z_B (M_12 - y m_3^T),   c = Z_A / Z_B m_3,
 
@@ -234,8 +235,8 @@ def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
     """
     M = K @ R @ inverse_of(K)
     warp = np.empty((len(y), 3, 2))
-    warp[:, :2] = M[:2, :2] - y[:, :, None] * M[2, :2]
-    warp[:, 2] = M[2, :2]
+    warp[:, :2] = M[..., :2, :2] - y[:, :, None] * M[..., 2:, :2]
+    warp[:, 2] = M[..., 2, :2]
     return np.asarray(growth[:, None, None] * warp)
 
 
@@ -243,15 +244,15 @@ def slant_warp(K: Array, t: Array, y: Array, growth: Array, slope: Array) -> Arr
     """
     (N, 3, 2) what `patch_warp` lacks where patches do not face the camera.
 
-    t: (3,) translation to B; slope: (N, 2) how inverse depth in A, over the unit of t, changes a
-    pixel: all over a plane alike, so that their sum is the homography of it. Of
+    t: (3,) or (N, 3) translation to B; slope: (N, 2) how inverse depth in A, over the unit of t,
+    changes a pixel: all over a plane alike, so that their sum is the homography of it. Of
     y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is Z_A / Z_B ((K t)_12 - y t_3), and
     that of the denominator is t_3.
     """
-    shift = K @ t
+    shift = t @ K.T
     by_depth = np.empty((len(y), 3))
-    by_depth[:, :2] = shift[:2] - y * shift[2]
-    by_depth[:, 2] = shift[2]
+    by_depth[:, :2] = shift[..., :2] - y * shift[..., 2:]
+    by_depth[:, 2] = shift[..., 2]
     return np.asarray((growth[:, None] * by_depth)[:, :, None] * slope[:, None])
 
 

@@ -15,12 +15,12 @@ from typing import Any
 import cv2
 from djet_ros import compiled
 from djet_ros.core.hamming import (
-    blocks,
     ends_of,
     Image,
     intensities_through,
     looks_through,
     MOST_NEARER,
+    passes,
     Pixels,
     require_describable,
     Shown,
@@ -74,14 +74,14 @@ def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading:
     places, ends = points.astype(np.float32), ends_of(tests)
     of_each = np.broadcast_to(np.float32(contrast), len(points))
 
-    def look(task: tuple[Grades, slice]) -> Grades:
-        image, some = task
+    def look(task: tuple[list[Shown], slice]) -> Grades:
+        seen, some = task
         return compiled.grades_through(
-            image, (inverse[some], nearer[some]), places[some], of_each[some], ends,
+            seen, (inverse[some], nearer[some]), places[some], of_each[some], ends,
             _reach(grading), MOST_NEARER)
 
     none = np.empty((len(tests), 0), np.int16)
-    return np.concatenate([none, *each(look, blocks(images))], axis=1)
+    return np.concatenate([none, *each(look, passes(images))], axis=1)
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,

@@ -157,6 +157,19 @@ def floating(images: Sequence[Shown]) -> list[Shown]:
     return [(image.astype(np.float32, copy=False), count) for image, count in images]
 
 
+def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
+    """Give the same for what takes several images of a size at once: few, where points are."""
+    found: list[tuple[list[Shown], slice]] = []
+    for image, some in blocks(images):
+        part = image, some.stop - some.start
+        seen, begun = found[-1] if found else ([], some)
+        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _WARPED_BLOCK:
+            found[-1] = [*seen, part], slice(begun.start, some.stop)
+        else:
+            found.append(([part], some))
+    return found
+
+
 def ends_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Places (2, E) at which tests (T, 4) look, each of them once, and which (2, T) a test has."""
     return _ends(tests.tobytes())

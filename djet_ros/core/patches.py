@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 from djet_ros import compiled
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import blocks, floating, gather_patches, Image, Shown
+from djet_ros.core.hamming import blocks, floating, gather_patches, Image, passes, Shown
 from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import each
 from djet_ros.core.types import Array
@@ -115,8 +115,8 @@ def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began:
     """Take the steps of `Expected.stepped`, compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
     tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _FARTHEST], float)
-    parts = [compiled.place(image, here, points[some], inverse[some], began[some], inside[some],
-                            tuning) for image, some in blocks(images)]
+    parts = [compiled.place(seen, here, points[some], inverse[some], began[some], inside[some],
+                            tuning) for seen, some in passes(images)]
     places, noise, spread = (np.concatenate(values) for values in zip(*parts))
     return places, noise, spread
 

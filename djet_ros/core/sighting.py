@@ -89,16 +89,13 @@ class Sighting:
             expected, here.tested.shape, reach)
         # One that neither of the last two frames saw is gone.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
-        warps = np.empty((len(landmarks), 3, 2))
-        R, t = (motions[newest] for motions in self.poses.between())
-        lean = landmarks.rho[:, None] * landmarks.slopes
-        for anchor in np.unique(landmarks.anchors[wanted]):
-            mine = wanted & (landmarks.anchors == anchor)
-            seen = expected[mine], 1 / places[mine, 2]
-            warps[mine] = patch_warp(self.K, R[anchor], *seen) + slant_warp(
-                self.K, t[anchor], *seen, lean[mine])
         which = np.argsort(landmarks.anchors, kind='stable')
         which = which[wanted[which]]
+        R, t = (motions[newest, landmarks.anchors[which]] for motions in self.poses.between)
+        seen = expected[which], 1 / places[which, 2]
+        lean = landmarks.rho[which, None] * landmarks.slopes[which]
+        warps = np.empty((len(landmarks), 3, 2))
+        warps[which] = patch_warp(self.K, R, *seen) + slant_warp(self.K, t, *seen, lean)
         return which[comparable(warps[which])], expected, warps
 
     def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int

@@ -23,6 +23,7 @@ from djet_ros.core.bundle import (
     noise_scale,
     observe,
     Observed,
+    OfPrior,
     PosePrior,
     Poses,
     projected,
@@ -39,6 +40,7 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.jet import Loss
 from djet_ros.core.landmark_choice import choose_landmarks
+from djet_ros.core.paraboloid import median
 from djet_ros.core.radial import straight_image, straight_rays, straightened
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.sighting import Sighting
@@ -295,7 +297,9 @@ class Window:
         """Tell the same of pixels x beside points (P, 2) of some inverse depths (P,)."""
         if not len(points) or not len(x):
             return np.empty(0), np.empty(0, np.int64)
-        away, match = cKDTree(x).query(points, distance_upper_bound=self._tuning.beside)
+        # Built in half the time of a balanced one, and asked as fast.
+        tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
+        away, match = tree.query(points, distance_upper_bound=self._tuning.beside)
         near = np.isfinite(away)
         return rho[near], match[near]
 
@@ -318,7 +322,7 @@ class Window:
                                          self._rays(y[match]))
         ratios = in_units / known
         # By what is near, which tells most but may be another body, or by all alike.
-        lengths = np.array([[_weighted_median(ratios, known / sigma)], [np.median(ratios)]])
+        lengths = np.array([[_weighted_median(ratios, known / sigma)], [median(ratios)]])
         noise = self._tuning.matched / self._K[0, 0] * sigma
         off = np.abs(in_units - lengths * known)
         agree = off < self._tuning.outlier * noise + self._tuning.known * np.abs(lengths) * known
@@ -342,8 +346,7 @@ class Window:
             turned, moved = (self._projected(places) for places in (
                 in_frame(self._K, self._poses, here, last) @ turn.T,
                 in_frame(self._K, self._poses, here, newest)))
-            way = np.median(np.linalg.norm(moved - turned, axis=1))
-            few = bool(way > self._tuning.parallax)
+            few = median(np.linalg.norm(moved - turned, axis=1)) > self._tuning.parallax
         self._is_keyframe[-1] = few
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
@@ -412,36 +415,36 @@ class Window:
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
         self._equalise()
-        observed = self._observed()
+        observed, prior = self._observed(), self._prior.at(self._poses)
         for _ in range(self._tuning.steps):
             reduced = self._reduced(observed)
-            H, g = self._prior.H + reduced.H, self._prior.gradient(self._poses) + reduced.g
+            H, g = self._prior.H + reduced.H, prior.slope + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            observed = self._moved(observed, step, reduced.change(step))
+            observed, prior = self._moved(observed, prior, step, reduced.change(step))
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
         return H
 
-    def _moved(self, observed: Observed, step: Array, change: Array) -> Observed:
+    def _moved(self, observed: Observed, prior: OfPrior, step: Array, change: Array
+               ) -> tuple[Observed, OfPrior]:
         """Go a step of the poses and its change of the landmarks, or as much as costs no more."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
-        cost = self._cost(observed, scale)
+        cost = self._cost(observed, scale) + prior.cost
         for _ in range(self._tuning.halvings + 1):
             self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
-            moved = self._observed()
-            if self._cost(moved, scale) <= cost:
-                return moved
+            moved, there = self._observed(), self._prior.at(self._poses)
+            if self._cost(moved, scale) + there.cost <= cost:
+                return moved, there
             step, change = step / 2, change / 2
         self._poses, self._landmarks, self._scale = poses, landmarks, scale
-        return observed
+        return observed, prior
 
     def _cost(self, observed: Observed, scale: float) -> float:
-        """Tell what observations of a noise, robustly, and the prior cost together."""
+        """Tell what observations of a noise cost, robustly."""
         losses, _ = self._robustly(observed, scale)
-        squares = losses.sum() + (observed.off**2).sum()
-        return float(squares / (2 * scale**2) + self._prior.cost(self._poses))
+        return float((losses.sum() + (observed.off**2).sum()) / (2 * scale**2))
 
     def _robustly(self, observed: Observed, scale: float) -> tuple[Array, Array]:
         """Losses (M,) of observations of a noise, and their weights."""
@@ -453,7 +456,7 @@ class Window:
         roots = self._landmarks.roots[seen, -1]
         if len(roots):
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
-            self._landmarks.roots[seen, -1] = roots / np.median(sizes)
+            self._landmarks.roots[seen, -1] = roots / median(sizes)
             # The patch where a landmark was found has as much noise as the first that shows it.
             anew = seen & ~self._landmarks.held.any((1, 2))
             self._landmarks.held[anew] = self._landmarks.roots[anew, -1]
