@@ -282,6 +282,23 @@ def test_matches_that_tell_nothing_move_no_pose() -> None:
             assert found.t.tolist() == [0, 0, 1]
 
 
+@pytest.mark.parametrize('seen', [False, True])
+def test_residuals_of_a_window_are_those_of_numpy(seen: bool) -> None:
+    rng = np.random.default_rng(6)
+    poses, landmarks = scene(rng, frames=6, landmarks=57)
+    landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
+    # Some far behind, at the camera, and beyond what k1 moves.
+    landmarks.rho[:9] = -3.0
+    landmarks.rho[9:12] = 1e9
+    landmarks.points[12:20] *= 9
+    landmarks.seen &= seen
+    ours, numpys = both(lambda: observe(BUNDLE_K, poses, landmarks))
+    for name, mine in vars(ours).items():
+        others = getattr(numpys, name)
+        assert np.shape(mine) == np.shape(others)
+        np.testing.assert_allclose(mine, others, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize('lens', [False, True])
 def test_landmarks_are_eliminated_as_numpy_does(lens: bool) -> None:
     rng = np.random.default_rng(5)

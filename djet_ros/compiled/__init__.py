@@ -26,7 +26,7 @@ Gray = NDArray[np.float32]
 Images = Sequence[tuple[NDArray[Any], int]]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 5
+_INTERFACE = 6
 
 _NOTHING = c_char * 0
 
@@ -268,30 +268,53 @@ def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: flo
     return found, off, fitting
 
 
+def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[np.int64],
+            between: tuple[Array, Array], landmarks: tuple[Array, ...], K: tuple[Array, Array],
+            tuning: Sequence[float]) -> tuple[NDArray[np.int64], tuple[Array, ...]]:
+    """
+    Residuals of M observations of N landmarks by F frames: `core.bundle.observe`.
+
+    seen: landmark and frame of each (M,); anchors: (N,); between: R (F, F, 3, 3) and t (F, F, 3);
+    landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), held (N, 2, 2) and
+    found (N, 2); K: (3, 3) and its inverse; tuning: k1, the nearest place, by how much k1 moves
+    points at most, and pixels beyond which nothing is told apart. Gives anchors (M,), and an
+    Observed's residuals, off, straight, R, t, ray, rho, place and root.
+    """
+    m, n, frames = len(seen[0]), len(anchors), len(between[0])
+    anchor = np.empty(m, np.int64)
+    told = tuple(np.empty(shape) for shape in (
+        (m, 2), (n, 2), (n, 2), (m, 3, 3), (m, 3), (m, 3), m, (m, 3), (m, 2, 2)))
+    given = _Given()
+    _call('djet_observe', c_int(m), c_int(n), c_int(frames),
+          *(given(one, np.int64) for one in (*seen, anchors)), *map(given, between),
+          *map(given, landmarks), *map(given, K), given(np.array(tuning, float)),
+          given(anchor, np.int64), *map(given, told))
+    return anchor, told
+
+
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
-              observed: tuple[Array, ...], held: tuple[Array, Array, float],
-              by_k1: tuple[Array, Array] | None, K: tuple[Array, Array],
-              least: tuple[float, float], frames: int
-              ) -> tuple[Array, Array, Array, Array, Array]:
+              observed: tuple[Array, ...], points: tuple[Array, Array, Array, float],
+              with_k1: bool, K: tuple[Array, Array], tuning: Sequence[float], trace: float,
+              frames: int) -> tuple[Array, Array, Array, Array, Array]:
     """
     Sum up M observations of N landmarks by F frames, and eliminate these: `core.bundle.eliminate`.
 
     which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
-    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); held:
-    (N, 2, 2), off (N, 2) and their weight; by_k1: how residuals (M, 2) and off change over k1,
-    where that is among the equations; K: (3, 3) and its inverse; least: depth, and information
-    about a landmark. Gives a Reduced's arrays.
+    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); points:
+    straight (N, 2), held (N, 2, 2), off (N, 2) and their weight; with_k1: whether that is among
+    the equations; K, tuning: as in `observe`; trace: information about a landmark. Gives a
+    Reduced's arrays.
     """
-    *of_points, weight = held
-    n, size = len(of_points[0]), (by_k1 is not None) + 6 * frames
+    *of_points, weight = points
+    n, size = len(of_points[0]), with_k1 + 6 * frames
     H, g = np.zeros((size, size)), np.zeros(size)
     coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
     slopes, gain = np.zeros((n, 3)), np.empty((3, size))
-    lens = (c_void_p(None),) * 2 if by_k1 is None else (_given(one) for one in by_k1)
-    _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames),
+    _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames), c_int(with_k1),
           *(_given(one, np.int64) for one in which), *map(_given, observed),
-          *map(_given, of_points), c_double(weight), *lens, *map(_given, K),
-          *map(c_double, least), *map(_given, (H, g, coupling, variances, slopes, gain)))
+          *map(_given, of_points), c_double(weight), *map(_given, K),
+          _given(np.array(tuning, float)), c_double(trace),
+          *map(_given, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 
 

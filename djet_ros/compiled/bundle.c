@@ -1,13 +1,123 @@
-/* Normal equations of a window, its landmarks eliminated: see core/bundle.py. */
+/* Residuals of a window, and its normal equations, the landmarks eliminated: see core/bundle.py. */
 #include <string.h>
 
 #include "common.h"
 
-/* Of one observation: its residuals (2,), and how they change with the steps of both poses, and
-   with the landmark's inverse depth and point, all of them by the root of its weight. */
+/* Of one observation: X/Z, Y/Z; its residuals (2,), and how they change with the steps of both
+   poses, and with the landmark's inverse depth and point, all of them by the root of its weight. */
 typedef struct {
-    double e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
+    double u[2], e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
 } Row;
+
+/* A camera (3, 3) and its inverse, its lens, and what projections are held to: see core/bundle.py
+   and core/radial.py. */
+typedef struct {
+    const double *K, *K_inverse;
+    double k1, nearest, farthest, far_out;
+} Lens;
+
+static Lens lens_of(const double *K, const double *K_inverse, const double tuning[4])
+{
+    const Lens lens = {K, K_inverse, tuning[0], tuning[1], tuning[2], tuning[3]};
+    return lens;
+}
+
+INLINE double within(double value, double most)
+{
+    return value > most ? most : value < -most ? -most : value;
+}
+
+/* radial.stretch. */
+INLINE double stretch(const Lens *lens, const double u[2])
+{
+    return 1 + within(lens->k1 * (u[0] * u[0] + u[1] * u[1]), lens->farthest);
+}
+
+INLINE double depth_of(const Lens *lens, const double place[3])
+{
+    return place[2] > lens->nearest ? place[2] : lens->nearest;
+}
+
+/* What is left over (2,), by a root (2, 2), between where a place is seen and a pixel. */
+INLINE void hold_against(const Lens *lens, const double place[3], const double pixel[2],
+                         const double *root, double *residual)
+{
+    const double depth = depth_of(lens, place), u[2] = {place[0] / depth, place[1] / depth};
+    const double by = stretch(lens, u), x = u[0] * by, y = u[1] * by;
+    double off[2];
+    for (int i = 0; i < 2; i++) {
+        const double *row = lens->K + 3 * i;
+        off[i] = within(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
+    }
+    for (int i = 0; i < 2; i++)
+        residual[i] = root[2 * i] * off[0] + root[2 * i + 1] * off[1];
+}
+
+/* bundle._through_the_lens, of one root (2, 2) at u. */
+INLINE void see_through(const Lens *lens, const double u[2], const double *root, double turned[4])
+{
+    const double *K = lens->K, *back = lens->K_inverse, by = stretch(lens, u);
+    for (int i = 0; i < 2; i++) {
+        double row[2], bent[2];
+        for (int j = 0; j < 2; j++)
+            row[j] = root[2 * i] * K[j] + root[2 * i + 1] * K[3 + j];
+        const double along = 2 * lens->k1 * (row[0] * u[0] + row[1] * u[1]);
+        for (int j = 0; j < 2; j++)
+            bent[j] = along * u[j] + by * row[j];
+        for (int j = 0; j < 2; j++)
+            turned[2 * i + j] = bent[0] * back[j] + bent[1] * back[3 + j];
+    }
+}
+
+/* bundle._over_k1, of one root (2, 2) at u. */
+INLINE void over_k1(const Lens *lens, const double u[2], const double *root, double moved[2])
+{
+    const double *K = lens->K, squared = u[0] * u[0] + u[1] * u[1];
+    const double x = squared * (K[0] * u[0] + K[1] * u[1]);
+    const double y = squared * (K[3] * u[0] + K[4] * u[1]);
+    for (int i = 0; i < 2; i++)
+        moved[i] = root[2 * i] * x + root[2 * i + 1] * y;
+}
+
+/* bundle.observe: of N landmarks, their points (N, 2) seen first by some of F frames, M
+   observations. R_between (F, F, 3, 3) and t_between (F, F, 3) lead from each frame (second) to
+   each other one; minima (N, F, 2), roots (N, F, 2, 2); tuning: k1, the nearest place, the
+   farthest that k1 moves points, and pixels beyond which nothing is told apart. */
+WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
+                       const int64_t *anchors, const double *R_between, const double *t_between,
+                       const double (*points)[2], const double *depths, const double *minima,
+                       const double *roots, const double *held, const double (*found)[2],
+                       const double *K, const double *K_inverse, const double *tuning,
+                       int64_t *anchor, double (*residuals)[2], double (*off)[2],
+                       double (*straight)[2], double (*R)[9], double (*t)[3], double (*ray)[3],
+                       double *rho, double (*place)[3], double (*root)[4])
+{
+    const Lens lens = lens_of(K, K_inverse, tuning);
+    for (int n = 0; n < N; n++) {
+        double towards[3] = {0, 0, 1};
+        for (int i = 0; i < 2; i++)
+            towards[i] = straight[n][i] = points[n][0] * K_inverse[3 * i]
+                                          + points[n][1] * K_inverse[3 * i + 1]
+                                          + K_inverse[3 * i + 2];
+        hold_against(&lens, towards, found[n], held + 4 * n, off[n]);
+    }
+    for (int m = 0; m < M; m++) {
+        const int64_t n = landmark[m], seen = n * F + frame[m];
+        anchor[m] = anchors[n];
+        const int64_t motion = frame[m] * F + anchor[m];
+        memcpy(R[m], R_between + 9 * motion, sizeof R[m]);
+        memcpy(t[m], t_between + 3 * motion, sizeof t[m]);
+        memcpy(root[m], roots + 4 * seen, sizeof root[m]);
+        rho[m] = depths[n];
+        ray[m][0] = straight[n][0];
+        ray[m][1] = straight[n][1];
+        ray[m][2] = 1;
+        for (int i = 0; i < 3; i++)
+            place[m][i] = R[m][3 * i] * ray[m][0] + R[m][3 * i + 1] * ray[m][1]
+                          + R[m][3 * i + 2] + rho[m] * t[m][i];
+        hold_against(&lens, place[m], minima + 2 * seen, root[m], residuals[m]);
+    }
+}
 
 INLINE int64_t least(int64_t a, int64_t b)
 {
@@ -27,16 +137,19 @@ static void cross(const double a[3], const double b[3], double product[3])
 }
 
 /* bundle.jacobians. */
-static void differentiate(const double *K, const double *K_inverse, double nearest,
-                          const double *residuals, const double *R, const double *t,
-                          const double *ray, double rho, const double *place, const double *root,
-                          double by, Row *row)
+static void differentiate(const Lens *lens, const double *residuals, const double *R,
+                          const double *t, const double *ray, double rho, const double *place,
+                          const double *root, double by, Row *row)
 {
-    const double depth = place[2] > nearest ? place[2] : nearest;
+    const double *K = lens->K, *K_inverse = lens->K_inverse, depth = depth_of(lens, place);
+    double turned[4];
+    row->u[0] = place[0] / depth;
+    row->u[1] = place[1] / depth;
+    see_through(lens, row->u, root, turned);
     for (int i = 0; i < 2; i++) {
         double by_place[3], by_turned[3];
         for (int j = 0; j < 2; j++)
-            by_place[j] = by * (root[2 * i] * K[j] + root[2 * i + 1] * K[3 + j]) / depth;
+            by_place[j] = by * (turned[2 * i] * K[j] + turned[2 * i + 1] * K[3 + j]) / depth;
         by_place[2] = -(by_place[0] * place[0] + by_place[1] * place[1]) / depth;
         for (int j = 0; j < 3; j++)
             by_turned[j] = by_place[0] * R[j] + by_place[1] * R[3 + j] + by_place[2] * R[6 + j];
@@ -101,44 +214,47 @@ INLINE void eliminate(int64_t size, int64_t from, int64_t to, const double *C,
 
 /* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark.
    Adds to H (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 6F for the poses, and
-   one before them where k1 is asked for, by_k1 and held_by_k1 given; gives variances (N, 3, 3);
-   gain: (3, S) of memory. */
-WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
-                         const int64_t *anchor, const double *residuals, const double *R,
-                         const double *t, const double *ray, const double *rho,
+   one before them where k1 is asked for; gives variances (N, 3, 3); gain: (3, S) of memory;
+   tuning: see djet_observe. */
+WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landmark,
+                         const int64_t *frame, const int64_t *anchor, const double *residuals,
+                         const double *R, const double *t, const double *ray, const double *rho,
                          const double *place, const double *root, const double *weights,
-                         const double *held, const double *off, double weight,
-                         const double *by_k1, const double *held_by_k1, const double *K,
-                         const double *K_inverse, double nearest, double trace, double *H,
+                         const double (*straight)[2], const double *held_before,
+                         const double *off, double weight, const double *K,
+                         const double *K_inverse, const double *tuning, double trace, double *H,
                          double *g, double *coupling, double *variances, double *slopes,
                          double *gain)
 {
-    const int64_t lens = by_k1 != NULL, size = lens + 6 * (int64_t)F;
+    const Lens lens = lens_of(K, K_inverse, tuning);
+    const int64_t size = with_k1 + 6 * (int64_t)F;
     for (int n = 0, m = 0; n < N; n++) {
-        double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace};
+        double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace}, held[4], by[2];
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
-        const double *gone = off + 2 * n, *by = lens ? held_by_k1 + 2 * n : NULL;
+        const double *gone = off + 2 * n;
+        see_through(&lens, straight[n], held_before + 4 * n, held);
+        over_k1(&lens, straight[n], held_before + 4 * n, by);
         /* All frames that see a landmark lie between two of them. */
-        int64_t from = lens ? 0 : size, to = lens;
-        if (lens) {
+        int64_t from = with_k1 ? 0 : size, to = with_k1;
+        if (with_k1) {
             H[0] += weight * (by[0] * by[0] + by[1] * by[1]);
             g[0] += weight * (by[0] * gone[0] + by[1] * gone[1]);
         }
         for (int i = 0; i < 2; i++) {
-            const double *column = held + 4 * n + i;
+            const double *column = held + i;
             for (int j = 0; j < 2; j++)
                 information[3 * (i + 1) + j + 1] +=
-                    weight * (column[0] * held[4 * n + j] + column[2] * held[4 * n + 2 + j]);
+                    weight * (column[0] * held[j] + column[2] * held[2 + j]);
             slope[i + 1] += weight * (column[0] * gone[0] + column[2] * gone[1]);
-            if (lens)
+            if (with_k1)
                 C[(i + 1) * size] += weight * (column[0] * by[0] + column[2] * by[1]);
         }
         for (; m < M && landmark[m] == n; m++) {
             const double root_of_weight = sqrt(weights[m]);
             Row row;
-            differentiate(K, K_inverse, nearest, residuals + 2 * m, R + 9 * m, t + 3 * m,
-                          ray + 3 * m, rho[m], place + 3 * m, root + 4 * m, root_of_weight, &row);
-            const int64_t f = lens + 6 * frame[m], a = lens + 6 * anchor[m];
+            differentiate(&lens, residuals + 2 * m, R + 9 * m, t + 3 * m, ray + 3 * m, rho[m],
+                          place + 3 * m, root + 4 * m, root_of_weight, &row);
+            const int64_t f = with_k1 + 6 * frame[m], a = with_k1 + 6 * anchor[m];
             from = least(from, least(f, a));
             to = most(to, most(f, a) + 6);
             const double *by_frame = row.by_frame[0], *by_anchor = row.by_anchor[0],
@@ -153,9 +269,11 @@ WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int
             add_block(C + a, size, by_own, 3, by_anchor, 6);
             add_block(information, 3, by_own, 3, by_own, 3);
             add_block(slope, 1, by_own, 3, row.e, 1);
-            if (lens) {
-                const double k1[2] = {root_of_weight * by_k1[2 * m],
-                                      root_of_weight * by_k1[2 * m + 1]};
+            if (with_k1) {
+                double k1[2];
+                over_k1(&lens, row.u, root + 4 * m, k1);
+                k1[0] *= root_of_weight;
+                k1[1] *= root_of_weight;
                 add_block(H, size, k1, 1, k1, 1);
                 add_block(H + f, size, k1, 1, by_frame, 6);
                 add_block(H + a, size, k1, 1, by_anchor, 6);

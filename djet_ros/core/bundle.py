@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from djet_ros import compiled
 from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import median, times
-from djet_ros.core.radial import bending, bent, straightened, stretch
+from djet_ros.core.radial import bending, bent, FARTHEST, straightened, stretch
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -288,6 +288,14 @@ class Observed:
 def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     """Take the residuals of all observations, in the unit of their roots."""
     landmark, frame = np.nonzero(landmarks.seen)
+    if compiled.library is not None:
+        o = landmarks
+        anchor, (residuals, off, straight, *at_places) = compiled.observe(
+            (landmark, frame), o.anchors, poses.between,
+            (o.points, o.rho, o.minima, o.roots, o.held, o.found), (K, inverse_of(K)),
+            _tuning(poses.k1))
+        return Observed(landmark, frame, anchor, residuals, off, o.held, K, poses.k1, straight,
+                        *at_places)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     R, t = (motions[frame, anchor] for motions in poses.between)
     rays_of_points = rays(K, landmarks.points)
@@ -299,6 +307,11 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
         times(root, projected(K, place, poses.k1) - landmarks.minima[landmark, frame]),
         times(landmarks.held, projected(K, rays_of_points, poses.k1) - landmarks.found),
         landmarks.held, K, poses.k1, rays_of_points[:, :2], R, t, ray, rho, place, root)
+
+
+def _tuning(k1: float) -> tuple[float, ...]:
+    """Give what a lens is told by, and what projections are held to, compiled."""
+    return k1, _NEAREST, FARTHEST, _FAR_OUT
 
 
 @dataclass(frozen=True)
@@ -451,12 +464,12 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     whether k1 is among the equations, or taken as it is.
     """
     if compiled.library is not None:
-        o, (root, held) = observed, _through_the_lens(observed)
+        o = observed
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
-            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, root, weights),
-            (held, o.off, weight), _over_k1(o) if lens else None, (o.K, inverse_of(o.K)),
-            (_NEAREST, _TRACE), frames), lens)
+            (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
+            (o.straight, o.held, o.off, weight), lens, (o.K, inverse_of(o.K)), _tuning(o.k1),
+            _TRACE, frames), lens)
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]

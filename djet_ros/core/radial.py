@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 # Share by which k1 moves points at most: what is farther out is in no image, and must not be
 # folded into one.
-_FARTHEST = 0.1
+FARTHEST = 0.1
 
 # Steps to where a point is without k1; each leaves a hundredth of what the one before did.
 _STRAIGHTENINGS = 3
@@ -27,7 +27,7 @@ _STRAIGHTENINGS = 3
 
 def stretch(u: Array, k1: float) -> Array:
     """By what k1 multiplies points u (N, 2), (N, 1)."""
-    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -_FARTHEST, _FARTHEST))
+    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -FARTHEST, FARTHEST))
 
 
 def bending(K: Array, u: Array, k1: float) -> Array:
