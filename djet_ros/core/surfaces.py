@@ -32,6 +32,7 @@ from djet_ros.core.paraboloid import (
     indefinite,
     largest,
     median,
+    medians_of_parts,
     Paraboloids,
     project_to_positive,
     times,
@@ -352,6 +353,12 @@ def contrast_of(here: Array, there: Array) -> float:
     if not len(here):
         return 1.0
     return min(max(median(here / there), 1 / _MOST_CONTRAST), _MOST_CONTRAST)
+
+
+def contrasts_of(here: Array, there: Array, counts: NDArray[np.int64]) -> Array:
+    """Give the same (N,) for each of N points of several images, so many of each in turn."""
+    ratios = medians_of_parts(here / there, counts)
+    return np.repeat(np.clip(ratios, 1 / _MOST_CONTRAST, _MOST_CONTRAST), counts)
 
 
 def comparable(warp: Array) -> NDArray[np.bool_]:
