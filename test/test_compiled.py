@@ -120,7 +120,7 @@ def test_patches_are_found_where_numpy_finds_them(count: int) -> None:
 @pytest.mark.parametrize('counts', [(3, 4, 9), (200, 90, 40)])
 def test_patches_of_several_images_are_those_of_each(counts: tuple[int, ...]) -> None:
     rng = np.random.default_rng(sum(counts))
-    images, here = [image(seed).astype(np.float32) for seed in range(3)], image(3)
+    images, here = [image(seed) for seed in range(3)], image(3)
     x = rng.uniform(20, 180, (sum(counts), 2))
     warp, y, ends = warps(rng, len(x)), x + rng.uniform(-2, 2, x.shape), np.cumsum(counts)
     together = place_all(list(zip(images, counts)), x, warp, here, y)

@@ -289,13 +289,12 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     """Take the residuals of all observations, in the unit of their roots."""
     landmark, frame = np.nonzero(landmarks.seen)
     if compiled.library is not None:
-        o = landmarks
         anchor, (residuals, off, straight, *at_places) = compiled.observe(
-            (landmark, frame), o.anchors, poses.between,
-            (o.points, o.rho, o.minima, o.roots, o.held, o.found), (K, inverse_of(K)),
-            _tuning(poses.k1))
-        return Observed(landmark, frame, anchor, residuals, off, o.held, K, poses.k1, straight,
-                        *at_places)
+            (landmark, frame), landmarks.anchors, poses.between,
+            (landmarks.points, landmarks.rho, landmarks.minima, landmarks.roots, landmarks.held,
+             landmarks.found), (K, inverse_of(K)), _tuning(poses.k1))
+        return Observed(landmark, frame, anchor, residuals, off, landmarks.held, K, poses.k1,
+                        straight, *at_places)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     R, t = (motions[frame, anchor] for motions in poses.between)
     rays_of_points = rays(K, landmarks.points)

@@ -144,12 +144,12 @@ def looks_through(warp: Array, tests: Tests
 
 def blocks(images: Sequence[Shown]) -> list[tuple[NDArray[Any], slice]]:
     """Give passes over the points of some images: each an image, and which points."""
-    passes, end = [], 0
+    parts, end = [], 0
     for image, count in images:
         begin, end = end, end + count
-        passes += [(image, slice(start, min(start + _WARPED_BLOCK, end)))
-                   for start in range(begin, end, _WARPED_BLOCK)]
-    return passes
+        parts += [(image, slice(start, min(start + _WARPED_BLOCK, end)))
+                  for start in range(begin, end, _WARPED_BLOCK)]
+    return parts
 
 
 def floating(images: Sequence[Shown]) -> list[Shown]:
