@@ -674,6 +674,22 @@ def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
     assert result.status in (Status.TOO_FEW_MATCHES, Status.DEGENERATE)
 
 
+@pytest.mark.parametrize('method', ['rpe', 'five_point'])
+def test_what_a_start_leaves_out_counts_among_the_matches_that_may_agree_by_chance(method):
+    """Those that RANSAC leaves agree with one another, however many it was offered."""
+    estimator = TwoViewEstimator(preset('best', method=method, starts='five_point'))
+    camera = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+
+    def view(seed):
+        soft = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(240, 320)), (0, 0), 1.5)
+        return estimator.view(cv2.normalize(soft, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8),
+                              camera)
+    for seed in range(4):
+        result = estimator.estimate(view(seed), view(1000 + seed))
+        assert result.inliers.sum() > 50
+        assert result.status is Status.TOO_FEW_INLIERS
+
+
 @pytest.mark.parametrize('goes', [pose(x=0.25), pose(x=0.2, z=0.1, yaw=-0.01),
                                   pose(x=0.1, z=0.3)])
 def test_the_twin_motion_of_a_plane_is_not_taken_for_the_cameras(goes):

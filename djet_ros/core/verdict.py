@@ -71,7 +71,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     if (inliers.sum() < config.min_matches or not np.isfinite(covariances[0]).all()
             or _by_chance(hamming[inliers])):
         status, t = Status.DEGENERATE, np.zeros(3)
-    elif _false_alarm(track, int(inliers.sum()), pair.current.gray.shape, config):
+    elif _false_alarm(pair, track, int(inliers.sum()), config):
         status = Status.TOO_FEW_INLIERS
     else:
         # Where a rotation alone explains the matches, any direction of t would do.
@@ -118,17 +118,17 @@ def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,
     return sign, before is None or not goes_on(before, ways[sign], ways[-sign])
 
 
-def _false_alarm(track: Track, agreeing: int, shape: tuple[int, ...],
-                 config: EstimatorConfig) -> bool:
+def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfig) -> bool:
     """
     Tell whether false matches would bring about a motion that as many agree with.
 
     One that may be anywhere in a disc of the search radius r lies within w of a line through
-    its middle with a probability of at most 4 w / (pi r).
+    its middle with a probability of at most 4 w / (pi r). Those that a starting pose had left out
+    were tried as well.
     """
-    radius = min(config.search_radius, 0.5) * max(shape)
+    radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
     chance = 4 * TRACK_TUNING.inlier * track.scale() / (np.pi * radius)
-    return false_alarms(agreeing, len(track.voting), chance) > 0
+    return false_alarms(agreeing, len(track.voting) + pair.left_out, chance) > 0
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: Array,
