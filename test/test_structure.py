@@ -438,6 +438,27 @@ def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
     assert after.scale_kind is Scale.RELATIVE
 
 
+@pytest.mark.parametrize('source', [Unmeasured(), ConstantScale(1.2)])
+def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(source):
+    """A window that sees none of them has its newest frame wherever rounding puts it."""
+    ahead = np.array([0, 0, -1.0])
+    added = [Addition(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
+             for length, sigma in ((1.0, 1e-3), (0.02, 800.0))]
+    source.exact, source.carried = False, True
+    scale = OneScale()
+    scale.configure(ESTIMATOR, source, 0.0)
+    scale._window = SimpleNamespace(
+        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
+        add=lambda view, relative, guess: added.pop(0))
+    known = {'covariance_5': np.eye(5) * 1e-8, 'covariance_6': np.eye(6) * 1e-8}
+    scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
+    step = scale.of_step((10**8, 2 * 10**8), None, RelativePose(Status.NO_PARALLAX, **known))
+    usual = 1.2 if isinstance(source, ConstantScale) else 1.0
+    assert step.length.value == pytest.approx(usual)
+    assert step.length.sigma >= 0.99 * usual
+    assert np.exp(scale._log) == pytest.approx(usual)
+
+
 class Ground(ScaleSource):
     """A source that tells given lengths in metres, one for each second, each to two per cent."""
 

@@ -163,7 +163,12 @@ class OneScale:
             return Step(relative, self._in_metres(measured) if measured.known
                         else unknown(guess * float(np.exp(self._log))))
         if not relative.t.any():
-            relative = _as_landmarks_tell(relative, addition, guess)
+            told = _as_landmarks_tell(relative, addition, guess)
+            if told is relative:
+                # A window that tells nothing has its newest frame anywhere; the way may be that
+                # of a usual step.
+                addition = replace(addition, length=guess, sigma=guess)
+            relative = told
         own = self._wandered(addition, relative, seconds)
         if measured.known:
             self._hear(measured, addition.length, own, seconds)
