@@ -498,3 +498,11 @@ def test_nobody_guesses_a_length_that_a_scale_needs(scale, length, too_short):
         with pytest.raises(DjetError, match=rf"scale is '{scale}', and odometry.{length} is "
                            rf'\S+; give the metres .*--{length.replace("_", "-")}'):
             scale_source(OdometryConfig(scale=scale, **given))
+
+
+def test_a_frame_that_is_refused_leaves_no_trace(cards):
+    vo, frame = odometry(), cards.frame(0.0, np.eye(4))
+    vo.process(frame)
+    with pytest.raises(ValueError, match='have the stamp'):
+        vo.process(replace(frame, gray=frame.gray[:-2]))
+    assert vo.process(cards.frame(0.1, STEP)).status is Status.OK

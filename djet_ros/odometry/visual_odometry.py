@@ -198,10 +198,11 @@ class VisualOdometry:
         view: of the frame as `estimator` prepares it, where that was done before.
         """
         # Can this frame be related to the past at all?
-        last, self._last = self._last, frame
-        status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
+        last = self._last
         if last and frame.stamp_ns == last.stamp_ns:
             raise ValueError(f'two frames in a row have the stamp {frame.stamp_ns} ns')
+        self._last = frame
+        status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
         backwards = bool(last and frame.stamp_ns < last.stamp_ns)
         if (backwards or status is Status.SIZE_CHANGED) and self._forget_lens():
             view = None
@@ -360,7 +361,6 @@ class VisualOdometry:
         """Begin a new reference: from nothing, or at the last pose with its motion unknown."""
         if backwards:
             self.reset()
-            self._scale.reset()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
             motion, covariance = self._carried(frame)
