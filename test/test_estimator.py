@@ -709,6 +709,33 @@ def test_views_of_two_cameras_are_no_pair():
                   replace(view, gray=view.gray[:-1])):
         with pytest.raises(ValueError, match='a pair is of one camera'):
             TwoViewEstimator().estimate(view, other)
+        with pytest.raises(ValueError, match='a pair is of one camera'):
+            TwoViewEstimator().estimate_matched(view, other, np.empty((0, 2)), np.empty((0, 2)))
+
+
+@pytest.mark.parametrize('image', [np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60)),
+                                   np.zeros((40, 60), np.uint16)])
+def test_what_is_no_gray_image_of_8_bits_is_refused(image):
+    with pytest.raises(ValueError, match='an image is'):
+        TwoViewEstimator().view(image, K)
+
+
+def test_what_is_no_camera_matrix_is_refused():
+    with pytest.raises(ValueError, match='its K'):
+        TwoViewEstimator().view(np.zeros((40, 60), np.uint8), np.eye(3, 4))
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_matches_may_be_whole_numbers_but_not_none(method):
+    views, estimator = small_views()[:2], TwoViewEstimator(preset('best', method=method))
+    x = np.rint(np.random.default_rng(60).uniform((20, 20), (140, 100), (60, 2)))
+    whole, exact = (estimator.estimate_matched(*views, places, places + np.array([3, 0], kind))
+                    for kind in (np.int64, np.float64) for places in [x.astype(kind)])
+    assert whole.status == exact.status
+    np.testing.assert_array_equal(whole.R, exact.R)
+    x[7, 1] = np.nan
+    with pytest.raises(ValueError, match='finite'):
+        estimator.estimate_matched(*views, x, x)
 
 
 def test_a_plane_starts_from_its_motion_among_others():

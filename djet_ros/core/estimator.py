@@ -66,8 +66,12 @@ class TwoViewEstimator:
         Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3).
 
         features: where they are known already, in what it makes of the image; left_out: (H, W)
-        bool, pixels that nothing is to be told from.
+        bool, pixels that nothing is to be told from. ValueError where the image or K is none.
         """
+        K = np.asarray(K, np.float64)
+        if gray.ndim != 2 or gray.dtype != np.uint8 or K.shape != (3, 3):
+            raise ValueError(f'an image is (H, W) uint8, and its K (3, 3); these are {gray.shape} '
+                             f'{gray.dtype} and {K.shape}')
         if self.k1:
             gray, left_out = straight_image(gray, K, self.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
@@ -102,9 +106,7 @@ class TwoViewEstimator:
         with a status that says why. ValueError where the views are not of one camera.
         """
         known, timings = known or Known(), dict[str, float]()
-        if not of_one_camera(previous, current):
-            raise ValueError(f'views of {previous.gray.shape} and {current.gray.shape} pixels, or '
-                             'their camera matrices, differ; a pair is of one camera')
+        _require_one_camera(previous, current)
 
         # Where the motion before foresees them, matches are near, and so is the pose.
         with _timed(timings, 'matching'):
@@ -136,8 +138,13 @@ class TwoViewEstimator:
         Estimate from given matches x, y (N, 2) in pixels of the two views.
 
         prior: as for ``estimate``; observe: is shown each round of Algorithm 1; covariances:
-        (N, 2, 2) of y up to a common factor, by which re-projection errors count.
+        (N, 2, 2) of y up to a common factor, by which re-projection errors count. ValueError where
+        the views are not of one camera, or a match is no pixel of finite numbers.
         """
+        _require_one_camera(previous, current)
+        x, y = (np.asarray(places, np.float64) for places in (x, y))
+        if not (np.isfinite(x).all() and np.isfinite(y).all()):
+            raise ValueError('matches are pixels of finite numbers; leave out what was not found')
         return self.estimate_pair(Pair(previous, current, x, y, _pose(prior), observe=observe,
                                        covariances=covariances))
 
@@ -234,6 +241,12 @@ class TwoViewEstimator:
         with _timed(pair.timings, 'result'):
             result = verdict(pair, track, self.config)
         return replace(result, timings=pair.timings, sought=pair.sought)
+
+
+def _require_one_camera(previous: View, current: View) -> None:
+    if not of_one_camera(previous, current):
+        raise ValueError(f'views of {previous.gray.shape} and {current.gray.shape} pixels, or '
+                         'their camera matrices, differ; a pair is of one camera')
 
 
 def _of(values: Array | None, chosen: NDArray[np.bool_]) -> Array | None:
