@@ -506,3 +506,14 @@ def test_a_frame_that_is_refused_leaves_no_trace(cards):
     with pytest.raises(ValueError, match='have the stamp'):
         vo.process(replace(frame, gray=frame.gray[:-2]))
     assert vo.process(cards.frame(0.1, STEP)).status is Status.OK
+
+
+@pytest.mark.parametrize('gap', [0.1, 60.0])
+def test_what_was_known_of_a_lens_is_not_of_another_camera(cards, gap):
+    vo = odometry()
+    drive(vo, cards, [np.eye(4), STEP, STEP])
+    vo._straighten(0.02)
+    frame = cards.frame(0.2 + gap, STEP)
+    result = vo.process(replace(frame, gray=frame.gray[:-20].copy()))
+    assert result.status is (Status.SIZE_CHANGED if gap < 1 else Status.TIME_JUMP)
+    assert vo.estimator.k1 == 0

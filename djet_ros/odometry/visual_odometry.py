@@ -12,6 +12,7 @@ from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.starts import Known
 from djet_ros.core.types import (
     Array,
+    of_one_camera,
     Pose,
     RelativePose,
     Status,
@@ -204,7 +205,9 @@ class VisualOdometry:
         self._last = frame
         status = (continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME)
         backwards = bool(last and frame.stamp_ns < last.stamp_ns)
-        if (backwards or status is Status.SIZE_CHANGED) and self._forget_lens():
+        # A gap may hide that it is of another camera.
+        another = last is not None and not of_one_camera(last, frame)
+        if (backwards or another) and self._forget_lens():
             view = None
         # Features are found once: now for the current frame, next time for the reference.
         if view is None:
