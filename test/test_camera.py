@@ -52,6 +52,13 @@ def test_where_p_is_missing_rectified_images_have_the_camera_k():
     assert np.array_equal(Camera.from_info(camera_info(K, SIZE, p=np.zeros(12)), True).K, K)
 
 
+def test_a_skew_is_taken_but_with_a_distortion_which_opencv_would_undo_without_it():
+    skewed = K + np.array([[0, 5.0, 0], [0, 0, 0], [0, 0, 0]])
+    assert Camera.from_info(camera_info(skewed, SIZE, p=np.zeros(12)), False).K[0, 1] == 5
+    with pytest.raises(BadMessage, match='the skew 5 of images with a distortion'):
+        Camera.from_info(camera_info(skewed, SIZE, d=DISTORTIONS['plumb_bob']), False)
+
+
 def test_raw_images_without_distortion_have_the_camera_k_and_stay_as_they_are():
     camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel()), False)
     gray = np.zeros(SIZE[::-1], np.uint8)

@@ -74,6 +74,10 @@ class Camera:
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
         self._distortion = _distortion(model, D) if distorts(model, D) else None
+        if self._distortion is not None and K[0, 1]:
+            raise BadMessage('bad_calibration', (
+                f'the skew {K[0, 1]:g} of images with a distortion is not known to OpenCV; '
+                'calibrate the camera without it, or rectify its images'))
         self._remedy = remedy
         self._undistorting: _Undistortion | None = None
 
