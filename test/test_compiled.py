@@ -7,8 +7,10 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 import os
+from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import TypeVar
 
 import cv2
@@ -367,3 +369,12 @@ def test_who_wants_to_can_do_without() -> None:
         env={**os.environ, 'DJET_COMPILED': told}, capture_output=True, text=True, check=True
     ).stdout.strip() for told in ('0', '1')]
     assert answers == ['True', 'False']
+
+
+def test_what_cannot_be_loaded_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+                                           ) -> None:
+    damaged = tmp_path / '_loops.so'
+    damaged.write_bytes(b'no library')
+    monkeypatch.setattr(compiled, 'find_spec', lambda name: SimpleNamespace(origin=str(damaged)))
+    with pytest.warns(UserWarning, match='left out; install djet_ros anew'):
+        assert compiled._loaded() is None

@@ -41,8 +41,12 @@ def _loaded() -> ctypes.CDLL | None:
     found = find_spec('djet_ros.compiled._loops')
     if found is None or found.origin is None or os.environ.get('DJET_COMPILED') == '0':
         return None
-    # It has no Python in it, and so lets others run meanwhile.
-    built = ctypes.CDLL(found.origin)
+    try:
+        # It has no Python in it, and so lets others run meanwhile.
+        built = ctypes.CDLL(found.origin)
+    except OSError as error:  # built for another machine, or damaged
+        warn(f'{error}, and left out; install djet_ros anew', stacklevel=2)
+        return None
     if not hasattr(built, 'djet_interface') or built.djet_interface() != _INTERFACE:
         warn(f'{found.origin} is of other sources, and left out; install djet_ros anew',
              stacklevel=2)
