@@ -157,6 +157,15 @@ def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
     assert after == pytest.approx(1, rel=0.05)
 
 
+def test_after_a_turn_on_the_spot_steps_are_expected_to_be_as_long_as_before_it(cards):
+    drive = Drive(cards)
+    drive.go(steps()[:5])
+    expected = drive.odometry._one_scale._speed
+    turns = drive.go([pose(yaw=0.02)] * 2 + [pose(yaw=-0.02)] * 2)
+    assert all(result.status is Status.NO_PARALLAX for result in turns)
+    assert drive.odometry._one_scale._speed == expected
+
+
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
 def test_a_way_too_slow_for_parallax_from_frame_to_frame_adds_up(cards, way):
     drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
@@ -454,6 +463,8 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
     step = scale.of_step((10**8, 2 * 10**8), None, RelativePose(Status.NO_PARALLAX, **known))
     usual = 1.2 if isinstance(source, ConstantScale) else 1.0
+    # It is no reason to expect the next step to be otherwise, either.
+    assert scale._speed == pytest.approx(10)
     assert step.length.value == pytest.approx(usual)
     assert step.length.sigma >= 0.99 * usual
     assert np.exp(scale._log) == pytest.approx(usual)

@@ -162,14 +162,15 @@ class OneScale:
         if addition is None:
             return Step(relative, self._in_metres(measured) if measured.known
                         else unknown(guess * float(np.exp(self._log))))
-        if not relative.t.any():
+        pair = relative
+        if not pair.t.any():
             told = _as_landmarks_tell(relative, addition, guess)
             if told is relative:
                 # A window that tells nothing has its newest frame anywhere; the way may be that
                 # of a usual step.
                 addition = replace(addition, length=guess, sigma=guess)
             relative = told
-        own = self._wandered(addition, relative, seconds)
+        own = self._wandered(addition, pair, seconds)
         if measured.known:
             self._hear(measured, addition.length, own, seconds)
             # Until the factor is known, lengths are as sure as they are measured.
