@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from djet_ros.core.covariance import as_far_as_claimed, pose_covariance
+from djet_ros.core.covariance import as_far_as_claimed, by_calibration, pose_covariance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
-from djet_ros.core.geometry import sphere_log, sphere_tangents, unit
-from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, Residuals
+from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents, unit
+from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise, Residuals
+from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.surfaces import DescriptorSurface, ReprojectionSurface, with_minimum
 from djet_ros.core.types import Pose, Status
 from djet_ros.lab.scenes.pair import render_pair
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from two_view import two_views
+from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SKEWED, two_views
 import yaml
 
 BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
@@ -42,6 +43,63 @@ def test_exact_matches_are_surer_than_any_camera_and_leave_a_covariance_neverthe
     covariance, _ = pose_covariance(exact, Loss(), rng.uniform(0, 400, (100, 2)), t, False)
     variances = np.linalg.eigvalsh(covariance)
     assert np.isfinite(variances).all() and (variances < 1e-8).all()
+
+
+def calibrated(K: np.ndarray, f: float = 0.0, cx: float = 0.0, cy: float = 0.0) -> np.ndarray:
+    """Camera matrix that is off by so many pixels."""
+    return K + np.array([[f, 0, cx], [0, f, cy], [0, 0, 0]])
+
+
+@pytest.mark.parametrize('camera', [K, SKEWED])
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+def test_a_wrong_calibration_moves_a_pose_as_its_covariance_says(camera, t):
+    views, off = two_views(np.random.default_rng(5), t=t, K=camera), 0.5
+    loss, count = Loss('geman_mcclure', 3.0), len(views.x)
+    sharp = np.random.default_rng(6).uniform(0.5, 2, (count, 1, 2)) * np.eye(2)
+    surfaces = Paraboloids(views.y, sharp + 0.2, np.zeros((count, 2)), np.zeros(count),
+                           np.ones(count, bool))
+
+    def problem(matrix):
+        return jet_problem(matrix, views.x, surfaces, epipole_blur=5.0)
+
+    right = problem(camera)
+    there = minimise(right, views.R, views.t, loss)
+    moves = []
+    for name in ('f', 'cx', 'cy'):
+        wrong = minimise(problem(calibrated(camera, **{name: off})), views.R, views.t, loss)
+        moves.append(np.append(rotation_log(wrong.R @ there.R.T), wrong.t - there.t))
+    moves = np.transpose(moves)
+    told = by_calibration(right, camera, there.pose, there.residuals, loss, off)
+    size = np.sqrt(np.diag(moves @ moves.T))
+    assert size[:3].max() > 1e-5 and size[3:].max() > 1e-4
+    np.testing.assert_array_less(np.abs(told - moves @ moves.T), 0.05 * np.outer(size, size))
+
+
+def test_poses_of_a_camera_whose_calibration_is_off_are_as_sure_as_they_say():
+    # Half a pixel, as conventions of where a pixel has its middle differ, is ten times the error
+    # of a pair whose calibration is right.
+    rng, found = np.random.default_rng(0), {0.0: [], 0.5: []}
+    estimators = {sigma: TwoViewEstimator(preset('best', calibration_sigma=sigma))
+                  for sigma in found}
+    for name, first in (('road', 5), ('road', 40), ('indoor', 3), ('forest', 5)):
+        pair = render_pair(name, first, seed=3)
+        for off in rng.normal(0, 0.5, (8, 3)):
+            exact, poses = estimators[0.0], {}
+            views = [exact.view(gray, calibrated(pair.K, *off))
+                     for gray in (pair.previous, pair.current)]
+            for sigma, estimator in estimators.items():
+                pose = poses[sigma] = estimator.estimate(*views)
+                error = np.append(rotation_log(pair.R @ pose.R.T),
+                                  sphere_log(pose.t, unit(pair.t)))
+                found[sigma].append(error @ np.linalg.solve(pose.covariance_5, error))
+            # Only what is claimed is another.
+            assert poses[0.0].status is poses[0.5].status is Status.OK
+            assert poses[0.0].R.tobytes() == poses[0.5].R.tobytes()
+            assert poses[0.0].t.tobytes() == poses[0.5].t.tobytes()
+    most = chi2.ppf(0.95, 5)
+    assert np.mean(np.array(found[0.0]) < most) < 0.5
+    assert np.mean(np.array(found[0.5]) < most) > 0.9
+    assert np.median(found[0.5]) / chi2.median(5) > 0.5
 
 
 @pytest.mark.slow

@@ -166,6 +166,27 @@ def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: 
     return _lifted((axes * variances / share**2) @ axes.T, pose.t)
 
 
+def by_calibration(problem: JetProblem, K: Array, pose: Pose, residuals: Residuals, loss: Loss,
+                   sigma: float) -> Array:
+    """
+    Covariance (6, 6) over (rotation vector, t) that errors of the camera matrix bring about.
+
+    residuals: those at the pose; sigma: standard deviation in pixels of the focal length, in which
+    fx and fy err together, and of either coordinate of the principal point. Where one of these is
+    off by dk, residuals change by dr, and weighted least squares moves the pose by
+    -(J W J^T)^-1 J W dr (the implicit function theorem on the minimum).
+    """
+    J = residuals.jacobian
+    weighed = J * loss(residuals.r**2)[1]
+    steps = np.zeros((3, 3, 3))
+    steps[0, :2, :2], steps[1, 0, 2], steps[2, 1, 2] = sigma * np.eye(2), sigma, sigma
+    changes = [epipolar_residuals(problem.seen_with(K, K + step), pose.R, pose.t).r - residuals.r
+               for step in steps]
+    moves = np.linalg.solve(weighed @ J.T, weighed @ np.transpose(changes))
+    lifted = lift(residuals.tangents) @ moves
+    return np.asarray(lifted @ lifted.T)
+
+
 def _curved(H: Array, curvature: Array) -> Array | None:
     """
     Give how a loss curves (5, 5), by its second derivatives (5, 5) and its weights H (5, 5).

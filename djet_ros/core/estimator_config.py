@@ -103,6 +103,10 @@ class EstimatorConfig:
         0.5, 'parallax that three quarters of the matches stay below when the direction of '
         'translation is not to be told (NO_PARALLAX), in pixels; noise raises it by itself',
         minimum=0.0, maximum=100.0)
+    calibration_sigma: float = parameter(
+        0.0, 'standard deviation of the focal length and of either coordinate of the principal '
+        'point, in pixels, which the covariance of a pose then holds as well; 0 takes the '
+        'calibration to be exact', minimum=0.0, maximum=10.0)
 
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""

@@ -76,6 +76,13 @@ class JetProblem:
         places = np.arange(len(self.blur))[chosen]
         return JetProblem(*(values.take(places, axis=-1) for values in self.matches))
 
+    def seen_with(self, K: Array, other: Array) -> JetProblem:
+        """Give the same pixels as a camera has them whose matrix is another one, not K."""
+        A = inverse_of(other) @ K
+        return JetProblem(A @ self.rays_x, A @ self.rays_y,
+                          spread_of_rays(inverse_of(K) @ other, self.spread),
+                          np.linalg.det(A) * self.blur)
+
     @property
     def matches(self) -> tuple[Array, Array, Array, Array]:
         """Give all of its arrays."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from djet_ros.core.covariance import (
     as_far_as_claimed,
+    by_calibration,
     difference,
     pose_covariance,
     spanning,
@@ -86,6 +87,9 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         else:
             status, covariances = _judged(Pose(R, t), covariances, track, voting, pair.before,
                                           other_way)
+    if config.calibration_sigma and np.isfinite(covariances[0]).all():
+        covariances = widened(covariances[0], sign * track.pose.t, by_calibration(
+            track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma))
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
         status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,

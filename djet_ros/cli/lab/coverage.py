@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, 'folder of the results')
     add_frames(parser)
     add_workers(parser)
-    add_flags(parser, ('estimator.method',))
+    add_flags(parser, ('estimator.method', 'estimator.calibration_sigma'))
 
 
 def run(args: argparse.Namespace) -> int:
