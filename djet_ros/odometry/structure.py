@@ -94,6 +94,8 @@ class OneScale:
     def reset(self) -> None:
         """Forget the factor; the next step makes a new unit."""
         self._speed: float | None = None
+        # Whether it is a guess already how long the next step is.
+        self._torn = False
         self._log, self._variance, self._metric = 0.0, 0.0, False
         # How many lengths in a row were not believed, and their metres.
         self._surprises = np.zeros(2)
@@ -143,8 +145,9 @@ class OneScale:
             return
         self._window.start(view, self._lens)
         self._short = np.zeros(5)
-        if self._speed is not None:
+        if self._speed is not None and not self._torn:
             self._doubt(_TORN**2)
+            self._torn = True
 
     def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Step:
         """
@@ -161,7 +164,7 @@ class OneScale:
         addition = self._added(current, relative, guess)
         if addition is None:
             return Step(relative, self._in_metres(measured) if measured.known
-                        else unknown(guess * float(np.exp(self._log))))
+                        else self.of_rest(span_ns))
         pair = relative
         if not pair.t.any():
             told = _as_landmarks_tell(relative, addition, guess)
@@ -254,7 +257,8 @@ class OneScale:
         if not self._window.is_new or relative.t.any():
             try:
                 addition = self._window.add(view, relative, guess)
-            except np.linalg.LinAlgError:  # of matches that do not hold together
+            except np.linalg.LinAlgError:
+                # Matches do not hold together, or none of a turn is of a landmark.
                 addition = None
             if self._lens is not None:
                 self._lens = self._window.lens
@@ -280,11 +284,19 @@ class OneScale:
         return common
 
     def _wandered(self, addition: Addition, relative: RelativePose, seconds: float) -> float:
-        """Take note of what a step was, and give how sure its length is, as a share of it."""
-        own = min(addition.sigma / addition.length, 1.0)
-        if relative.t.any():  # without parallax, only a turn is sure
+        """
+        Take note of what a step was, and give how sure its length is, as a share of it.
+
+        A turn leaves the scale to landmarks that were seen before: it wanders by how unsure the
+        camera's place is, over a usual step.
+        """
+        own, self._torn = min(addition.sigma / addition.length, 1.0), False
+        usual = addition.length
+        if relative.t.any() or self._speed is None:
             self._speed = addition.length / seconds
-        self._doubt((_WANDERING * own)**2)
+        else:
+            usual = max(usual, self._speed * seconds)
+        self._doubt((_WANDERING * own * addition.length / usual)**2)
         return own
 
     def _doubt(self, variance: float) -> None:
