@@ -23,10 +23,12 @@ from djet_ros.dds.names import Names
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.live.middleware import Profile
+from djet_ros.live.topics import image_topics
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
+from djet_ros.ros.command_line import topic_rules
 import numpy as np
 import pytest
 from ros_messages import camera_info, IMAGE, image, IMAGE_TYPE, INFO, INFO_TYPE, SEEN, serialised
@@ -440,6 +442,25 @@ def test_names_are_resolved_and_remapped_as_in_ros():
     assert names.resolve('/diagnostics') == '/diagnostics'
     assert Names('vo_node', ['__node:=front']).resolve('~/path') == '/front/path'
     assert Names('vo_node', ['__ns:=/']).full_node == '/vo_node'
+
+
+@pytest.mark.parametrize(('rules', 'info'), [
+    ([], '/front/camera_info'),
+    (['camera_info:=/elsewhere/info'], '/elsewhere/info'),
+    # The very name that it would have without images elsewhere.
+    (['camera_info:=/camera_info'], '/camera_info'),
+    # As launch files hand it on.
+    (['camera_info:=camera_info'], '/front/camera_info'),
+])
+def test_camera_info_is_beside_the_images_unless_a_rule_says_where(rules, info):
+    names = Names('vo_node', ['image:=/front/image_raw', *rules])
+    assert image_topics(names.resolve, names.is_remapped, 'raw') == ('/front/image_raw', info)
+
+
+def test_rules_for_topics_are_found_among_the_words_for_ros():
+    words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
+             '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']
+    assert list(topic_rules(words, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
 
 
 @pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',

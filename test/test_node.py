@@ -217,6 +217,11 @@ def test_only_the_images_need_a_name(node, publisher, subscriber, drive):
                       '/robot/left/camera_info')
 
 
+def test_a_camera_info_that_is_named_as_it_would_be_anyway_is_heard_there(node):
+    one = node('-r', 'image:=/front/image_raw', '-r', 'camera_info:=/camera_info', **FAST)
+    wait_for_log(one, 'images from /front/image_raw, camera_info from /camera_info')
+
+
 def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
     one = node('-r', 'camera_info:=/elsewhere/info', **FAST)
     # Its own debug_image is an image, too, and not meant.

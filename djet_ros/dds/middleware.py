@@ -58,9 +58,9 @@ class DdsMiddleware:
         """Give the full name of a topic or service, remapped."""
         return self._names.resolve(name)
 
-    def expand(self, name: str) -> str:
-        """Give the full name, not remapped."""
-        return self._names.expand(name)
+    def is_remapped(self, name: str) -> bool:
+        """Tell whether a rule says what a topic is called."""
+        return self._names.is_remapped(name)
 
     def now_ns(self) -> int:
         """Time of the system, or of /clock."""

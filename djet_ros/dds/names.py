@@ -28,8 +28,9 @@ class Names:
             raise DjetError(f"'{self.node}' is no name of a node; give letters, digits and _, as "
                             'in left_vo, and its namespace by -r __ns:=/NAMESPACE')
         self.namespace = '/' + special.get('__ns', '').strip('/')
+        # What a launch file hands on as it stands says nothing.
         self._rules = [(self.expand(old), self.expand(new)) for old, new in pairs
-                       if not old.startswith('__')]
+                       if not old.startswith('__') and old != new]
 
     @property
     def full_node(self) -> str:
@@ -48,6 +49,10 @@ class Names:
         """Give the full name, remapped."""
         full = self.expand(name)
         return next((new for old, new in self._rules if old == full), full)
+
+    def is_remapped(self, name: str) -> bool:
+        """Tell whether a rule says what a name stands for, be it what it would be anyway."""
+        return self.expand(name) in (old for old, _ in self._rules)
 
 
 def _parse(rule: str) -> tuple[str, str]:

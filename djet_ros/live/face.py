@@ -134,7 +134,7 @@ class Face:
 
     def image_topics(self, config: NodeConfig) -> tuple[str, str]:
         """Resolve the names of the images and of their CameraInfo."""
-        return image_topics(self._middleware.resolve, self._middleware.expand,
+        return image_topics(self._middleware.resolve, self._middleware.is_remapped,
                             config.image_transport)
 
     def advertise(self, outputs: Mapping[str, str]) -> None:

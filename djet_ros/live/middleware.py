@@ -91,8 +91,8 @@ class Middleware(Protocol):
     def resolve(self, name: str) -> str:
         """Give the full name of a topic or service, remapped."""
 
-    def expand(self, name: str) -> str:
-        """Give the full name, not remapped."""
+    def is_remapped(self, name: str) -> bool:
+        """Tell whether a rule says what a topic is called, be it as it would be anyway."""
 
     def now_ns(self) -> int:
         """Time for stamps, in nanoseconds; simulated where the user asked for it."""

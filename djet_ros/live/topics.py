@@ -57,18 +57,19 @@ def graph_input_type(topic: str) -> str:
     return _ODOMETRY_OUTPUTS[topic]
 
 
-def image_topics(resolve: Callable[[str], str], expand: Callable[[str], str],
+def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], bool],
                  transport: str) -> tuple[str, str]:
     """
     Resolve the names of the images and of their CameraInfo.
 
-    resolve gives the full name with remappings, expand the one without. As with image_transport,
-    only the image's name needs to be remapped: camera_info is taken beside it, and the
-    compressed images below it.
+    resolve gives the full name with remappings, is_remapped tells whether there is one. As with
+    image_transport, only the image's name needs to be remapped: camera_info is taken beside it,
+    and the compressed images below it.
     """
     image = resolve('image').removesuffix('/compressed')
-    info = resolve('camera_info')
-    if info == expand('camera_info'):
+    if is_remapped('camera_info'):
+        info = resolve('camera_info')
+    else:
         info = f'{image.rpartition("/")[0]}/camera_info'
     if transport == 'compressed':
         image += '/compressed'

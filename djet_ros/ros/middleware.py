@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
+import sys
 from time import monotonic
 from typing import Any
 
@@ -13,6 +14,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
 from djet_ros.odometry.messages import pose_of
+from djet_ros.ros.command_line import topic_rules
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -143,8 +145,13 @@ class RosMiddleware:
         """Give the full name of a topic or service, remapped."""
         return str(self._node.resolve_topic_name(name))
 
-    def expand(self, name: str) -> str:
-        """Give the full name, not remapped."""
+    def is_remapped(self, name: str) -> bool:
+        """Tell whether a rule of the command line says what a topic is called."""
+        full = self._expand(name)
+        return any(old != new and self._expand(old) == full
+                   for old, new in topic_rules(sys.argv, self._node.get_name()))
+
+    def _expand(self, name: str) -> str:
         return str(self._node.resolve_topic_name(name, only_expand=True))
 
     def now_ns(self) -> int:

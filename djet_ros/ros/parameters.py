@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 import sys
 from typing import Any
@@ -22,6 +21,7 @@ from djet_ros.live.parameters import (
     with_live_values,
 )
 from djet_ros.odometry.scale import check_scale
+from djet_ros.ros.command_line import values_after
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -102,7 +102,7 @@ def graph_parameters(node: Node) -> Config:
 def _given(node: Node) -> dict[str, Any]:
     """Values that came with the start, by names that some node of ours has."""
     known = flat(Config())
-    for path in _files(sys.argv):
+    for path in map(Path, values_after(sys.argv, '--params-file')):
         if why := why_unused(path, node.get_fully_qualified_name()):
             node.get_logger().warning(why)
     values = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
@@ -110,15 +110,6 @@ def _given(node: Node) -> dict[str, Any]:
         if name not in known and not is_ros_own(name):
             node.get_logger().warning(why_unknown(name))
     return {name: value for name, value in values.items() if name in known}
-
-
-def _files(words: Sequence[str]) -> Iterator[Path]:
-    """Give the parameter files that a command line has for ROS."""
-    for_ros = False
-    for word, following in pairwise(words):
-        for_ros = word == '--ros-args' or (for_ros and word != '--')
-        if for_ros and word == '--params-file':
-            yield Path(following)
 
 
 def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any], *,
