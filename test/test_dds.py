@@ -457,6 +457,15 @@ def test_camera_info_is_beside_the_images_unless_a_rule_says_where(rules, info):
     assert image_topics(names.resolve, names.is_remapped, 'raw') == ('/front/image_raw', info)
 
 
+@pytest.mark.parametrize('rule', [
+    'image:=/cam/image_raw', 'image:=/cam/image_raw/compressed',
+    'image/compressed:=/cam/image_raw/compressed'])
+def test_compressed_images_may_be_named_with_or_without_their_transport(rule):
+    names = Names('vo_node', [rule])
+    assert image_topics(names.resolve, names.is_remapped, 'compressed') == (
+        '/cam/image_raw/compressed', '/cam/camera_info')
+
+
 def test_rules_for_topics_are_found_among_the_words_for_ros():
     words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
              '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']

@@ -67,6 +67,9 @@ def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], boo
     and the compressed images below it.
     """
     image = resolve('image').removesuffix('/compressed')
+    if transport == 'compressed':
+        # Many remap this one, as ROS 2's republish asks for.
+        image = resolve(f'{image}/compressed').removesuffix('/compressed')
     if is_remapped('camera_info'):
         info = resolve('camera_info')
     else:
