@@ -547,6 +547,22 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
         'odometry.max_gap', 'estimator.window']) == [2.0, 5]
 
 
+@pytest.mark.parametrize(('values', 'topic'), [
+    ({'ros.publish_path': True}, f'{NODE}/path.publisher'),
+    ({'odometry.mask': True}, '/mask.subscription')])
+def test_a_topic_that_can_not_be_had_is_refused_each_time_and_the_node_works_on(
+        node, publisher, subscriber, drive, values, topic):
+    node('-p', f'qos_overrides.{topic}.reliability:=perhaps', **EVERY)
+    camera(publisher)
+    for _ in range(2):
+        (done, reason), = publisher.ask('configure', node=NODE, values=values)
+        assert not done
+        assert "'perhaps'" in reason
+    assert publisher.ask('configured', node=NODE, names=[*values]) == [False]
+    play(publisher, drive[:3])
+    subscriber.wait('a pair', paired(2))
+
+
 @pytest.mark.parametrize(('values', 'asks'), [
     ({'odometry.imu': True}, 'odometry.imu is true without an odometry.imu_rotation'),
     ({'odometry.guess': True}, 'odometry.guess is true'),

@@ -42,7 +42,7 @@ class OdometryFace(Face):
             {'image': image, 'camera_info': info})
         self._hears_speed = self._hears_tf = False
         self._hears_beside: set[str] = set()
-        self._connect(config)
+        self.connect(config)
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
         for name in ('reset', 'pause', 'resume'):
             middleware.serve(f'~/{name}', getattr(self.session, name))
@@ -50,33 +50,32 @@ class OdometryFace(Face):
                          f'{config.ros.queue_policy}')
 
     def configure(self, config: Config) -> None:
-        """Take other parameters from the next image on."""
-        self._connect(config)
+        """Take other parameters, which it is connected for, from the next image on."""
         self.session.configure(config)
 
-    def _connect(self, config: Config) -> None:
-        """Make the publishers and the subscriptions that a configuration asks for."""
+    def connect(self, config: Config) -> None:
+        """Make what a configuration asks for of publishers and subscriptions; may be refused."""
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,
                   'guess': odometry.guess_by_topic}
         if why_frames(odometry) and not self._follows_frames:
-            self._follows_frames = True
             self._middleware.follow_frames()
+            self._follows_frames = True
         for what in [what for what in wanted if wanted[what] and what not in self._hears_beside]:
-            self._hears_beside.add(what)
             self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
                         getattr(self.session, what),
                         replace(input_profile(config.ros),
                                 depth=_MASKS_DEPTH if what == 'mask' else _DEPTH))
+            self._hears_beside.add(what)
         if odometry.guess_by_tf and not self._hears_tf:
-            self._hears_tf = True
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))
             self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
                         Profile(depth=_FRAMES_DEPTH, latched=True))
+            self._hears_tf = True
         if config.odometry.scale == 'speed' and not self._hears_speed:
-            self._hears_speed = True
             for topic, kind in SPEED_TYPES.items():
                 self.listen(self._middleware.resolve(topic), kind, self.session.speed,
                             input_profile(config.ros))
+            self._hears_speed = True

@@ -47,9 +47,14 @@ class Parameters:
         _declare(node, (item for item in flat(self.config).values() if item.name in ODOMETRY),
                  given)
 
-    def call_on_change(self, apply: Callable[[Config], None]) -> None:
-        """Accept changes from now on; apply is called with each new configuration."""
-        self._apply = apply
+    def call_on_change(self, prepare: Callable[[Config], None],
+                       apply: Callable[[Config], None]) -> None:
+        """
+        Accept changes from now on; apply is called with each new configuration.
+
+        prepare is called with it before, and refuses what can't be had by a DjetError.
+        """
+        self._prepare, self._apply = prepare, apply
         self._node.add_pre_set_parameters_callback(self._complete)
         self._node.add_on_set_parameters_callback(self._check)
         self._node.add_post_set_parameters_callback(self._take)
@@ -68,8 +73,12 @@ class Parameters:
                 ] + [one for one in parameters if one.name not in ODOMETRY]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        values = _values(parameters)
         try:
-            _possible(with_live_values(self.config, _values(parameters)))
+            config = _possible(with_live_values(self.config, values))
+            # What topics declare of their own, as qos_overrides, asks for none.
+            if values:
+                self._prepare(config)
         except DjetError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -13,5 +13,5 @@ def make(node: Node) -> Face:
     """Make the odometry of a node's parameters; they can be changed while it runs."""
     parameters = Parameters(node)
     face = OdometryFace(RosMiddleware(node), parameters.config)
-    parameters.call_on_change(face.configure)
+    parameters.call_on_change(face.connect, face.configure)
     return face
