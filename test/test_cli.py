@@ -73,6 +73,14 @@ def test_every_command_has_help(command: str) -> None:
     assert answer.stderr == ''
 
 
+@pytest.mark.parametrize('command', [*COMMANDS, *(f'lab {verb}' for verb in LAB)])
+def test_help_comes_where_only_ascii_can_be_shown(command: str,
+                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('PYTHONIOENCODING', 'ascii')
+    answer = djet(*command.split(), '--help')
+    assert (answer.returncode, answer.stderr) == (0, '')
+
+
 def test_the_version_is_the_packages() -> None:
     assert djet('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from pathlib import Path
 import re
 import shutil
 import signal
@@ -367,6 +368,18 @@ def test_the_table_is_short_and_says_where_the_plot_is(replayed):
     assert done.stdout.rstrip().endswith(str(results / 'trajectory.png'))
     assert len(done.stdout.splitlines()) < 25
     assert cv2.imread(str(results / 'trajectory.png')).shape[0] > 300
+
+
+@pytest.mark.parametrize('name', [b'drive \xff', rb'a$\nope{$b', b'[red]x'],
+                         ids=['no text', 'formula', 'markup'])
+def test_whatever_a_recording_is_called_its_plot_is_drawn(folder, tmp_path, monkeypatch, name):
+    monkeypatch.setenv('PYTHONIOENCODING', 'utf-8:strict')
+    source, results = (Path(os.fsdecode(os.fsencode(tmp_path) + b'/' + word))
+                       for word in (name, b'of ' + name))
+    source.symlink_to(folder)
+    done = djet('replay', str(source), '--output', str(results), '--preset', 'fast')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (results / 'trajectory.png').exists()
 
 
 def test_a_folder_and_its_bag_give_the_same_bytes_each_time(folder, replayed, tmp_path):

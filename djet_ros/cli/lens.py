@@ -9,6 +9,7 @@ from djet_ros.cli.options import add_overwrite, add_topics
 from djet_ros.cli.replay import configured
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags
+from djet_ros.errors import one_line
 from djet_ros.lab.lens import calibration, examine, LensReport, plot_lens
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import check_room, make_room, write_whole
@@ -60,7 +61,7 @@ def _write(folder: Path, report: LensReport, args: argparse.Namespace) -> None:
     if report.worth_correcting and not report.rectified:
         write_whole(folder / YAML, calibration(report))
         print(f'calibration: {folder / YAML}')
-    plot_lens(folder / PLOT, args.source.resolve().name, report)
+    plot_lens(folder / PLOT, one_line(args.source.resolve().name), report)
     print(f'plot: {folder / PLOT}')
 
 

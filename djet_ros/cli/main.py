@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from io import TextIOWrapper
 import os
 import signal
 import sys
@@ -73,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     one_blas_thread()
     sleep_while_waiting()
+    _print_anything()
     with _heeding_sigterm():
         return _main(argv)
 
@@ -98,6 +100,12 @@ def _main(argv: Sequence[str] | None) -> int:
         return 141
     except OSError as error:
         return _fail(f'{error.filename}: {error.strerror}' if error.filename else str(error))
+
+
+def _print_anything() -> None:
+    """Let names of files that are no text, and signs that a terminal lacks, end no command."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors='backslashreplace')
 
 
 @contextmanager

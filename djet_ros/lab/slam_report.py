@@ -12,7 +12,7 @@ from djet_ros import __version__
 from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
@@ -68,7 +68,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         except DjetError as error:
             # It is not installed, or refuses a way that is straight.
             summary['evo'] = str(error)
-    _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, Path(name).name)
+    _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, one_line(Path(name).name))
     write_whole(folder / SUMMARY, json.dumps(summary, indent=2) + '\n')
     return summary
 

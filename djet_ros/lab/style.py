@@ -39,6 +39,8 @@ STYLE: dict[Any, Any] = {
     'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
     'grid.color': '#dddddd', 'grid.linewidth': 0.6, 'lines.linewidth': 1.3,
     'legend.frameon': False, 'axes.axisbelow': True,
+    # Titles have names of folders, and a $ in these begins no formula.
+    'text.parse_math': False,
 }
 
 

@@ -15,7 +15,7 @@ import cv2
 from djet_ros import __version__
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
-from djet_ros.errors import DjetError
+from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.diagnostics import Counts
 from djet_ros.odometry.messages import mounted_frame, pose_of, seconds_text, stamp_ns
 from djet_ros.odometry.scale import Scale, scale_source, ScaleSource
@@ -312,7 +312,8 @@ class Replay:
     def _plot(self, truth: Array) -> None:
         """Draw the trajectory; what is not known of its lengths is taken from the ground truth."""
         log, unit = self._log, 'm'
-        title = f'{Path(self._name).name}: {self._config.estimator.method}, {self._config.preset}'
+        name = one_line(Path(self._name).name)
+        title = f'{name}: {self._config.estimator.method}, {self._config.preset}'
         estimate = np.array([step.pose for step in log.steps])
         known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
         if log.scale is Scale.UNKNOWN and known.size:

@@ -227,7 +227,9 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str
         axes.plot(truth[:, 0], truth[:, 2], color='0.55', linewidth=2.5, label='ground truth')
     axes.plot(estimate[:, 0], estimate[:, 2], color='tab:blue', linewidth=1.2, label='estimate')
     axes.plot(*estimate[0, [0, 2]], 'o', color='black', markersize=5, label='start')
-    axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
+    axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})')
+    # A $ in the name of a folder begins no formula.
+    axes.set_title(title, parse_math=False)
     _widen(axes)
     axes.grid(color='0.9')
     axes.legend(loc='best')
