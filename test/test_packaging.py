@@ -165,6 +165,10 @@ def test_the_manifest_is_valid_and_agrees_with_setup_py(distribution: Distributi
     assert manifest.licenses == [metadata['License']]
     person, = manifest.maintainers
     assert (person.name, person.email) == (metadata['Maintainer'], metadata['Maintainer-email'])
+    # What reads the launch files, which are of Python or XML.
+    formats = {path.suffix for path in (ROOT / 'launch').glob('*.launch.*')}
+    assert formats == {'.py', '.xml'}
+    assert {'launch', 'launch_xml'} <= {one.name for one in manifest.exec_depends}
 
 
 def test_every_dependency_is_bounded_and_the_lower_bounds_are_tested(
