@@ -500,6 +500,17 @@ def test_many_images_dropped_under_load_are_a_warning_and_few_are_none(drive):
     assert '43% of the newest 21 images' in found['images dropped under load']
 
 
+def test_two_cameras_on_one_topic_are_a_warning_where_they_have_equal_stamps(drive):
+    one = tracker()
+    for i in range(12):
+        for gray, frame in zip(drive, ('left', 'right')):
+            one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=frame))
+    assert one.counts.dropped == {'equal_stamp': 12}
+    level, _, found = mended(one)
+    assert level != 'OK'
+    assert '50% of the newest 24 images' in found['images of two cameras']
+
+
 @pytest.mark.parametrize(('frame', 'parameters', 'name', 'remedy'), [
     ('', {}, 'no frame_id', 'set it in the camera driver, or odometry.camera_frame'),
     ('odom', {}, 'frame_id is odom_frame', 'set odometry.camera_frame or odometry.odom_frame'),

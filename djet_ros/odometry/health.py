@@ -22,6 +22,9 @@ _SHARE = 0.1
 # Images or pairs in a row from which on something is no accident.
 _IN_A_ROW = 5
 
+# The fate of images that have the stamp of the one before them, and come from another camera.
+_OTHER = 'of another camera'
+
 # What helps where a scale source does not know a length.
 _REMEDIES = {
     'speed': 'publish it on {topics}, stamped by the clock of the images (use_sim_time on both '
@@ -63,9 +66,12 @@ class Health:
         """Take another configuration; what was seen of lengths is about the last one."""
         self._config, self._unknown_lengths = config, 0
 
-    def dropped(self, reason: str, number: int = 1) -> None:
-        """Take images that were dropped for a reason."""
-        self._fates.extend([reason] * min(number, _WINDOW))
+    def dropped(self, reason: str, number: int = 1, image_frame: str | None = None) -> None:
+        """Take images that were dropped for a reason; image_frame: the frame_id of one of them."""
+        # The same image twice is nothing to mend.
+        other = (reason == 'equal_stamp' and self._last is not None
+                 and image_frame not in (None, self._last.frame_id))
+        self._fates.extend([_OTHER if other else reason] * min(number, _WINDOW))
         self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
         if self._equal > self._most_equal and self._last is not None:
             self._most_equal, self._stood_ns = self._equal, self._last.stamp_ns
@@ -92,7 +98,7 @@ class Health:
         return [one for one in (
             self._stamps(), self.few_levels(), self._frame(),
             None if mounted else self._mounting(), self._length(scale), self._load(),
-            self._way(), self._order()) if one is not None]
+            self._way(), self._order(), self._two_cameras()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
         return None if self._last is None else _still(self._equal, self._last.stamp_ns)
@@ -186,6 +192,14 @@ class Health:
         return Complaint('images out of order', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
             'and dropped; do two cameras publish on one topic?'))
+
+    def _two_cameras(self) -> Complaint | None:
+        if (share := self._share(_OTHER)) < _SHARE:
+            return None
+        return Complaint('images of two cameras', 'WARN', (
+            f'{share:.0%} of the newest {len(self._fates)} images had the stamp of the one before '
+            'them, another frame_id, and were dropped; two cameras publish on one topic, and '
+            'poses are of now one, now the other'))
 
 
 def bent(lens: SelfCalibration | None) -> Complaint | None:

@@ -227,7 +227,7 @@ class Tracker:
         if self._camera is None:
             return self._without_camera(stamp)
         if self._frame is not None and (reason := self._out_of_order(stamp, self._frame)):
-            self._drop(reason)
+            self._drop(reason, message.header.frame_id)
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
             seen = self._see(message, self._camera)
@@ -428,9 +428,9 @@ class Tracker:
         late = newest.stamp_ns - stamp <= self.config.odometry.max_backwards * 1e9
         return 'late' if late and self._late_in_a_row < _LATE_IN_A_ROW else ''
 
-    def _drop(self, reason: str) -> None:
+    def _drop(self, reason: str, image_frame: str | None = None) -> None:
         self.counts.dropped[reason] += 1
-        self._health.dropped(reason)
+        self._health.dropped(reason, image_frame=image_frame)
         self.verdict = reason
 
     def _reject(self, problem: BadMessage, stamp: int) -> list[Outgoing]:
