@@ -597,6 +597,17 @@ def test_diagnostics_come_on_a_change_of_state_and_once_per_second_of_stamps(dri
     assert said == [0, 1, 11, 21]
 
 
+def test_a_path_goes_on_with_other_parameters_unless_they_name_other_frames(drive):
+    one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.0})
+    lengths = []
+    for i, values in enumerate(({}, {'odometry.max_gap': 2.0, 'ros.path_length': 100},
+                                {'odometry.odom_frame': 'world'})):
+        one.configure(with_values(one.config, values))
+        out = play(one, drive[2 * i:2 * i + 2], start=0.2 * i)
+        lengths.append(len(out[-1]['path'].poses))
+    assert lengths == [2, 4, 2]
+
+
 def test_a_path_comes_on_demand_throttled_and_bounded(drive):
     assert all('path' not in out for out in play(tracker(), drive[:3]))
     one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.25, 'ros.path_length': 4})

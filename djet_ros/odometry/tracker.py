@@ -12,7 +12,7 @@ from collections.abc import Callable
 import math
 from typing import Any, NamedTuple
 
-from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.parallel import started_beside
 from djet_ros.core.types import Array, STARTED, TRACKED, View
@@ -155,7 +155,8 @@ class Tracker:
         self._odometry.listen_to(self._beside.gyro, self._beside.guess)
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
-        self._path = deque(self._path if before == after else (),
+        # Poses of another frame are no part of a path.
+        self._path = deque(self._path if _frames(before) == _frames(after) else (),
                            maxlen=config.ros.path_length)
         if self._info is not None and (before.rectified, before.residual_k1) != (
                 after.rectified, after.residual_k1):
@@ -511,6 +512,11 @@ class Tracker:
                 return []
         self._said = what, stamp
         return [self.diagnostics(stamp)]
+
+
+def _frames(config: OdometryConfig) -> tuple[str, ...]:
+    """Name what poses in the odom frame are of, and along which axes."""
+    return config.odom_frame, config.base_frame, config.camera_frame, config.frame_convention
 
 
 def _seen(message: Any, camera: Camera, limits: tuple[int, int],
