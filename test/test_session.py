@@ -394,6 +394,17 @@ def test_a_new_beginning_is_explained_in_the_log(live, drive):
     assert line.startswith('warning: restarted: TIME_JUMP: the stamps went back by 10.200 s')
 
 
+def test_a_step_back_is_logged_though_a_gap_was_just_before(live, drive):
+    one = live()
+    one.send(drive[:3])
+    one.send(drive[3:4], first=100)
+    one.send(drive[4:6], first=4)
+    one.wait_for_images(6)
+    gap, back = one.graph.lines
+    assert 'it goes on at the last pose' in gap
+    assert 'odom jumps to the origin' in back
+
+
 def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatch):
     one = live()
     one.session.camera_info(None)

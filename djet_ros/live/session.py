@@ -473,7 +473,8 @@ class Session:
             return
         said = ': '.join(filter(None, [tracker.state.value, tracker.detail,
                                        str(tracker.problem or tracker.remark)]))
-        self._log.warn(f'{tracker.state} {tracker.detail}', said)
+        # That odom is at the origin again is no more of what a gap said just before.
+        self._log.warn(f'{tracker.state} {tracker.detail} {tracker.went_back}', said)
 
     def _log_complaints(self) -> None:
         """Put what there is to mend into the log, once for as long as it is."""

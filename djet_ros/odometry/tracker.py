@@ -128,6 +128,8 @@ class Tracker:
         self.problem: BadMessage | None = None
         # What the newest frame without a pair means, for a log.
         self.remark = ''
+        # Whether the newest frame has thrown away all before it, as its stamp went back.
+        self.went_back = False
         self._frame: Frame | None = None
         # The next images, of which a face knows one or two.
         self._expected: deque[_Expected] = deque(maxlen=2)
@@ -440,7 +442,8 @@ class Tracker:
         return self._diagnostics_if_due(stamp)
 
     def _process(self, frame: Frame, view: View | None) -> list[Outgoing]:
-        if self._frame is not None and frame.stamp_ns < self._frame.stamp_ns:
+        self.went_back = self._frame is not None and frame.stamp_ns < self._frame.stamp_ns
+        if self.went_back:
             self._path.clear()
             self._path_stamp = None
         result = self._odometry.process(frame, view)
