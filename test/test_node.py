@@ -311,14 +311,18 @@ def test_a_camera_that_sends_with_best_effort_is_heard(node, publisher, subscrib
     subscriber.wait('a pair', paired(3))
 
 
+@pytest.mark.parametrize(('parameters', 'remedy'), [
+    ({**FAST, f'qos_overrides.{IMAGE}.subscription.reliability': 'reliable'},
+     'ros.qos_reliability to best_effort'),
+    (EVERY, 'ros.queue_policy to latest')], ids=['override', 'every'])
 def test_a_qos_that_does_not_fit_is_said_with_both_sides(
-        node, publisher, subscriber, drive):
-    one = node(**FAST, **{f'qos_overrides.{IMAGE}.subscription.reliability': 'reliable'})
+        node, publisher, subscriber, drive, parameters, remedy):
+    one = node(**parameters)
     publisher.advertise(IMAGE, IMAGE_TYPE, listeners=0, reliability='best_effort')
     line = wait_for_log(one, f'incompatible QoS on {IMAGE}')
     assert '/camera_driver offers best_effort, volatile' in line
     assert '/vo_node asks for reliable, volatile' in line
-    assert 'set ros.qos_reliability' in line
+    assert f'set {remedy} or qos_overrides.{IMAGE}.subscription.*' in line
     publisher.advertise(INFO, INFO_TYPE)
     assert one.log.count('incompatible QoS') == 1
 

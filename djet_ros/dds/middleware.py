@@ -34,7 +34,7 @@ class DdsMiddleware:
     use_sim_time: stamps of now are those of /clock.
     """
 
-    qos_remedy = 'ros.qos_reliability'
+    qos_remedy = ''
     senders_wait = True
     message_type = staticmethod(message_type)
 

@@ -68,6 +68,7 @@ class Face:
         self._refused: list[Subscription] = []
         self._images: Subscription | None = None
         self._latched = False
+        self._remedy = 'ros.qos_reliability to best_effort'
         self._last_tick = -float('inf')
 
     def run(self, stop: Event) -> int:
@@ -134,6 +135,9 @@ class Face:
 
     def image_topics(self, config: NodeConfig) -> tuple[str, str]:
         """Resolve the names of the images and of their CameraInfo."""
+        if config.queue_policy == 'every':
+            # It subscribes reliably, whatever the other one says.
+            self._remedy = 'ros.queue_policy to latest'
         return image_topics(self._middleware.resolve, self._middleware.is_remapped,
                             config.image_transport)
 
@@ -194,7 +198,8 @@ class Face:
             if ours.incompatible_with(offered):
                 self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
                          f'{self._middleware.node} asks for {ours}. Nothing is received from it; '
-                         'set ' + self._middleware.qos_remedy.format(topic=topic))
+                         f'set {self._remedy}'
+                         + self._middleware.qos_remedy.format(topic=topic))
 
 
 def _transport_remedy(kinds: Collection[str]) -> str:
