@@ -16,7 +16,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, View
 from djet_ros.core.window import Addition, Window
-from djet_ros.odometry.scale import Common, Length, ScaleSource, unknown
+from djet_ros.odometry.scale import Common, Length, ScaleSource
 import numpy as np
 from scipy.special import bdtr
 
