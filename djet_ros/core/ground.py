@@ -15,7 +15,7 @@ import math
 
 import cv2
 from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
-from djet_ros.core.geometry import rays, rotation_exp, sphere_tangents
+from djet_ros.core.geometry import rays, rotation_exp, skew, sphere_tangents
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
@@ -328,10 +328,33 @@ def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
 def _described(m: Array, covariance: Array) -> GroundMotion:
     """Length, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
     length = float(np.linalg.norm(m))
+    lean, by_plane = _lean(m)
+    J = np.vstack([m / length, by_plane])
+    return GroundMotion(np.array([length, *lean]), J @ covariance @ J.T)
+
+
+def _lean(m: Array) -> tuple[Array, Array]:
+    """Pitch and roll (2,) in rad of a plane m (3,), and their derivative (2, 3) by it."""
+    length = float(np.linalg.norm(m))
     x, y, z = (m / length).tolist()
     upright = np.hypot(y, z)
-    J = np.array([[x, y, z],
-                  [0.0, -z / upright**2 / length, y / upright**2 / length],
-                  [upright / length, -x * y / upright / length, -x * z / upright / length]])
-    return GroundMotion(np.array([length, np.arctan2(z, y), np.arctan2(x, upright)]),
-                        J @ covariance @ J.T)
+    J = np.array([[0.0, -z / upright**2, y / upright**2],
+                  [upright, -x * y / upright, -x * z / upright]]) / length
+    return np.array([np.arctan2(z, y), np.arctan2(x, upright)]), J
+
+
+def turned(lean: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """
+    Tell how a plane at rest leans against a camera that turns.
+
+    lean: (2,) pitch and roll in rad before; R: (3, 3) rotation, ``x_after = R x_before``, with
+    the covariance (3, 3) of its rotation vector. Gives the lean (2,) after, its derivative (2, 2)
+    by that before, and the covariance (2, 2) that comes of the rotation.
+    """
+    pitch, roll = lean
+    normal = np.array([np.sin(roll), np.cos(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch)])
+    _, before = _lean(normal)
+    after, J = _lean(R @ normal)
+    by_turn = -J @ skew(R @ normal)
+    # A lean moves the normal across itself, as the pseudoinverse does.
+    return after, J @ R @ np.linalg.pinv(before), by_turn @ covariance @ by_turn.T
