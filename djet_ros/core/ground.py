@@ -89,8 +89,8 @@ class GroundMotion:
     """
     What a pair of views says of the ground.
 
-    value: (3,) length of the translation in heights of the camera, pitch of the camera (down is
-    positive) and roll against the ground in rad; covariance: (3, 3).
+    value: (3,) length of the translation in heights of the camera, and pitch (down is positive)
+    and roll in rad of the previous view's camera against the ground; covariance: (3, 3).
     """
 
     value: Array

@@ -24,6 +24,7 @@ from djet_ros.odometry.interpolation import positions_at
 from djet_ros.odometry.stamped import Stamped
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 # Standard deviation, in units of the trajectory, of a length that is not known: huge for every
 # filter that weighs by it, and far from where squares lose their precision.
@@ -42,15 +43,15 @@ _KEPT_SPEEDS = 10_000
 # where no rotation tells what they do.
 _WANDERING = np.array([1.0, np.radians(0.5), np.radians(0.5)])
 
-# How the ground in sight bends along the way, in rad after a metre; chosen. Heights of a road alone
-# (ISO 8608, class C) tilt what is in sight of a car by 0.07 degrees.
+# How ground in sight of a car tilts as the way goes on, in rad after a metre; chosen. The heights
+# of a road of class C (ISO 8608) make 0.07 degrees, to which its bends are added.
 _BENDING = np.radians(0.1)
 
 # What nobody knows before the first pair: speed, and how well the camera is mounted.
 _AT_FIRST = np.array([1e3, np.radians(2.0), np.radians(2.0)])
 
-# By how much ground that is in sight leans otherwise than the road does; chosen: for the same
-# heights, and a straight line through eight metres of them, it is 0.08 (class B) to 0.16 (class C).
+# By how much a plane through that ground, eight metres of it, leans otherwise than the road; chosen:
+# 0.08 degrees are made by heights of class B, 0.16 by class C.
 _UNEVEN = np.radians(0.1)
 
 # Lengths that a scale can't do without: their parameter, the smallest in metres, their meaning.
@@ -243,11 +244,12 @@ class CameraHeightScale(ScaleSource):
 
     Each pair of views gives the translation between them and the camera's pitch and roll, with an
     uncertainty; one is often sure only against the other. A Kalman filter over (speed, pitch,
-    roll) brings together what pairs say. Speed changes as vehicles can. Pitch and roll change as
-    the camera turns, while the ground stays as it is: that tells bouncing from ground that bends,
-    and what bends more than roads do is none. For longer than there is ground in sight this would
-    be wrong, as on a hill the road turns with the vehicle. So where no ground was seen, pitch and
-    roll are what they were. The ground must be seen to fill the lower part of the image, and the camera must not roll.
+    roll) brings together what pairs say. Speed changes as vehicles can. Pitch and roll change with
+    the turn of each pair, as ground keeps still: so a vehicle that nods is told from ground that
+    bends. What bends more than roads do is none. While no ground is seen they stay as they were:
+    on a hill the road turns with the vehicle.
+
+    The ground must be seen to fill the lower part of the image, and the camera must not roll.
     Where no ground was seen for half a second, the length is unknown, and the last speed remains
     the guess.
 
@@ -266,19 +268,20 @@ class CameraHeightScale(ScaleSource):
                 relative: RelativePose) -> None:
         """Take from a pair of views how far the ground moved."""
         seconds = (end_ns - start_ns) * 1e-9
-        x, P = self._foreseen(start_ns, end_ns, relative)
+        x, P = self._predicted(start_ns, end_ns)
         # Lengths that the filter expects, in heights; four deviations to both sides.
         expected = (x[0] + np.array([-4, 4]) * np.sqrt(P[0, 0])) * seconds / self._height
         seen = self._ground_of(current).motion(
             previous, current, relative, (float(expected[0]), float(expected[1])))
-        if seen is not None:
-            self._update(end_ns, *self._measured(seen, seconds), x, P)
+        if seen is not None and self._update(*self._measured(seen, seconds), x, P):
+            self._seen_ns = end_ns
+            self._turn(relative, seconds)
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Speed over the ground times time."""
         if self._seen_ns is None:
             return unknown(1.0)
-        x, P = self._predicted(end_ns)
+        x, P = self._predicted(start_ns, end_ns)
         seconds = (end_ns - start_ns) * 1e-9
         metres = max(float(x[0]), 0.0) * seconds
         if end_ns - self._seen_ns > _LONGEST_HOLD_NS:
@@ -302,23 +305,13 @@ class CameraHeightScale(ScaleSource):
             self._ground = view.K, view.gray.shape, Ground(view.K, view.gray.shape, self._pitch)
         return self._ground[2]
 
-    def _predicted(self, stamp_ns: int) -> tuple[Array, Array]:
-        """State (3,) and covariance (3, 3) at a stamp."""
-        seconds = 0.0 if self._seen_ns is None else max(stamp_ns - self._seen_ns, 0) * 1e-9
-        return self._x.copy(), self._P + np.diag(_WANDERING**2) * seconds
-
-    def _foreseen(self, start_ns: int, end_ns: int,
-                  relative: RelativePose) -> tuple[Array, Array]:
-        """State (3,) and covariance (3, 3) after a pair: turned by it, if it goes on from there."""
-        x, P = self._predicted(end_ns)
-        covariance = relative.covariance_5[:3, :3]
-        if start_ns != self._seen_ns or not np.isfinite(covariance).all():
-            return x, P
-        way = max(float(x[0]), 0.0) * (end_ns - start_ns) * 1e-9
-        x[1:], J, by_turn = turned(self._x[1:], relative.R, covariance)
-        P[0, 1:] = P[1:, 0] = J @ self._P[1:, 0]
-        P[1:, 1:] = J @ self._P[1:, 1:] @ J.T + by_turn + _BENDING**2 * way * np.eye(2)
-        return x, P
+    def _predicted(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
+        """State (3,) in a pair, speed to its end and lean at its start, and covariance (3, 3)."""
+        gaps = np.zeros(3)
+        if self._seen_ns is not None:
+            gaps[0] = max(end_ns - self._seen_ns, 0)
+            gaps[1:] = abs(start_ns - self._seen_ns)
+        return self._x, self._P + np.diag(_WANDERING**2 * gaps * 1e-9)
 
     def _measured(self, seen: GroundMotion, seconds: float) -> tuple[Array, Array]:
         """Speed, pitch and roll (3,) and their covariance, with how uneven ground is."""
@@ -326,12 +319,12 @@ class CameraHeightScale(ScaleSource):
         return seen.value * scale, seen.covariance * np.outer(scale, scale) + np.diag(
             [0.0, _UNEVEN**2, _UNEVEN**2])
 
-    def _update(self, stamp_ns: int, z: Array, R: Array, x: Array, P: Array) -> None:
-        """Take a measurement z (3,) with its covariance into the state that was predicted."""
+    def _update(self, z: Array, R: Array, x: Array, P: Array) -> bool:
+        """Take a measurement z (3,) with its covariance into what was predicted, if it is one."""
         off, S = z - x, P + R
         if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _SURPRISE:
             # No ground leans like this.
-            return
+            return False
         if off[0]**2 > _SURPRISE * S[0, 0]:
             # What is seen counts more than how vehicles speed up.
             P = P.copy()
@@ -341,7 +334,19 @@ class CameraHeightScale(ScaleSource):
         keep = np.eye(3) - gain
         self._x = x + gain @ (z - x)
         self._P = keep @ P @ keep.T + gain @ R @ gain.T
-        self._seen_ns = stamp_ns
+        return True
+
+    def _turn(self, relative: RelativePose, seconds: float) -> None:
+        """Take the lean from the start of a pair to its end."""
+        covariance = relative.covariance_5[:3, :3]
+        if not np.isfinite(covariance).all():
+            self._P = self._P + np.diag([0.0, *_WANDERING[1:]**2 * seconds])
+            return
+        lean, by_lean, by_turn = turned(self._x[1:], relative.R, covariance)
+        way = max(float(self._x[0]), 0.0) * seconds
+        J = block_diag(1.0, by_lean)
+        self._x = np.array([self._x[0], *lean])
+        self._P = J @ self._P @ J.T + block_diag(0.0, by_turn + _BENDING**2 * way * np.eye(2))
 
 
 class GuessScale(ScaleSource):
