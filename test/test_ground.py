@@ -1,6 +1,7 @@
 """The ground under the camera: how far it moved, how sure that is, and when nothing is said."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 from cards import Cards, K as CARDS_K, pose, REST
 import cv2
@@ -9,7 +10,7 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
-from djet_ros.core.ground import Ground
+from djet_ros.core.ground import Ground, turned
 from djet_ros.core.masks import blocked
 from djet_ros.core.types import RelativePose, Status, View
 from djet_ros.lab.scenes import make_scene
@@ -41,16 +42,46 @@ class Floor:
         v, u = np.mgrid[:SIZE[1], :SIZE[0]].astype(float)
         rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
         rays = rays @ floor_pose(pitch, yaw=yaw)[:3, :3].T
-        below = rays[..., 1] > 0.02
-        reach = height / np.where(below, rays[..., 1], 1.0)
+        below, aside, along = self._met(rays, height)
         # 2 cm a pixel
-        places = [((at + reach * ray) / 0.02 % 1024).astype(np.float32)
-                  for at, ray in ((x, rays[..., 0]), (z, rays[..., 2]))]
+        places = [((at + way) / 0.02 % 1024).astype(np.float32)
+                  for at, way in ((x, aside), (z, along))]
         image = np.where(below, cv2.remap(self._texture, *places, cv2.INTER_LINEAR,
                                           borderMode=cv2.BORDER_WRAP), 200.0)
         if seed is not None:
             image = image + np.random.default_rng(seed).normal(0, 2, image.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+    def _met(self, rays, height):
+        """Which rays meet the floor, and how far aside and along it."""
+        below = rays[..., 1] > 0.02
+        reach = height / np.where(below, rays[..., 1], 1.0)
+        return below, reach * rays[..., 0], reach * rays[..., 2]
+
+
+class Hill(Floor):
+    """A floor that is round from front to back: a crest, or a hollow where radius is negative."""
+
+    def __init__(self, radius):
+        super().__init__()
+        self._radius = radius
+
+    def _met(self, rays, height):
+        """Where rays meet a cylinder below; arcs are lengths along it."""
+        centre = height + self._radius
+        squares, down = (rays[..., 1:]**2).sum(-1), rays[..., 1] * centre
+        root = down**2 - squares * (centre**2 - self._radius**2)
+        below = (rays[..., 1] > 0.02) & (root > 0)
+        reach = (down - np.sign(self._radius) * np.sqrt(np.maximum(root, 0.0))) / squares
+        arc = np.arctan(reach * rays[..., 2] / (centre - reach * rays[..., 1]))
+        return below, reach * rays[..., 0], self._radius * arc
+
+    def motion(self, way):
+        """Motion of a camera that goes so far along the ground, as that turns it."""
+        angle, centre = way / self._radius, HEIGHT + self._radius
+        after = floor_pose(angle, z=centre * np.sin(angle))
+        after[1, 3] = centre * (1 - np.cos(angle))
+        return moved(floor_pose(0.0), after)
 
 
 def floor_pose(pitch, x=0.0, z=0.0, yaw=0.0):
@@ -276,6 +307,65 @@ def test_ground_that_leans_all_of_a_sudden_is_none(floor):
     after = scale.between(5 * 10**8, 6 * 10**8)
     assert after.value == pytest.approx(before.value)
     assert after.sigma > before.sigma
+
+
+def test_a_plane_at_rest_leans_otherwise_against_a_camera_that_turns():
+    """By pitch alone as far as it nods, by roll as far as it tips; turning makes one the other."""
+    nods, tips, turns = (rotation_exp(angle) for angle in 0.1 * np.eye(3)[[0, 2, 1]])
+    sure = np.zeros((3, 3))
+    np.testing.assert_allclose(turned(np.array([0.05, 0.0]), nods, sure)[0], [0.15, 0.0])
+    np.testing.assert_allclose(turned(np.array([0.0, 0.02]), tips, sure)[0], [0.0, -0.08])
+    np.testing.assert_allclose(turned(np.array([0.05, 0.0]), turns, sure)[0],
+                               [0.05 * np.cos(0.1), 0.05 * np.sin(0.1)], atol=1e-4)
+
+
+def test_a_lean_is_as_sure_as_it_was_and_as_the_turn_is():
+    lean, R = np.array([0.2, -0.1]), rotation_exp(np.array([0.05, -0.2, 0.1]))
+    covariance = np.diag([1.0, 2.0, 3.0]) * 1e-4
+    after, by_lean, by_turn = turned(lean, R, covariance)
+    step = 1e-6
+    by_lean_found = np.transpose([turned(lean + off, R, covariance)[0] - after
+                                  for off in step * np.eye(2)]) / step
+    J = np.transpose([turned(lean, rotation_exp(off) @ R, covariance)[0] - after
+                      for off in step * np.eye(3)]) / step
+    np.testing.assert_allclose(by_lean, by_lean_found, atol=1e-5)
+    np.testing.assert_allclose(by_turn, J @ covariance @ J.T, atol=1e-8)
+
+
+@pytest.mark.parametrize('pitches', [2 * np.sin(2 * np.pi * 1.5 * 0.1 * np.arange(21)),
+                                     np.repeat([0.0, 2.0, 0.0], 7)])
+def test_a_vehicle_that_nods_goes_no_further(floor, pitches):
+    """Thrice in two seconds, as when it bounces, or all of a sudden; pitches in degrees."""
+    scale, lengths, way = CameraHeightScale(HEIGHT, 0.0), [], 0.8
+    for i, pair in enumerate(pairwise(np.radians(pitches))):
+        views = [view(floor.gray(pitch, z=way * at, seed=at)) for at, pitch in enumerate(pair, i)]
+        motion = moved(floor_pose(pair[0]), floor_pose(pair[1], z=way))
+        scale.observe(i * 10**8, (i + 1) * 10**8, *views, motion)
+        lengths.append(scale.between(i * 10**8, (i + 1) * 10**8))
+    assert all(length.known for length in lengths)
+    off = np.array([length.value for length in lengths[3:]]) / way - 1
+    assert np.sqrt(np.mean(off**2)) < 0.015
+
+
+@pytest.mark.parametrize('radius', [400.0, -400.0])
+def test_a_vehicle_that_turns_with_the_road_tells_a_hill(radius):
+    """
+    A pair alone takes ground ahead for a plane that goes on below the camera.
+
+    On a crest that is nearer than the ground, on which the vehicle turns without leaning.
+    """
+    hill, scale, way = Hill(radius), CameraHeightScale(HEIGHT, 0.0), 0.8
+    motion, ground = hill.motion(way), Ground(K, SIZE[::-1], 0.0)
+    true = 2 * (HEIGHT + radius) * np.sin(way / radius / 2)
+    alone, lengths = [], []
+    for i in range(25):
+        views = [view(hill.gray(z=way * at, seed=at)) for at in (i, i + 1)]
+        scale.observe(i * 10**8, (i + 1) * 10**8, *views, motion)
+        lengths.append(scale.between(i * 10**8, (i + 1) * 10**8).value)
+        alone.append(HEIGHT * ground.motion(*views, motion).value[0])
+    off, off_alone = (np.mean(values) / true - 1 for values in (lengths, alone))
+    assert 0.02 < np.sign(radius) * off_alone < 0.05
+    assert abs(off) < 0.75 * abs(off_alone)
 
 
 # In the odometry

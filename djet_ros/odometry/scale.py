@@ -50,8 +50,8 @@ _BENDING = np.radians(0.1)
 # What nobody knows before the first pair: speed, and how well the camera is mounted.
 _AT_FIRST = np.array([1e3, np.radians(2.0), np.radians(2.0)])
 
-# By how much a plane through that ground, eight metres of it, leans otherwise than the road; chosen:
-# 0.08 degrees are made by heights of class B, 0.16 by class C.
+# By how much a plane through that ground, eight metres of it, leans otherwise than the road;
+# chosen: heights of class B make 0.08 degrees, those of class C 0.16.
 _UNEVEN = np.radians(0.1)
 
 # Lengths that a scale can't do without: their parameter, the smallest in metres, their meaning.
@@ -262,6 +262,7 @@ class CameraHeightScale(ScaleSource):
         # A kerb, a lawn or a bump is seen from where it comes into sight until it leaves it.
         self.alike = height * SIGHT
         self._ground: tuple[Array, tuple[int, ...], Ground] | None = None
+        self._seen_ns: int | None = None
         self.reset()
 
     def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
@@ -296,7 +297,7 @@ class CameraHeightScale(ScaleSource):
     def reset(self) -> None:
         """Forget speed, pitch and roll."""
         self._x, self._P = np.array([0.0, self._pitch, 0.0]), np.diag(_AT_FIRST**2)
-        self._seen_ns: int | None = None
+        self._seen_ns = None
 
     def _ground_of(self, view: View) -> Ground:
         """Ground of the camera, which seldom changes."""
