@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from djet_ros.core.covariance import difference, SURPRISING
+from djet_ros.core.covariance import differences, SURPRISING
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
@@ -262,11 +262,11 @@ def _unlike(poses: Sequence[Pose], solution: Solution, information: Array, bound
 
     information: (5, 5) in the parameters of the solution, by which squared distances are taken.
     """
-    off = np.array([difference(solution.R, solution.t, pose) for pose in poses])
+    off = differences(solution.R, solution.t, np.stack([pose.R for pose in poses]),
+                      np.stack([pose.t for pose in poses]))
     kept: list[int] = []
     for number in range(len(poses)):
-        apart_from = off[kept] - off[number]
-        if ((apart_from @ information * apart_from).sum(1) > bound).all():
+        if (_squared(off[kept] - off[number], information) > bound).all():
             kept.append(number)
     return kept
 
@@ -313,22 +313,21 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
                possible: NDArray[np.bool_] | None = None) -> list[Pose]:
     """Choose the cheapest poses that lie in different basins, up to a number of them."""
     chosen: list[int] = []
-    told: list[Array] = []
     R = sketch.R.reshape(-1, 9)
     # Squares of what `apart` gives, of all at once.
-    off = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T)
+    near = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T) <= BASIN_TUNING.same_basin**2
+    passed = np.zeros(len(sketch), bool) if possible is None else ~possible
     for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
-        pose = sketch.pose(number)
-        if ((possible is not None and not possible[number])
-                or (off[number, chosen] <= BASIN_TUNING.same_basin**2).any()
-                # A valley has room for several that matches do not tell from one another.
-                or any(_squared(sketch.pose(other), pose, information)
-                       <= BASIN_TUNING.same_minimum for other, information in zip(chosen, told))):
+        if passed[number]:
             continue
         chosen.append(number)
         if len(chosen) == most:
             break
-        told.append(_information(epipolar_residuals(problem, pose.R, pose.t), loss))
+        # A valley has room for several that matches do not tell from one another.
+        information = _information(
+            epipolar_residuals(problem, sketch.R[number], sketch.t[number]), loss)
+        off = differences(sketch.R[number], sketch.t[number], sketch.R, sketch.t)
+        passed |= near[number] | (_squared(off, information) <= BASIN_TUNING.same_minimum)
     return [sketch.pose(number) for number in chosen]
 
 
@@ -340,7 +339,6 @@ def _information(residuals: Residuals, loss: Loss) -> Array:
     return np.asarray((J * weights) @ J.T / noise)
 
 
-def _squared(pose: Pose, other: Pose, information: Array) -> float:
-    """Squared distance of another pose, by the information (5, 5) about one."""
-    off = difference(pose.R, pose.t, other)
-    return float(off @ information @ off)
+def _squared(off: Array, information: Array) -> Array:
+    """Squared lengths (S,) of differences (S, 5), by the information (5, 5) about a pose."""
+    return np.asarray((off @ information * off).sum(1))

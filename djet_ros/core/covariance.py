@@ -273,9 +273,13 @@ def difference(R: Array, t: Array, other: Pose) -> Array:
 
     Matches tell t up to its sign, so it is the nearer of both signs that differs, by its chord.
     """
-    sign = 1.0 if other.t @ t >= 0 else -1.0
-    return np.concatenate([rotation_log(other.R @ R.T),
-                           sphere_tangents(t).T @ (sign * other.t - t)])
+    return np.asarray(differences(R, t, other.R[None], other.t[None])[0])
+
+
+def differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
+    """Give how S motions, R (S, 3, 3) and t (S, 3), differ from one in that way, (S, 5)."""
+    towards = np.where(other_t @ t >= 0, 1.0, -1.0)[:, None] * other_t - t
+    return np.concatenate([rotation_log(other_R @ R.T), towards @ sphere_tangents(t)], axis=1)
 
 
 def squared_distance(covariance: Array, apart: Array) -> float:
