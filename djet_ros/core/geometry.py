@@ -178,11 +178,6 @@ def sides(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
     return ahead.astype(float) - behind
 
 
-def facing(R: Array, t: Array, rays_x: Array, rays_y: Array) -> float:
-    """Sign, 1 or -1, with which t brings more of the points to the front of both cameras."""
-    return 1.0 if sides(R, t, rays_x, rays_y).sum() >= 0 else -1.0
-
-
 def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
     """
     (N,) how many times larger the surroundings of points are seen in B than in A.

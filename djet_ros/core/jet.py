@@ -24,7 +24,7 @@ from djet_ros.core.geometry import (
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import median, medians, middles, Paraboloids
+from djet_ros.core.paraboloid import median, medians, middle_of, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -296,7 +296,7 @@ def core_scale(residuals: Array) -> float:
     ordered = np.sort(np.abs(residuals))
     count = len(ordered)
     for _ in range(1 + _CORE_ROUNDS):
-        scale = _NORMAL * float(middles(ordered[:count])) if count else 1.0
+        scale = _NORMAL * middle_of(ordered, count) if count else 1.0
         before, count = count, int(ordered.searchsorted(_CORE * scale))
         if count == before:
             break

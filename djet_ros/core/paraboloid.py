@@ -125,6 +125,11 @@ def middles(ordered: Array) -> Array:
         ordered[..., half] if odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
 
 
+def middle_of(ordered: Array, count: int) -> float:
+    """Median of the first of (N,) values that are ordered."""
+    return (ordered.item((count - 1) // 2) + ordered.item(count // 2)) / 2
+
+
 def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
     """(N,) bool mask of the paraboloids that have no minimum."""
     A = paraboloids.A
@@ -141,6 +146,8 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
     positive = eigenvalues[eigenvalues > 0]
     floor = _CURVATURE_FLOOR * (median(positive) if len(positive) else 1.0)
     low = np.flatnonzero(mean - spread < floor)
+    if not len(low):
+        return paraboloids
     least, most = (mean - spread)[low], (mean + spread)[low]
     # The projection onto the weak direction is (most I - A) / (most - least).
     both, width = most < floor, np.maximum(most - least, 1e-300)

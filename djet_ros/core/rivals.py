@@ -8,13 +8,13 @@ well; and where a lorry fills half of the image, each half has a motion of its o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 from djet_ros.core.covariance import summed_by_cell
-from djet_ros.core.geometry import facing, inverse_depths
+from djet_ros.core.geometry import inverse_depths, sides
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
-from djet_ros.core.sketch import losses_at, losses_in_front, refine_all
+from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import around, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -163,8 +163,8 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     """
     on = refine_all(problem, [first], Loss(), 0)
     first = _in_front(problem, first, np.abs(on.r[0]) < _MEMBER * scale)
-    scale = float(np.clip(robust_scale(on.r[0]), scale, 3 * scale))
-    off = _distances(problem, first)
+    scale = min(max(robust_scale(on.r[0]), scale), 3 * scale)
+    off = _distances(problem, replace(on, t=first.t[None]))
     strays = np.flatnonzero(off > _STRAY * scale)
     least = max(least, round(_SMALL_SHARE * (off < _MEMBER * scale).sum()))
     if len(strays) < least:
@@ -178,7 +178,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
     refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
     pose = _in_front(alone, refined.pose(0), np.abs(refined.r[0]) < _MEMBER * scale)
-    members = _distances(problem, pose) < _MEMBER * scale
+    members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < _MEMBER * scale
     followers = members[strays].sum()
     if followers < least or followers <= len(strays) / 2:
         return None
@@ -210,16 +210,20 @@ def _log_choose(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
 
-def _distances(problem: JetProblem, pose: Pose) -> Array:
-    """Distances (N,) of matches from their epipolar half-lines, in those of the residuals."""
+def _distances(problem: JetProblem, on: Sketch) -> Array:
+    """
+    Distances (N,) of matches from their epipolar half-lines, in those of the residuals.
+
+    on: a pose, and how far they are from its lines, whichever the sign of t.
+    """
     # Indefinite surfaces that are kept as printed have losses below 0.
-    return np.asarray(np.sqrt(np.abs(losses_at(problem, [pose], Loss(), signs=(1.0,))[0])))
+    return np.asarray(np.sqrt(np.abs(losses_in_front(problem, on, Loss(), signs=(1.0,))[0])))
 
 
 def _in_front(problem: JetProblem, pose: Pose, agreeing: NDArray[np.bool_]) -> Pose:
     """Give t the sign that brings more of the points to the front of both cameras."""
-    rays_x, rays_y = problem.rays_x[:, agreeing].T, problem.rays_y[:, agreeing].T
-    return Pose(pose.R, facing(pose.R, pose.t, rays_x, rays_y) * pose.t)
+    votes = sides(pose.R, pose.t, problem.rays_x.T, problem.rays_y.T)
+    return Pose(pose.R, pose.t if votes @ agreeing >= 0 else -pose.t)
 
 
 def _flatness(problem: JetProblem, pose: Pose) -> float:

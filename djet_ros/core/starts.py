@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 from djet_ros.core.fusion import Turn
@@ -127,10 +128,17 @@ def thinned(count: int, most: int) -> slice:
 
 def all_round(R: Array, count: int) -> list[Pose]:
     """Give poses of one rotation with directions evenly over half a sphere, on a spiral."""
+    return [Pose(R, t) for t in _half_sphere(count)]
+
+
+@lru_cache(maxsize=8)
+def _half_sphere(count: int) -> Array:
     z = (np.arange(count) + 0.5) / count
     turn = np.pi * (1 + np.sqrt(5)) * (np.arange(count) + 0.5)
     ring = np.sqrt(1 - z**2)
-    return [Pose(R, t) for t in np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)]
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    directions.setflags(write=False)
+    return directions
 
 
 def around(pose: Pose, count: int) -> list[Pose]:

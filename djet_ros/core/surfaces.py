@@ -407,8 +407,9 @@ def no_paraboloids(n: int) -> Paraboloids:
 def _put(paraboloids: Paraboloids, fitted: Paraboloids,
          places: NDArray[np.bool_]) -> Paraboloids:
     """Give the paraboloids with those at some places (N,) bool replaced by fitted ones."""
-    arrays = {name: getattr(paraboloids, name).copy() for name in ('centres', 'A', 'b', 'c')}
-    indices = np.flatnonzero(places)
-    for name, array in arrays.items():
-        array[indices] = getattr(fitted, name)
-    return replace(paraboloids, **arrays)
+    # To take is several times as fast as to put in, of what has several axes.
+    which = np.arange(len(places))
+    which[places] = len(places) + np.arange(len(fitted.c))
+    return replace(paraboloids, **{
+        name: np.concatenate([getattr(paraboloids, name), getattr(fitted, name)]).take(
+            which, axis=0) for name in ('centres', 'A', 'b', 'c')})

@@ -127,13 +127,14 @@ class Track:
         """Give how many rounds were made."""
         return len(self.rounds)
 
+    @cached_property
     def scale(self) -> float:
         """Give the robust standard deviation of the residuals, in pixels of a typical surface."""
         return _scale(self.residuals.r)
 
     def inliers(self) -> NDArray[np.bool_]:
         """(N,) bool mask of the matches that voted and agree with the pose."""
-        agree = np.abs(self.residuals.r) < TRACK_TUNING.inlier * self.scale()
+        agree = np.abs(self.residuals.r) < TRACK_TUNING.inlier * self.scale
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers
@@ -198,7 +199,7 @@ def _contested(algorithm: _Algorithm, track: Track, pair: Pair, surface: Residua
         end = led.run([pose], ahead)
         if end is not None:
             ends.append((led, end))
-    loss = Loss('geman_mcclure', config.loss_scale * min(end.scale() for _, end in ends))
+    loss = Loss('geman_mcclure', config.loss_scale * min(end.scale for _, end in ends))
     losses = np.full((len(ends), len(pair.y)), loss.scale**2)
     for row, (_, end) in zip(losses, ends):
         row[end.voting] = loss(end.residuals.r**2)[0]
@@ -221,9 +222,10 @@ def _of_one_plane(track: Track, first: _Optimised, x: Array) -> tuple[Rival, ...
     against the same places: later ones lie, and patches are warped, as the pose that was led on
     has them, and it makes itself sure.
     """
+    if not (first.rivals and any(rival.preference >= DECIDED for rival in track.rivals)):
+        return track.rivals
     agree = track.inliers()
-    if not (first.rivals and any(rival.preference >= DECIDED for rival in track.rivals)
-            and lie_on_a_plane(x[agree], track.placed.places[agree], track.scale())):
+    if not lie_on_a_plane(x[agree], track.placed.places[agree], track.scale):
         return track.rivals
     ours = first.nearest(track.pose)
     preferred = preferences(first.losses_behind(), first.places, ours)
@@ -305,7 +307,7 @@ class _Algorithm:
             # Match culling: a keypoint without a surface is out, and keeps its last loss.
             voting = self._voting(paraboloids)
             if (voting.sum() < self._config.min_matches
-                    or voting.mean() <= limits.agreeing):
+                    or voting.sum() <= limits.agreeing * len(voting)):
                 return None
             # Step 2: global pose optimisation.
             found = self._optimised(paraboloids, voting, poses, ahead,

@@ -25,7 +25,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.jet import epipolar_residuals
 from djet_ros.core.pair import Pair
-from djet_ros.core.paraboloid import quantile
+from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.rivals import change, DECIDED, false_alarms, goes_on, preferences
 from djet_ros.core.tracking import Track, TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose, Status
@@ -76,7 +76,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         status = Status.TOO_FEW_INLIERS
     else:
         # Where a rotation alone explains the matches, any direction of t would do.
-        R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale()
+        R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale
         parallax = _parallax(K, R_alone, rays_x, minima)
         if parallax < max(config.min_parallax, noise):
             if parallax >= noise:
@@ -131,7 +131,7 @@ def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfi
     were tried as well.
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
-    chance = 4 * TRACK_TUNING.inlier * track.scale() / (np.pi * radius)
+    chance = 4 * TRACK_TUNING.inlier * track.scale / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting) + pair.left_out, chance) > 0
 
 
@@ -184,7 +184,7 @@ def _goes_on(before: Pose | None, pose: Pose, rival: Pose) -> bool:
 def _by_chance(hamming: Array) -> bool:
     """Tell of descriptor distances (N,), NaN where there is none, whether chance explains them."""
     known = hamming[np.isfinite(hamming)]
-    return bool(known.size and np.median(known) > _CHANCE_BITS)
+    return bool(known.size and median(known) > _CHANCE_BITS)
 
 
 def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
