@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from djet_ros.core.cells import beginnings
+from djet_ros.core.cells import beginnings, short
 from djet_ros.core.geometry import rotation_log, sphere_tangents
 from djet_ros.core.jet import (
     epipolar_residuals,
@@ -428,6 +428,7 @@ def summed_by_cell(places: Array, values: Array) -> Array:
 def _by_cell(places: Array, side: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Give the order of points (N, 2) by cells of a side, and where each cell begins in that."""
     columns, rows = np.floor(places / side).astype(np.int64).T
-    cell = columns * 2**32 + rows
+    columns, rows = columns - columns.min(initial=0), rows - rows.min(initial=0)
+    cell = short(columns * (rows.max(initial=0) + 1) + rows)
     order = np.argsort(cell, kind='stable')
     return order, beginnings(cell[order])

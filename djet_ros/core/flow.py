@@ -50,16 +50,24 @@ def follow(previous: View, current: View, start: Array, reach: float, levels: in
     bits = np.full(len(points), np.inf)
     x, at_first = (places.astype(np.float32)[:, None] for places in (points, start))
     y, seen = _flow(previous.gray, current.gray, x, at_first, levels, _STEPS, _LAST_STEP)
-    near = np.flatnonzero(seen & (np.linalg.norm(y - at_first, axis=2).ravel() < reach))
-    back, seen_back = _flow(current.gray, previous.gray, y[near], x[near], 0, _STEPS_BACK,
-                            _LAST_STEP_BACK)
-    good = near[seen_back
-                & (np.linalg.norm(back - x[near], axis=2).ravel() < _THERE_AND_BACK)]
+    near = np.flatnonzero(seen & _within(reach, y, at_first))
+    began = x.take(near, axis=0)
+    back, seen_back = _flow(current.gray, previous.gray, y.take(near, axis=0), began, 0,
+                            _STEPS_BACK, _LAST_STEP_BACK)
+    good = near[seen_back & _within(_THERE_AND_BACK, back, began)]
     places = y[:, 0].astype(np.float64)
-    bits[good] = match_distances(previous.smoothed, points[good], current.smoothed, places[good])
+    bits[good] = match_distances(previous.smoothed, points.take(good, axis=0), current.smoothed,
+                                 places.take(good, axis=0))
     # Not a number where a descriptor would leave the image.
     bits[~(bits <= _ALIKE)] = np.inf
     return places, bits
+
+
+def _within(reach: float, places: NDArray[np.float32], others: NDArray[np.float32]
+            ) -> NDArray[np.bool_]:
+    """(N,) bool mask of the places (N, 1, 2) that are nearer than a reach to others."""
+    x, y = (places - others)[:, 0].T
+    return np.asarray(np.sqrt(x * x + y * y) < reach)
 
 
 def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32],

@@ -79,11 +79,12 @@ def match_foreseen(previous: View, current: View, prior: RelativePose | None, kn
     if found.sum() < max(_ENOUGH * _expected(prior, len(found)), _MANY):
         return None
     # Where many are far off, as after a step twice as long, others are farther than the reach.
-    off = np.linalg.norm((y - foreseen)[found], axis=1)
+    off = np.linalg.norm((y - foreseen).compress(found, axis=0), axis=1)
     if quantile(off, _NEARLY_ALL) > reach / 2:
         return None
     first = _surest(bits)
-    return Foreseen(Matches(previous.features.points[first], y[first]), bits[first], motion)
+    return Foreseen(Matches(previous.features.points.take(first, axis=0), y.take(first, axis=0)),
+                    bits[first], motion)
 
 
 def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
@@ -106,7 +107,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     pairs = _match_turned(previous, current, turned, prior, radius)
     y, bits = _settled(previous, current, y, bits, pairs)
     first = _surest(bits)
-    return Matches(there.points[first], y[first])
+    return Matches(there.points.take(first, axis=0), y.take(first, axis=0))
 
 
 def _match_turned(previous: View, current: View, places: Array, prior: RelativePose | None,
