@@ -30,8 +30,9 @@ Shown = tuple[NDArray[Any], int]
 # Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
 _BLOCK = 2048
 
-# Points per pass of warped patches, which take up to 512 places in the image each (2 MB).
-_WARPED_BLOCK = 256
+# Points per pass of warped patches, which take up to 512 places in the image each (2 MB); and of
+# what takes one after the other, where a pass is but a share for one of two threads.
+_WARPED_BLOCK, _SHARE = 256, 512
 
 # Pixels by which the farthest ends of tests may be off, for when driving, a warp's derivative will
 # do. All of a patch is off by a seventh of that, a twentieth of the noise of a match.
@@ -142,13 +143,14 @@ def looks_through(warp: Array, tests: Tests
     return inverse.astype(np.float32), nearer.astype(np.float32), bend > _BENT
 
 
-def blocks(images: Sequence[Shown]) -> list[tuple[NDArray[Any], slice]]:
+def blocks(images: Sequence[Shown], most: int = _WARPED_BLOCK
+           ) -> list[tuple[NDArray[Any], slice]]:
     """Give passes over the points of some images: each an image, and which points."""
     parts, end = [], 0
     for image, count in images:
         begin, end = end, end + count
-        parts += [(image, slice(start, min(start + _WARPED_BLOCK, end)))
-                  for start in range(begin, end, _WARPED_BLOCK)]
+        parts += [(image, slice(start, min(start + most, end)))
+                  for start in range(begin, end, most)]
     return parts
 
 
@@ -160,10 +162,10 @@ def floating(images: Sequence[Shown]) -> list[Shown]:
 def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
     """Give the same for what takes several images of a size at once: few, where points are."""
     found: list[tuple[list[Shown], slice]] = []
-    for image, some in blocks(images):
+    for image, some in blocks(images, _SHARE):
         part = image, some.stop - some.start
         seen, begun = found[-1] if found else ([], some)
-        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _WARPED_BLOCK:
+        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _SHARE:
             found[-1] = [*seen, part], slice(begun.start, some.stop)
         else:
             found.append(([part], some))

@@ -53,7 +53,7 @@ _LEAST_ERROR = 0.01
 # What is fitted to a patch: its place, brightness and contrast.
 _FITTED = 4
 
-# Patches per pass: bounds the memory that they take (4 MB).
+# Patches per pass, where NumPy takes them side by side: bounds their memory (4 MB).
 _BLOCK = 1024
 
 
@@ -86,6 +86,8 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
     them. What would go far, or lies at the border, stays at y.
     """
+    if compiled.library is not None and len(y):
+        return place_all([(there, len(x))], x, warp, here, y)
     places, covariances = y.copy(), np.empty((len(y), 2, 2))
 
     def refine(start: int) -> None:
@@ -115,9 +117,14 @@ def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began:
     """Take the steps of `Expected.stepped`, compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
     tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _FARTHEST], float)
-    parts = [compiled.place(seen, here, points[some], inverse[some], began[some], inside[some],
-                            tuning) for seen, some in passes(images)]
-    places, noise, spread = (np.concatenate(values) for values in zip(*parts))
+
+    def step(task: tuple[list[Shown], slice]) -> tuple[Array, Array, Array]:
+        seen, some = task
+        return compiled.place(seen, here, points[some], inverse[some], began[some], inside[some],
+                              tuning)
+
+    places, noise, spread = (np.concatenate(values)
+                             for values in zip(*each(step, passes(images))))
     return places, noise, spread
 
 
