@@ -104,9 +104,10 @@ static void slopes_of(const Pose *pose, const double tangents[2][3], double slop
     }
 }
 
-/* Take the residuals at a pose; the variances' own change is in J if they are `exact`. */
+/* Take the residuals at a pose, and J if it is wanted; the variances' own change is in that if they
+   are `exact`. */
 INLINE void look(const Problem *problem, const Pose *pose, const double tangents[2][3], int exact,
-                 Left *left)
+                 int with_J, Left *left)
 {
     double T[3][3], E[3][3], slopes[5][9];
     cross_matrix(pose->t, T);
@@ -139,6 +140,8 @@ INLINE void look(const Problem *problem, const Pose *pose, const double tangents
         }
         store(left->r + k, r);
         store(left->sign + k, sign);
+        if (!with_J)
+            continue;
         Lanes products[9];
         for (int i = 0; i < 9; i++)
             products[i] = w[i / 3] * x[i % 3];
@@ -307,10 +310,11 @@ typedef struct {
     Left left;
 } Place;
 
-INLINE void arrive(const Problem *problem, Loss loss, int exact, Place *place)
+INLINE void arrive(const Problem *problem, Loss loss, int exact, int with_J, Place *place)
 {
     sphere_tangents(place->pose.t, place->tangents);
-    look(problem, &place->pose, (const double (*)[3])place->tangents, exact, &place->left);
+    look(problem, &place->pose, (const double (*)[3])place->tangents, exact, with_J,
+         &place->left);
     place->cost = cost_of(loss, problem->m, &place->left);
 }
 
@@ -328,11 +332,11 @@ typedef struct {
 } Limits;
 
 /* Levenberg-Marquardt steps from a place, which is moved; `there` is for trials. `exact` as in
-   look, and a match curves as its loss does then. */
+   look, and a match curves as its loss does then; only then J is told at the end. */
 INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps, Limits limits,
                     double damping, Place *here, Place *there)
 {
-    arrive(problem, loss, exact, here);
+    arrive(problem, loss, exact, exact || most_steps > 0, here);
     for (int number = 0; number < most_steps; number++) {
         double H[5][5], gradient[5], step[5], length = 0;
         sum_up(problem->m, &here->left, exact, limits.curved, H, gradient);
@@ -342,7 +346,7 @@ INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps
             length += step[i] * step[i];
         const int is_small = sqrt(length) < limits.step;
         move(&here->pose, (const double (*)[3])here->tangents, step, &there->pose);
-        arrive(problem, loss, exact, there);
+        arrive(problem, loss, exact, exact || number + 1 < most_steps, there);
         if (there->cost < here->cost) {
             swap(here, there);
             damping = fmax(damping / 10, 1e-9);
