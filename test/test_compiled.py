@@ -17,6 +17,7 @@ import cv2
 from djet_ros import compiled
 from djet_ros.core.bundle import eliminate, observe
 from djet_ros.core.corners import _peaks, corner_slopes
+from djet_ros.core.covariance import _along_curve, sums_of_cells, without_each
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.features import most_similar
@@ -282,6 +283,20 @@ def test_matches_that_tell_nothing_move_no_pose() -> None:
         for found in both(partial(minimise, matches, np.eye(3), np.array([0.0, 0, 1]), Loss())):
             assert found.R.tolist() == np.eye(3).tolist()
             assert found.t.tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize('count', [1, 2, 700])
+def test_what_cells_tell_is_summed_up_as_numpy_does(count: int) -> None:
+    rng = np.random.default_rng(count)
+    order, codes = _along_curve(rng.uniform((-90, -20), (1600, 900), (count, 2)))
+    J, weights, r = rng.normal(size=(5, count)), rng.uniform(0, 1, count), rng.normal(size=count)
+    ours, numpys = both(lambda: sums_of_cells(J, weights, r, order, codes))
+    np.testing.assert_array_equal(ours[1], numpys[1])
+    for mine, others in zip(ours, numpys):
+        np.testing.assert_allclose(mine, others, rtol=1e-9, atol=1e-9)
+    whole = (J * weights) @ J.T + 1e-3 * np.eye(5)
+    for mine, others in zip(*both(lambda: without_each(whole, ours[0]))):
+        np.testing.assert_allclose(mine, others, rtol=1e-7, atol=1e-7 * np.abs(others).max())
 
 
 @pytest.mark.parametrize('seen', [False, True])

@@ -26,7 +26,7 @@ Gray = NDArray[np.float32]
 Images = Sequence[tuple[NDArray[Any], int]]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 6
+_INTERFACE = 7
 
 _NOTHING = c_char * 0
 
@@ -35,6 +35,9 @@ _ROWS, _FILLED_UP = 28, 3
 
 # Rows of sums that slopes of corners ask for, and planes in squares.
 _SUMS, _OF_SQUARES = 12, 14
+
+# What is summed up of the matches of a cell.
+_TERMS = 27
 
 
 def _loaded() -> ctypes.CDLL | None:
@@ -270,6 +273,37 @@ def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: flo
           c_int(rounds), c_double(usual), _given(np.empty((_OF_SQUARES, rows * columns))),
           *map(_given, (off, found, fitting)))
     return found, off, fitting
+
+
+def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
+                  codes: NDArray[np.uint64], sides: int, small: int
+                  ) -> tuple[Array, NDArray[np.int64], Array, Array]:
+    """
+    Sum up what N matches tell by cells in cells: `core.covariance.sums_of_cells`.
+
+    J: (5, N); weights, r: (N,); order, codes: (N,) from `core.covariance._along_curve`; sides: so
+    many, the number of the small ones among them. Gives of small cells their sums (27, C) and the
+    first (C,) of their matches in order; and of cells of each side pulls (S, 5, 5) and products
+    (S, 2).
+    """
+    n = len(r)
+    sums, first = np.empty((n, _TERMS)), np.empty(n, np.int64)
+    pulls, products = np.empty((sides, 5, 5)), np.empty((sides, 2))
+    count = _call('djet_sums_of_cells', c_int(n), *map(_given, (J, weights, r)),
+                  _given(order, np.int64), _given(codes, np.uint64), c_int(sides), c_int(small),
+                  _given(sums), _given(first, np.int64), _given(pulls), _given(products))
+    return sums[:count].T, first[:count], pulls, products
+
+
+def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
+    """
+    Tell how a pose would move without each of C cells: `core.covariance.without_each`.
+
+    whole: (5, 5); sums: (27, C). Gives moves (5, C), and the sum (5, 5) of inverses.
+    """
+    moves, inverses = np.empty((sums.shape[1], 5)), np.empty((5, 5))
+    _call('djet_without_each', c_int(len(moves)), *map(_given, (whole, sums.T, moves, inverses)))
+    return moves.T, inverses
 
 
 def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[np.int64],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from djet_ros import compiled
 from djet_ros.core.cells import beginnings, short
 from djet_ros.core.geometry import rotation_log, sphere_tangents
 from djet_ros.core.jet import (
@@ -112,18 +113,15 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     if told[0] <= 1e-12 * told[-1]:
         return UNKNOWN
     curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
-    order, nested = _nested(places)
-    terms = _terms(J.take(order, axis=1), weights[order], residuals.r[order])
-    cells = _Cells.of(H, places[order], terms, nested[_SMALL])
+    cells, pulls, products = _summed_up(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or not (cells.suffice() and large.suffice()):
         return UNKNOWN
-    without = np.asarray(np.linalg.inv(H - cells.H))
-    moves = np.einsum('cij,jc->ic', without, cells.gradients)
+    moves, without = without_each(H, cells.sums)
     size = cells.size(moves)
     by_itself = _jackknife(cells, without, moves)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = by_itself + _alike(terms[20:], nested, cells.inverse, by_itself, size, noise)
+    covariance = by_itself + _alike(pulls, products, cells.inverse, by_itself, size, noise)
     growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
     covariance += growth * size * _hardly_told(cells, growth)
     # What a pose moves by over what it would by H, the loss's weights.
@@ -218,12 +216,6 @@ class _Cells:
     inverse: Array
     places: Array
     sums: Array
-
-    @classmethod
-    def of(cls, H: Array, places: Array, terms: Array, first: NDArray[np.int64]) -> _Cells:
-        """Sum the terms (27, N) of matches at pixels (N, 2) by cells, given the first of each."""
-        return cls(H, np.asarray(np.linalg.inv(H)), (places[first] // CELL + 0.5) * CELL,
-                   np.add.reduceat(terms, first, axis=1))
 
     def in_larger(self, side: float) -> _Cells:
         """Give larger cells, each made of whole small ones; places are those of one of them."""
@@ -329,20 +321,20 @@ def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
     """
     Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
 
-    without: (C, 5, 5) inverses of what is left of the whole without each cell; moves: (5, C) of
-    the pose without its matches. A delete-a-group jackknife, to first order
+    without: (5, 5) sum of the inverses of what is left without each cell; moves: (5, C) of the
+    pose without its matches. A delete-a-group jackknife, to first order
     (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their
     moves say little; so the mean is taken of the moves that are seen and of those that noise would
     make, which are large there, at the size that has the seen ones on average.
     """
     seen = moves @ moves.T + _LEAST_VARIANCE * cells.inverse
-    by_noise = without.sum(0) - len(cells) * cells.inverse
+    by_noise = without - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
     return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
 
 
-def _alike(terms: Array, nested: list[NDArray[np.int64]], inverse: Array, by_itself: Array,
-           size: float, noise: float) -> Array:
+def _alike(pulls: Array, products: Array, inverse: Array, by_itself: Array, size: float,
+           noise: float) -> Array:
     """
     Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
 
@@ -352,12 +344,10 @@ def _alike(terms: Array, nested: list[NDArray[np.int64]], inverse: Array, by_its
     overlap; then by pairs farther and farther apart, whether there is more between these than that
     lets expect.
 
-    terms: (7, N) the last of those of matches; nested: the first of each cell, from the smallest
-    on; inverse: (5, 5) that of H; noise: variance of a match, which bounds what is told.
+    pulls, products: of cells of each side, from the smallest on, see `sums_of_cells`; inverse:
+    (5, 5) that of H; noise: variance of a match, which bounds what is told.
     """
-    by_side = [np.add.reduceat(terms, first, axis=1) for first in nested]
-    pulls = np.diff([sums[:5] @ sums[:5].T for sums in by_side], axis=0)
-    products = np.diff([(sums[5:]**2).sum(1) for sums in by_side], axis=0)
+    pulls, products = np.diff(pulls, axis=0), np.diff(products, axis=0)
     found = products[:, 0] + (pulls * by_itself).sum((1, 2))
     left = inverse @ _in_all(_FALLS, pulls) @ inverse
     expected = _FALLS * products[:, 1] - left.reshape(-1, 25) @ pulls.reshape(-1, 25).T
@@ -394,6 +384,51 @@ def _hardly_told(cells: _Cells, growth: float) -> Array:
     return np.asarray((half * (wider - 1)) @ half.T)
 
 
+def _summed_up(H: Array, places: Array, J: Array, weights: Array, r: Array
+               ) -> tuple[_Cells, Array, Array]:
+    """Give small cells, and pulls and products of cells of all sides: see `sums_of_cells`."""
+    order, codes = _along_curve(places)
+    sums, first, pulls, products = sums_of_cells(J, weights, r, order, codes)
+    middles = (places[order[first]] // CELL + 0.5) * CELL
+    return _Cells(H, np.asarray(np.linalg.inv(H)), middles, sums), pulls, products
+
+
+def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
+                  codes: NDArray[np.uint64]) -> tuple[Array, NDArray[np.int64], Array, Array]:
+    """
+    Sum up what matches tell by cells in cells.
+
+    J (5, N), weights and r (N,) of matches; order, codes: (N,) from `_along_curve`. Gives of small
+    cells their sums (27, C), see `_Cells`, and the first (C,) of their matches in order. And of
+    cells of each side, from the smallest on, sums of products: pulls (S, 5, 5) of how gradients
+    change where all residuals of a cell grow alike, and squares (S, 2) of weighted residuals and
+    of weights.
+    """
+    if compiled.library is not None:
+        return compiled.sums_of_cells(J, weights, r, order, codes, _SIDES, _SMALL)
+    terms = _terms(J.take(order, axis=1), weights[order], r[order])
+    # Cells of a side are the same where all bits above those of the places in them are.
+    differing = np.append(np.uint64(2**64 - 1), codes[1:] ^ codes[:-1])
+    nested = [np.flatnonzero(differing >= 4**side) for side in range(_SIDES)]
+    by_side = [np.add.reduceat(terms[20:], first, axis=1) for first in nested]
+    return (np.add.reduceat(terms, nested[_SMALL], axis=1), nested[_SMALL],
+            np.array([sums[:5] @ sums[:5].T for sums in by_side]),
+            np.array([(sums[5:]**2).sum(1) for sums in by_side]))
+
+
+def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
+    """
+    Tell how a pose would move without the matches of each of C cells, to first order.
+
+    whole: (5, 5) H of all; sums: (27, C), see `_Cells`; what is left of H without any of them is
+    positive definite. Gives moves (5, C), and the sum (5, 5) of the inverses of what is left.
+    """
+    if compiled.library is not None:
+        return compiled.without_each(whole, sums)
+    left = np.asarray(np.linalg.inv(whole - sums[_WHOLE].T.reshape(-1, 5, 5)))
+    return np.einsum('cij,jc->ic', left, sums[15:20]), left.sum(0)
+
+
 def _terms(J: Array, weights: Array, r: Array) -> Array:
     """Give what ``_Cells`` sums up (27, N) of matches, by their J (5, N), weights and r (N,)."""
     weighed, (rows, columns) = J * weights, _UPPER
@@ -401,22 +436,21 @@ def _terms(J: Array, weights: Array, r: Array) -> Array:
                            [weights * r, weights]])
 
 
-def _nested(places: Array) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+def _along_curve(places: Array) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
     """
-    Order points (N, 2) by cells in cells in cells, and give where each begins in that, by side.
+    Order points (N, 2) by cells in cells in cells; gives that, and codes (N,) of these in it.
 
     Along Morton's curve, which interleaves the bits of columns and rows, points of one cell of any
     of the sides come one after the other.
     """
-    cells = np.floor(places / _SMALLEST).astype(np.int64) + 2**15
+    cells = np.floor(places / _SMALLEST).astype(np.int64)
+    # From the corner of one of the largest on, codes are short.
+    cells -= cells.min(0) >> _SIDES - 1 << _SIDES - 1
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         cells = (cells | cells << shift) & mask
-    code = cells[:, 0] | cells[:, 1] << 1
+    code = short(cells[:, 0] | cells[:, 1] << 1)
     order = np.argsort(code, kind='stable')
-    ordered = code[order]
-    # Cells of a side are the same where all bits above those of the places in them are.
-    differing = np.append(-1, ordered[1:] ^ ordered[:-1]).view(np.uint64)
-    return order, [np.flatnonzero(differing >= 4**side) for side in range(_SIDES)]
+    return order, code[order].astype(np.uint64)
 
 
 def summed_by_cell(places: Array, values: Array) -> Array:
