@@ -16,7 +16,13 @@ from typing import TypeVar
 import cv2
 from djet_ros import compiled
 from djet_ros.core.bundle import eliminate, observe
-from djet_ros.core.corners import _peaks, corner_slopes
+from djet_ros.core.corners import (
+    _exact_peaks,
+    _peaks,
+    corner_slopes,
+    noise_of,
+    spread_out,
+)
 from djet_ros.core.covariance import _along_curve, sums_of_cells, without_each
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
@@ -168,6 +174,28 @@ def test_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
         for ours, numpys in zip(*both(partial(_peaks, slopes, 0.5, gray.shape))):
             np.testing.assert_array_equal(ours, numpys)
             assert len(ours) or min(size) < 40
+
+
+@pytest.mark.parametrize('size', [(320, 200), (321, 107), (8, 10), (8, 9)])
+def test_noise_and_places_of_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
+    for seed in range(2):
+        gray = image(seed, size)
+        ours, numpys = both(partial(noise_of, gray))
+        assert ours == numpys
+        slopes = corner_slopes(gray)
+        found, _ = _peaks(slopes, 0.5, gray.shape)
+        np.testing.assert_array_equal(*both(partial(_exact_peaks, slopes, found)))
+
+
+@pytest.mark.parametrize('count', [0, 1, 900])
+@pytest.mark.parametrize('most', [0, 1, 300, 900])
+def test_points_are_spread_out_as_numpy_does(count: int, most: int) -> None:
+    rng = np.random.default_rng(count)
+    points = rng.integers(0, (700, 300), (count, 2))
+    # Some are as strong as others.
+    strengths = rng.integers(0, 99, count).astype(np.float32)
+    first = rng.uniform(size=count) < 0.6
+    np.testing.assert_array_equal(*both(partial(spread_out, points, strengths, most, first)))
 
 
 @pytest.mark.parametrize('count', [1, 2, 700])

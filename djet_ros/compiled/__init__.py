@@ -26,7 +26,7 @@ Gray = NDArray[np.float32]
 Images = Sequence[tuple[NDArray[Any], int]]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 7
+_INTERFACE = 8
 
 _NOTHING = c_char * 0
 
@@ -149,6 +149,49 @@ def peaks(slopes: Gray, least: float, margin: int, after: tuple[int, int]
                   _given(np.empty(slopes.shape[1], np.uint8), np.uint8),
                   _given(places, np.int64), _given(around, np.bool_))
     return places[:count], around[:count]
+
+
+def exact_peaks(slopes: Gray, places: NDArray[np.int64]) -> Array:
+    """
+    Pixels (N, 2) at which slopes (H, W) are highest: `core.corners._exact_peaks`.
+
+    places: (N,) of peaks in the flat array.
+    """
+    points = np.empty((len(places), 2))
+    _call('djet_exact_peaks', _given(slopes, np.float32), c_int(slopes.shape[1]),
+          c_int(len(places)), _given(places, np.int64), _given(points))
+    return points
+
+
+def spread_out(points: NDArray[np.int64], by_strength: NDArray[np.int64],
+               first: NDArray[np.bool_], side: int, most: int) -> NDArray[np.int64]:
+    """
+    Choose, in order, at most so many of points (N, 2), at least one: `core.corners.spread_out`.
+
+    by_strength: (N,) their order; first: (N,); side: of a cell in pixels.
+    """
+    n, (columns, rows) = len(points), (points.max(0) // side + 1).tolist()
+    chosen, memory = np.empty(n, np.int64), np.empty(2 * columns * rows + 3 * n, np.int32)
+    count = _call('djet_spread_out', c_int(n), _given(points, np.int64),
+                  _given(by_strength, np.int64), _given(first, np.bool_), c_int(side),
+                  c_int(columns), c_int(columns * rows), c_int(most), _given(memory, np.int32),
+                  _given(chosen, np.int64))
+    return chosen[:count]
+
+
+def curved_blocks(image: NDArray[np.uint8], side: int, apart: int) -> NDArray[np.int32]:
+    """
+    Sum up curvatures in blocks (B,) of an image (H, W): `core.corners._curved_blocks`.
+
+    side: of blocks in pixels, for one of which there is room; apart: from one row of them to the
+    next.
+    """
+    height, width = image.shape
+    rows, across = -(-(height - side - 1) // apart), width // side
+    sums, memory = np.empty(rows * across, np.int32), np.empty((2, width + 2), np.int32)
+    _call('djet_curved_blocks', _given(image, np.uint8), c_int(width), c_int(rows), c_int(apart),
+          c_int(side), c_int(across), _given(memory, np.int32), _given(sums, np.int32))
+    return sums
 
 
 def nearest(points: Array, others: Array) -> NDArray[np.int64]:

@@ -1,4 +1,5 @@
 /* How corner-like places of an image are: see core/corners.py. */
+#include <stdlib.h>
 #include <string.h>
 
 #include "common.h"
@@ -141,4 +142,84 @@ WIDE int djet_peaks(const float *slopes, int width, float least, int margin, int
         }
     }
     return count;
+}
+
+/* Pixels (n, 2) at which parabolas through peaks of slopes, at places (n,) of the flat array and
+   none of them at its border, are highest: core.corners._exact_peaks. */
+WIDE void djet_exact_peaks(const float *slopes, int width, int n, const int64_t *places,
+                           double (*points)[2])
+{
+    for (int k = 0; k < n; k++) {
+        const int64_t whole[2] = {places[k] % width, places[k] / width}, steps[2] = {1, width};
+        for (int axis = 0; axis < 2; axis++) {
+            const float *at = slopes + places[k];
+            const float here = at[0], before = at[-steps[axis]], after = at[steps[axis]];
+            const float curved = 2 * here - before - after;
+            const float off = (after - before) / (2 * (curved > 1e-9f ? curved : 1e-9f));
+            /* The middle of two pixels is half a pixel beyond the first. */
+            points[k][axis] = 2 * ((double)whole[axis]
+                                   + (off < -0.5f ? -0.5f : off > 0.5f ? 0.5f : off)) + 0.5;
+        }
+    }
+}
+
+/* Choose at most so many of n points, the best of each cell before others: core.corners.spread_out.
+   points: (n, 2) pixels; by_strength: (n,) their order; first: (n,) those that come before all
+   others; side: of cells, of which there are so many in a row and in all. memory: twice as many,
+   and (3, n). Gives how many are chosen, and which of them, in order. */
+int djet_spread_out(int n, const int64_t (*points)[2], const int64_t *by_strength,
+                    const uint8_t *first, int side, int columns, int cells, int most,
+                    int32_t *memory, int64_t *chosen)
+{
+    int32_t *in_cell = memory, *of_rank = in_cell + 2 * cells, *rank = of_rank + 2 * n;
+    memset(memory, 0, (size_t)(2 * (cells + n)) * sizeof *memory);
+    /* By how many of its cell, and of its kind, a point comes behind. */
+    for (int k = 0; k < n; k++) {
+        const int64_t point = by_strength[k];
+        const int late = !first[point];
+        const int64_t cell = points[point][1] / side * columns + points[point][0] / side;
+        rank[point] = late * n + in_cell[2 * cell + late]++;
+        of_rank[rank[point]]++;
+    }
+    /* All are chosen up to some rank, and the strongest of that one. */
+    int last = 0, room = most, count = 0;
+    while (last < 2 * n && of_rank[last] <= room)
+        room -= of_rank[last++];
+    for (int k = 0; k < n && room; k++)
+        if (rank[by_strength[k]] == last) {
+            rank[by_strength[k]] = -1;
+            room--;
+        }
+    for (int k = 0; k < n; k++)
+        if (rank[k] < last)
+            chosen[count++] = k;
+    return count;
+}
+
+/* Sums of the sizes of curvatures in rows of blocks: core.corners._curved_blocks. Blocks are `side`
+   wide and high, in `across` columns; rows of them begin one pixel after so many rows of the image
+   (height, width). memory: (2, width + 2). */
+WIDE void djet_curved_blocks(const uint8_t *image, int width, int rows, int apart, int side,
+                             int across, int32_t *restrict memory, int32_t *restrict sums)
+{
+    int32_t *restrict down = memory + 1, *restrict sizes = memory + width + 2;
+    for (int row = 0; row < rows; row++) {
+        memset(sizes, 0, (size_t)width * sizeof *sizes);
+        for (int j = 0; j < side; j++) {
+            const uint8_t *above = image + (int64_t)(row * apart + j) * width,
+                          *here = above + width, *below = here + width;
+            for (int x = 0; x < width; x++)
+                down[x] = above[x] - 2 * here[x] + below[x];
+            down[-1] = down[1];
+            down[width] = down[width - 2];
+            for (int x = 0; x < width; x++)
+                sizes[x] += abs(down[x - 1] - 2 * down[x] + down[x + 1]);
+        }
+        for (int block = 0; block < across; block++) {
+            int32_t sum = 0;
+            for (int i = 0; i < side; i++)
+                sum += sizes[block * side + i];
+            sums[row * across + block] = sum;
+        }
+    }
 }

@@ -111,18 +111,25 @@ def detect_large_corners(gray: Image, max_features: int, contrast: float,
 
 def noise_of(image: Image) -> float:
     """Tell the standard deviation of an image's noise, in gray levels, where it is flattest."""
-    first = np.arange(0, len(image) - _FLAT_BLOCK - 1, _ROWS_APART)
-    across = image.shape[1] // _FLAT_BLOCK
-    if not len(first) or not across:
+    if len(image) < _FLAT_BLOCK + 2 or image.shape[1] < _FLAT_BLOCK:
         return 0.0
-    rows = image[first[:, None] + np.arange(_FLAT_BLOCK + 2)]
-    curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_32F, _TWICE_CURVED)
-    # The rows beside each row of blocks are there for its differences.
-    whole = np.abs(curved.reshape(rows.shape)[:, 1:-1, :across * _FLAT_BLOCK])
-    means = cv2.resize(whole.reshape(-1, whole.shape[2]), (across, len(first)),
-                       interpolation=cv2.INTER_AREA)
+    mean = quantile(_curved_blocks(image) / _FLAT_BLOCK**2, _FLAT)
     # The mean of what is normal, whatever its sign, is sqrt(2 / pi) of its standard deviation.
-    return float(quantile(np.ravel(means), _FLAT) * np.sqrt(np.pi / 2) / _OF_NOISE)
+    return float(mean * np.sqrt(np.pi / 2) / _OF_NOISE)
+
+
+def _curved_blocks(image: Image) -> NDArray[np.int32]:
+    """Sum up the absolute differences of both ways in blocks (B,), of some rows of an image."""
+    if compiled.library is not None:
+        return compiled.curved_blocks(image, _FLAT_BLOCK, _ROWS_APART)
+    first = np.arange(0, len(image) - _FLAT_BLOCK - 1, _ROWS_APART)
+    rows = image[first[:, None] + np.arange(_FLAT_BLOCK + 2)]
+    curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_16S, _TWICE_CURVED)
+    # The rows beside each row of blocks are there for its differences.
+    across = image.shape[1] // _FLAT_BLOCK
+    sizes = np.abs(curved.reshape(rows.shape)[:, 1:-1, :across * _FLAT_BLOCK])
+    blocks = sizes.reshape(len(first), _FLAT_BLOCK, across, _FLAT_BLOCK)
+    return np.asarray(blocks.sum((1, 3), dtype=np.int32).ravel())
 
 
 def corner_slopes(image: Image) -> NDArray[np.float32]:
@@ -183,6 +190,8 @@ def spread_out(points: Pixels, strengths: NDArray[np.float32], most: int,
     first: (N,) bool mask of points that come before all others.
     """
     by_strength = _strongest_first(strengths)
+    if compiled.library is not None and len(points):
+        return compiled.spread_out(points, by_strength, first, _CELL, most)
     columns, rows = (points[by_strength, axis] // _CELL for axis in (0, 1))
     late = ~first[by_strength]
     rank = rank_in_cells(short((rows * (columns.max(initial=0) + 1) + columns) * 2 + late))
@@ -276,6 +285,8 @@ def _exact_peaks(slopes: NDArray[np.float32], found: NDArray[np.int64]) -> NDArr
 
     found: (M,) places of the peaks in the flat array, none of them at its border.
     """
+    if compiled.library is not None:
+        return compiled.exact_peaks(slopes, found)
     flat, width = slopes.ravel(), slopes.shape[1]
     here, points = flat[found], np.empty((len(found), 2))
     for axis, index, step in ((0, found % width, 1), (1, found // width, width)):
