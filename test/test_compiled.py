@@ -27,7 +27,7 @@ from djet_ros.core.covariance import _along_curve, sums_of_cells, without_each
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.features import most_similar
-from djet_ros.core.geometry import rotation_log
+from djet_ros.core.geometry import fit_rotation, rotation_exp, rotation_log
 from djet_ros.core.graded import graded_surfaces, grades_through, smooth_finely
 from djet_ros.core.hamming import dense_descriptors, match_distances
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, minimise
@@ -311,6 +311,18 @@ def test_matches_that_tell_nothing_move_no_pose() -> None:
         for found in both(partial(minimise, matches, np.eye(3), np.array([0.0, 0, 1]), Loss())):
             assert found.R.tolist() == np.eye(3).tolist()
             assert found.t.tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize('count', [2, 9, 900])
+def test_rotations_are_fitted_as_numpy_does(count: int) -> None:
+    rng = np.random.default_rng(count)
+    x = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
+    for turn in (np.zeros(3), np.array([0.1, -0.2, 0.3]), np.array([3.1, 0.0, 0.0])):
+        y = x @ rotation_exp(turn).T + rng.normal(0, 1e-3, x.shape)
+        # Some of them have nothing to do with it.
+        y[:count // 4] += 0.3
+        ours, numpys = both(partial(fit_rotation, x, y))
+        np.testing.assert_allclose(ours, numpys, atol=1e-9)
 
 
 @pytest.mark.parametrize('count', [1, 2, 700])

@@ -26,7 +26,7 @@ Gray = NDArray[np.float32]
 Images = Sequence[tuple[NDArray[Any], int]]
 
 # That of what is built, see interface.c: sources in place may be newer than it.
-_INTERFACE = 8
+_INTERFACE = 9
 
 _NOTHING = c_char * 0
 
@@ -300,6 +300,14 @@ def losses_in_front(matches: tuple[Array, Array, Array, Array], loss: tuple[int,
           c_int(len(signs)), _given(np.array(signs, float)), _given(losses),
           _given(np.empty((3, n))))
     return losses
+
+
+def fit_rotation(rays_x: Array, rays_y: Array, rounds: int) -> Array:
+    """Find the rotation (3, 3) from rays (N, 3) to others: `core.geometry.fit_rotation`."""
+    R, memory = np.empty((3, 3)), np.empty((9, len(rays_x)))
+    _call('djet_fit_rotation', c_int(len(rays_x)), _given(rays_x), _given(rays_y), c_int(rounds),
+          _given(R), _given(memory))
+    return R
 
 
 def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: float

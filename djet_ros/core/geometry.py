@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import cv2
+from djet_ros import compiled
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +138,8 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     Least squares over directions (Wahba's problem), reweighted by a Cauchy loss at the median
     deviation, so that what moves or is near in part of the image does not turn it.
     """
+    if compiled.library is not None:
+        return compiled.fit_rotation(rays_x, rays_y, rounds)
     # Components first: a third of the time.
     x, y = (one.T / np.sqrt(np.einsum('ij,ij->i', one, one)) for one in (rays_x, rays_y))
     R, weights, half = np.eye(3), np.ones(len(rays_x)), len(rays_x) // 2
