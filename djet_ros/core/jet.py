@@ -180,7 +180,7 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
 
 def entries(S: Array) -> Array:
     """Give the entries 11, 12, 22 (3, N) of symmetric matrices (N, 2, 2)."""
-    return np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
+    return np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
 
 
 def spread_of_rays(K: Array, spread: Array) -> Array:

@@ -57,10 +57,11 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     S, T = (core_scale(r)**2 * measured.spread
             for measured, r in ((problem, solution.residuals.r), (found, off)))
     has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
+    there = np.flatnonzero(has_minimum)
     rays_y, joined = problem.rays_y.copy(), S.copy()
-    way, joined[:, has_minimum] = join(
-        (found.rays_y - rays_y)[:2, has_minimum], S[:, has_minimum], T[:, has_minimum])
-    rays_y[:2, has_minimum] += way
+    way, joined[:, there] = join(*(values.take(there, axis=1) for values in (
+        found.rays_y[:2] - rays_y[:2], S, T)))
+    rays_y[:2, there] += way
     # Residuals are in pixels for a match of typical sharpness again.
     G = inverse_of(K)[:2, :2]
     width = np.trace(G @ G.T)
@@ -83,7 +84,7 @@ def join(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
     S = _TOGETHER * S
     inverse = _inverse(S + T)
     way = _times(inverse, apart)
-    left = S - np.stack([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
+    left = S - np.array([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
                          _form(S[1:], inverse, S[1:])])
     return _times(S, way), left * _noise_of_each((apart * way).sum(0))
 
@@ -111,7 +112,7 @@ def _inverse(S: Array) -> Array:
     """Entries 11, 12, 22 (3, N) of the inverses of symmetric matrices, given by theirs."""
     area = S[0] * S[2] - S[1]**2
     # Exact matches have no area at all.
-    return np.stack([S[2], -S[1], S[0]]) / np.where(area != 0, area, 1e-300)
+    return np.array([S[2], -S[1], S[0]]) / np.where(area != 0, area, 1e-300)
 
 
 def _times(S: Array, v: Array) -> Array:

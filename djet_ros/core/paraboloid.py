@@ -53,8 +53,12 @@ class Paraboloids:
         """Give those at some places, a mask (N,) bool or indices."""
         # To take is three to six times as fast as to index, of whatever has several axes.
         places = np.arange(len(self.c))[chosen]
-        return Paraboloids(*(values.take(places, axis=0) for values in (
+        some = Paraboloids(*(values.take(places, axis=0) for values in (
             self.centres, self.A, self.b, self.c, self.usable)))
+        # What has been told of all need not be told again.
+        vars(some).update((name, value.take(places, axis=0)) for name, value in vars(self).items()
+                          if name in ('inverses', 'ways'))
+        return some
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
         """(N,) bool mask of those whose minimum lies at most so far off, along either axis."""

@@ -171,9 +171,11 @@ class DescriptorSurface(_OfImages):
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
         """Measure the contrast where matches are at first, and keep it."""
         if self._contrast is None:
+            there = np.flatnonzero(usable)
+            there = there[thinned(len(there), _MEASURED)]
             self._contrast = self._distances.contrast(
-                self._previous.tested, np.rint(self.x[usable]).astype(np.int64), self._current,
-                np.rint(y[usable]).astype(np.int64))
+                self._previous.tested, np.rint(self.x[there]).astype(np.int64), self._current,
+                np.rint(y[there]).astype(np.int64))
         return self._contrast
 
     def _kept(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,

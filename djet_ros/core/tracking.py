@@ -303,15 +303,15 @@ class _Algorithm:
         for number in range(1, most + 1):
             # Step 1: update the local residuals around the keypoints and fit A', b, c.
             fits = self._fits(by_places)
-            paraboloids, no_minimum = with_minimum(fits, self._config.indefinite)
+            paraboloids, no_minimum = ((fits, 0) if by_places
+                                       else with_minimum(fits, self._config.indefinite))
             # Match culling: a keypoint without a surface is out, and keeps its last loss.
             voting = self._voting(paraboloids)
             if (voting.sum() < self._config.min_matches
                     or voting.sum() <= limits.agreeing * len(voting)):
                 return None
             # Step 2: global pose optimisation.
-            found = self._optimised(paraboloids, voting, poses, ahead,
-                                    TRACK_TUNING.steps_by_places if by_places else MAX_STEPS)
+            found = self._optimised(paraboloids, voting, poses, ahead, by_places)
             if number == 1:
                 self.first = found
             last = (found.converged and self._seen_as_it_has_them) or number == most
@@ -356,11 +356,11 @@ class _Algorithm:
         return np.asarray(self._alive & self._plausible & self._ours & within)
 
     def _optimised(self, paraboloids: Paraboloids, voting: NDArray[np.bool_], poses: list[Pose],
-                   ahead: Pose | None, steps: int) -> _Optimised:
+                   ahead: Pose | None, by_places: bool) -> _Optimised:
         """Find the pose in the right basin of some."""
-        config, places = self._config, self._surface.x[voting]
+        config, places = self._config, self._surface.x.compress(voting, axis=0)
         problem = jet_problem(self._K, places, paraboloids.of(voting), config.epipole_blur,
-                              config.weigh_by_fit)
+                              config.weigh_by_fit and not by_places)
         if len(poses) > 1:
             basin = right_basin(problem, places, poses, config, self._pair.before,
                                 self._pair.known.turn)
@@ -369,6 +369,7 @@ class _Algorithm:
         else:
             basin = basin_of(problem, poses[0])
         loss = Loss(config.loss, config.loss_scale * basin.scale)
+        steps = TRACK_TUNING.steps_by_places if by_places else MAX_STEPS
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps, basin.residuals)
         converged = len(poses) == 1 and change(basin.pose, solution.pose) < config.epsilon
         if basin.others_move:
