@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import cv2
 from djet_ros import compiled
@@ -74,10 +75,8 @@ def match_nearby(previous: Features, current: Features,
         return np.empty((0, 2), np.int64)
     rows, columns = _by_octave_and_column(previous), _by_octave_and_column(current)
     there, here = previous.points[rows], current.points[columns]
-    strips = np.array([(strip.start, strip.stop, near.start, near.stop)
-                       for strip, near in _neighbourhoods(
-                           previous.octaves[rows], there[:, 0], current.octaves[columns],
-                           here[:, 0], search_radius)], np.int64).reshape(-1, 4)
+    strips = _neighbourhoods(previous.octaves[rows], there[:, 0], current.octaves[columns],
+                             here[:, 0], search_radius)
     # Keeps the numbers small: single precision is enough.
     centre, weight = there.mean(0), np.sqrt(_DISTANCE_BITS / 2) / search_radius
     claim, best_there, best_here = most_similar(
@@ -163,15 +162,23 @@ def factor(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32
 
 def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,
                     octaves_here: NDArray[np.int32], x_here: Array,
-                    search_radius: float) -> Iterator[tuple[slice, slice]]:
-    """Give strips of features of one octave, each with those in the other image to compare."""
-    for octave in np.unique(octaves_there):
-        start, end = np.searchsorted(octaves_there, (octave, octave + 1))
-        for first in range(start, end, _STRIP):
-            strip = slice(first, min(first + _STRIP, end))
-            reach = x_there[strip][[0, -1]] + (-search_radius, search_radius)
-            for other in range(octave - _OCTAVES, octave + _OCTAVES + 1):
-                there, after = np.searchsorted(octaves_here, (other, other + 1))
-                near = there + np.searchsorted(x_here[there:after], reach)
-                if near[0] < near[1]:
-                    yield strip, slice(*near.tolist())
+                    search_radius: float) -> NDArray[np.int64]:
+    """
+    Give strips (S, 4) of features of one octave, each with those in the other image to compare.
+
+    As in `most_similar`. Features are ordered by octaves, and by columns x within these.
+    """
+    found = [np.empty((0, 4), np.int64)]
+    for octave in np.unique(octaves_there).tolist():
+        start, end = octaves_there.searchsorted([octave, octave + 1])
+        first = np.arange(start, end, _STRIP)
+        last = np.minimum(first + _STRIP, end)
+        reach = x_there[first] - search_radius, x_there[last - 1] + search_radius
+        others = np.arange(octave - _OCTAVES, octave + _OCTAVES + 2)
+        bounds = octaves_here.searchsorted(others)
+        # Of a strip, one octave after the other.
+        strips = np.stack([np.stack([first, last, *(
+            there + x_here[there:after].searchsorted(x) for x in reach)], axis=1)
+            for there, after in pairwise(bounds)], axis=1).reshape(-1, 4)
+        found.append(strips[strips[:, 2] < strips[:, 3]])
+    return np.concatenate(found)
