@@ -409,8 +409,11 @@ def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int6
 def _given(array: NDArray[Any], dtype: Any = np.float64) -> Any:
     """Give where an array lies, in C's order and of a type; what is given keeps it there."""
     ordered = np.ascontiguousarray(array, dtype)
-    # Where it may be written to, in a third of the time: hundreds are given a frame.
-    return _NOTHING.from_buffer(ordered.data) if ordered.flags.writeable else ordered.ctypes
+    try:
+        # In a third of the time: hundreds are given a frame.
+        return _NOTHING.from_buffer(ordered)
+    except TypeError:  # what may only be read
+        return ordered.ctypes
 
 
 def _images(images: Images, dtype: Any) -> tuple[Any, ...]:
