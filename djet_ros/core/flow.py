@@ -79,5 +79,6 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[n
     found, seen, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, start.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, steps, last_step),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        # In place of the eigenvalues, which it has, it would compare all patches once more.
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
     return np.asarray(found, np.float32), np.asarray(seen).ravel() > 0
