@@ -411,7 +411,7 @@ def _given(array: NDArray[Any], dtype: Any = np.float64) -> Any:
     ordered = np.ascontiguousarray(array, dtype)
     try:
         # In a third of the time: hundreds are given a frame.
-        return _NOTHING.from_buffer(ordered)
+        return _NOTHING.from_buffer(ordered.data)
     except TypeError:  # what may only be read
         return ordered.ctypes
 
