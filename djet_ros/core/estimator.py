@@ -239,8 +239,7 @@ class TwoViewEstimator:
 
     def _verdict(self, pair: Pair, track: Track) -> RelativePose:
         with _timed(pair.timings, 'result'):
-            result = verdict(pair, track, self.config)
-        return replace(result, timings=pair.timings, sought=pair.sought)
+            return verdict(pair, track, self.config)
 
 
 def _require_one_camera(previous: View, current: View) -> None:

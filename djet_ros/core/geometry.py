@@ -101,7 +101,8 @@ def _inverse(matrix: bytes) -> Array:
 def rays(K: Array, points: Array) -> Array:
     """Take pixels (N, 2) to their viewing rays K^-1 x (N, 3), with z = 1."""
     K_inv = inverse_of(K)
-    return np.asarray(points @ K_inv[:, :2].T + K_inv[:, 2])
+    # Components first: half of the time, and what is done with them mostly has them so.
+    return np.asarray((K_inv[:, :2] @ points.T + K_inv[:, 2:]).T)
 
 
 def essential(R: Array, t: Array) -> Array:
@@ -117,7 +118,8 @@ def fundamental(K: Array, R: Array, t: Array) -> Array:
 
 def epipolar_lines(F: Array, x: Array) -> Array:
     """Epipolar lines l = F x (N, 3) in image B, of pixels x (N, 2) of image A."""
-    return np.asarray(x @ F[:, :2].T + F[:, 2])
+    # Components first, as in `rays`.
+    return np.asarray((F[:, :2] @ x.T + F[:, 2:]).T)
 
 
 def line_distances(lines: Array, y: Array) -> Array:

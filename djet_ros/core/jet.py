@@ -175,7 +175,7 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
     pixel = np.linalg.det(inverse_of(K)[:2, :2])
     blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
-    return JetProblem(rays(K, x).T.copy(), rays(K, minima).T.copy(), spread, blur)
+    return JetProblem(rays(K, x).T, rays(K, minima).T, spread, blur)
 
 
 def entries(S: Array) -> Array:

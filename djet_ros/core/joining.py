@@ -50,7 +50,7 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     itself: at the edge of what is near, they see different things. See `_noise_of_each`. What has
     no minimum stays as it is.
     """
-    found = replace(problem, rays_y=rays(K, placed.places).T.copy(),
+    found = replace(problem, rays_y=rays(K, placed.places).T,
                     spread=spread_of_rays(K, entries(placed.covariances)),
                     blur=np.zeros(len(placed.places)))
     off = epipolar_residuals(found, solution.R, solution.t).r

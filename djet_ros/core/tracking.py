@@ -159,12 +159,13 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     if track is None or len(starts) == 1:
         return track
     first = algorithm.first
-    untold = replace(pair, known=Known())
     algorithm, track = _contested(algorithm, track, pair, surface, config, ahead)
-    track = replace(track, rivals=_of_one_plane(track, first, surface.x))
+    rivals = _of_one_plane(track, first, surface.x)
+    if rivals is not track.rivals:
+        track = replace(track, rivals=rivals)
     if turn is not None and not turn.may_be(track.pose.R):
         for rival in first.rivals:
-            led = _Algorithm(untold, surface, config, everything).run([rival])
+            led = _Algorithm(_untold(pair), surface, config, everything).run([rival])
             if led is not None and turn.prefers(led.pose.R, track.pose.R):
                 track = led
     second = second_motion(first.problem, first.places, track.pose, algorithm.noise,
@@ -175,8 +176,13 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     if taken is second.pose:
         members = np.zeros(len(pair.y), bool)
         members[first.voting] = second.members
-        track = _Algorithm(untold, surface, config, members).run([taken]) or track
+        track = _Algorithm(_untold(pair), surface, config, members).run([taken]) or track
     return replace(track, rivals=(Rival(other, 0.0),), guess=True) if guess else track
+
+
+def _untold(pair: Pair) -> Pair:
+    """Give a pair of which nothing is known but its images."""
+    return replace(pair, known=Known())
 
 
 def _contested(algorithm: _Algorithm, track: Track, pair: Pair, surface: ResidualSurface,

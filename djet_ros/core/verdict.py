@@ -97,7 +97,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         y_opt=track.y_opt, inliers=inliers, voting=track.voting,
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
-        indefinite=track.indefinite, iterations=track.iterations,
+        indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
+        sought=pair.sought,
         rivals=(*(rival.pose for rival in track.rivals),
                 *([Pose(R, -t)] if other_way and t.any() else [])))
 
