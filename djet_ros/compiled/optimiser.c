@@ -218,9 +218,11 @@ INLINE void sum_up(int m, const Left *left, int by_loss, double least_curved, do
 
 /* Solve (H + ridge) step = -gradient by elimination with pivots; 0 where there is nothing to go
    by. */
-static int damped_step(double H[5][5], const double gradient[5], double damping, double step[5])
+static int damped_step(const double given[5][5], const double gradient[5], double damping,
+                       double step[5])
 {
-    double most = 0;
+    double most = 0, H[5][5];
+    memcpy(H, given, sizeof H);
     for (int i = 0; i < 5; i++) {
         for (int j = 0; j < 5; j++)
             if (!isfinite(H[i][j]))
@@ -336,18 +338,22 @@ typedef struct {
 INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps, Limits limits,
                     double damping, Place *here, Place *there)
 {
+    double H[5][5], gradient[5];
+    int has_moved = 1;
     arrive(problem, loss, exact, exact || most_steps > 0, here);
     for (int number = 0; number < most_steps; number++) {
-        double H[5][5], gradient[5], step[5], length = 0;
-        sum_up(problem->m, &here->left, exact, limits.curved, H, gradient);
-        if (!damped_step(H, gradient, damping, step))
+        double step[5], length = 0;
+        if (has_moved)
+            sum_up(problem->m, &here->left, exact, limits.curved, H, gradient);
+        if (!damped_step((const double (*)[5])H, gradient, damping, step))
             break;
         for (int i = 0; i < 5; i++)
             length += step[i] * step[i];
         const int is_small = sqrt(length) < limits.step;
         move(&here->pose, (const double (*)[3])here->tangents, step, &there->pose);
         arrive(problem, loss, exact, exact || number + 1 < most_steps, there);
-        if (there->cost < here->cost) {
+        has_moved = there->cost < here->cost;
+        if (has_moved) {
             swap(here, there);
             damping = fmax(damping / 10, 1e-9);
             if (is_small || there->cost - here->cost < limits.gain * fabs(here->cost))

@@ -262,8 +262,8 @@ def _unlike(poses: Sequence[Pose], solution: Solution, information: Array, bound
 
     information: (5, 5) in the parameters of the solution, by which squared distances are taken.
     """
-    off = differences(solution.R, solution.t, np.stack([pose.R for pose in poses]),
-                      np.stack([pose.t for pose in poses]))
+    off = differences(solution.R, solution.t, np.array([pose.R for pose in poses]),
+                      np.array([pose.t for pose in poses]))
     kept: list[int] = []
     for number in range(len(poses)):
         if (_squared(off[kept] - off[number], information) > bound).all():

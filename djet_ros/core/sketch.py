@@ -93,7 +93,7 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     Each is judged by itself and never ends above the cost of its start; held: a rotation that
     all are drawn to.
     """
-    R, t = np.stack([start.R for start in starts]), np.stack([start.t for start in starts])
+    R, t = np.array([start.R for start in starts]), np.array([start.t for start in starts])
     if compiled.library is not None and held is None:
         return Sketch(*compiled.refine_all(problem.matches, loss.numbers, steps,
                                            DAMPING_AT_FIRST, R, t))
