@@ -309,6 +309,7 @@ class _Algorithm:
         for number in range(1, most + 1):
             # Step 1: update the local residuals around the keypoints and fit A', b, c.
             fits = self._fits(by_places)
+            # Places by themselves have one, and nothing is left over there.
             paraboloids, no_minimum = ((fits, 0) if by_places
                                        else with_minimum(fits, self._config.indefinite))
             # Match culling: a keypoint without a surface is out, and keeps its last loss.
