@@ -307,6 +307,22 @@ def test_keyframes_of_a_live_map_are_without_the_residual_distortion(live):
     assert np.array_equal(slam._frame(START).gray, undone)
 
 
+def test_an_image_that_waits_is_seen_by_the_camera_that_took_it(live):
+    """Whoever zooms in says so before the odometry of the last image has come."""
+    slam = live(FEW_FEATURES, message_type, 'image_rect')
+    early, wide, near = START - PERIOD, START, START + PERIOD
+    slam.image(image(Cards().gray(REST), stamp_ns=early))
+    slam.camera_info(camera_info(K, SIZE))
+    slam.image(image(Cards().gray(REST), stamp_ns=wide))
+    zoomed = K * [[2.0], [2.0], [1.0]]
+    slam.camera_info(camera_info(zoomed, SIZE))
+    slam.image(image(Cards().gray(REST), stamp_ns=near))
+    assert np.array_equal(slam._frame(wide).K, K)
+    assert np.array_equal(slam._frame(near).K, zoomed)
+    # One from before any CameraInfo has the one that there is.
+    assert np.array_equal(slam._frame(early).K, zoomed)
+
+
 def test_keyframes_of_a_live_map_have_the_masks_of_their_images(live):
     """One for all images, and one by its stamp."""
     still = np.zeros(SIZE[::-1], bool)

@@ -65,7 +65,8 @@ class LiveSlam:
         self.mounted = not config.odometry.base_frame
         self._info: Any = None
         self._camera: Camera | None = None
-        self._images: OrderedDict[int, Any] = OrderedDict()
+        # Each with the camera that took it; None where no CameraInfo had come yet.
+        self._images: OrderedDict[int, tuple[Any, Camera | None]] = OrderedDict()
         self._masks = Masks(still_mask)
         self.reset()
 
@@ -101,7 +102,7 @@ class LiveSlam:
         if not self._images:
             return 'no image has come that tells the frame of the camera'
         config = self.config.odometry
-        newest = next(reversed(self._images.values()))
+        newest, _ = next(reversed(self._images.values()))
         camera, axes = mounted_frame(config, newest.header.frame_id)
         found = transform(config.base_frame, camera)
         if found is None:
@@ -113,7 +114,7 @@ class LiveSlam:
     # What comes in
 
     def camera_info(self, message: Any) -> None:
-        """Take a CameraInfo; it holds for the images that become keyframes from now on."""
+        """Take a CameraInfo; it holds for the images that come from now on."""
         if self._info is None or not same_camera(self._info, message):
             self._info = message
             try:
@@ -127,7 +128,7 @@ class LiveSlam:
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage; it waits for the odometry of its stamp."""
         stamp = stamp_ns(message.header)
-        self._images[stamp] = message
+        self._images[stamp] = message, self._camera
         self._images.move_to_end(stamp)
         if len(self._images) > self.slam.image_buffer:
             self._images.popitem(last=False)
@@ -244,13 +245,15 @@ class LiveSlam:
 
     def _frame(self, stamp: int) -> Frame | None:
         """Frame of the image with a stamp, which waits no longer; None where none is to be had."""
-        message = self._images.pop(stamp, None)
-        if message is None or self._camera is None:
+        message, camera = self._images.pop(stamp, (None, None))
+        # The first CameraInfo may come after its image, which the odometry had with it.
+        camera = camera or self._camera
+        if message is None or camera is None:
             return None
         try:
             raw = gray_image(message, self.config.odometry.gray_limits())
-            return Frame(self._camera.undistort(raw), self._camera.K, stamp,
-                         message.header.frame_id, self._masks.of(stamp, raw.shape, self._camera))
+            return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
+                         self._masks.of(stamp, raw.shape, camera))
         except BadMessage as problem:
             self._reject('image', problem)
             return None
