@@ -151,6 +151,23 @@ def test_a_gyro_at_the_end_of_its_range_tells_no_turn() -> None:
     assert gyro.turn(0, PERIOD) is not None
 
 
+def test_late_samples_neither_hide_nor_feign_the_end_of_a_gyro_s_range() -> None:
+    """A bus delivers some samples after later ones."""
+    fast, slow, ms = np.array([0, 0, 9.0]), np.array([0, 0, 8.0]), 1_000_000
+    at_its_end = mounted()
+    for stamp in (0, 10, 20, 30, 40, 50, 35, 60, 70):
+        at_its_end.add(stamp * ms, fast)
+    for start, end in ((25, 38), (32, 34), (41, 58), (52, 59)):
+        assert at_its_end.turn(start * ms, end * ms) is None
+    # Equal to the newest sample, but not to those around it.
+    turning = mounted()
+    for stamp, rate in ((0, slow), (10, slow * 1.01), (20, fast), (30, fast), (15, fast),
+                        (40, slow), (50, slow * 1.01)):
+        turning.add(stamp * ms, rate)
+    assert turning.refused == {'out of order': 1}
+    assert turning.turn(12 * ms, 48 * ms) is not None
+
+
 def test_a_bag_that_begins_again_begins_the_samples_again_but_not_the_bias() -> None:
     gyro = constant(np.array([0, 0, 0.1]), seconds=2.0)
     gyro.learn(0, SECOND, np.eye(3), np.eye(3) * 1e-8)

@@ -118,9 +118,11 @@ class Gyro:
         if stamp_ns in self._rates:
             self.refused['equal stamp'] += 1
             return
-        self._note_saturation(stamp_ns, rate)
         if self._rates and stamp_ns < self._rates.stamps[-1]:
-            self.refused['out of order'] += 1  # and of use all the same
+            # Of use all the same; what its neighbours say of the range of the gyro is known.
+            self.refused['out of order'] += 1
+        else:
+            self._note_saturation(stamp_ns, rate)
         self._rates.add(stamp_ns, rate)
 
     def forget_before(self, stamp_ns: int) -> None:
@@ -222,7 +224,11 @@ class Gyro:
         return _integrate(times, knots, rates)
 
     def _note_saturation(self, stamp_ns: int, rate: Array) -> None:
-        """Take values that stay the same at a high rate for the end of the gyro's range."""
+        """
+        Take values that stay the same at a high rate for the end of the gyro's range.
+
+        Of the newest sample, so that stamps of these stay sorted.
+        """
         before = self._rates[self._rates.stamps[-1]] if self._rates else np.zeros(3)
         same = bool(((rate == before) & (np.abs(rate) > _FAST)).any())
         self._equal = self._equal + 1 if same else 0
