@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-
+from djet_ros.core import jet
 from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
 from djet_ros.core.jet import (
     core_scale,
@@ -283,6 +283,13 @@ def test_the_core_scale_is_that_of_the_right_matches_where_most_are_false():
     assert core_scale(np.concatenate([right, false])) == pytest.approx(0.1, rel=0.05)
     assert core_scale(right) == pytest.approx(0.1, rel=0.05)
     assert core_scale(np.full(30, 2.0)) == pytest.approx(robust_scale(np.full(30, 2.0)))
+
+
+@pytest.mark.parametrize('rounds', [1, 6, 7, 8, 9])
+def test_the_core_scale_of_exact_matches_is_zero_after_any_number_of_rounds(monkeypatch, rounds):
+    monkeypatch.setattr(jet, '_CORE_ROUNDS', rounds)
+    assert core_scale(np.zeros(10)) == 0.0
+    assert core_scale(np.append(np.zeros(10), [3.0, 5.0, 9.0])) == 0.0
 
 
 def test_matches_that_determine_nothing_leave_the_pose_finite():

@@ -290,7 +290,8 @@ def core_scale(residuals: Array) -> float:
     Give the standard deviation of the residuals that belong together, which may be few.
 
     The median tells it where most are right. Over wide baselines most matches are false, and far
-    from their epipolar lines; they are left out round by round.
+    from their epipolar lines; they are left out round by round. Where more than half of what is
+    left fits exactly it is 0.
     """
     # Of ordered ones, those that belong together come first.
     ordered = np.sort(np.abs(residuals))
@@ -298,7 +299,7 @@ def core_scale(residuals: Array) -> float:
     for _ in range(1 + _CORE_ROUNDS):
         scale = _NORMAL * middle_of(ordered, count) if count else 1.0
         before, count = count, int(ordered.searchsorted(_CORE * scale))
-        if count == before:
+        if count == before or not scale:
             break
     return scale
 
