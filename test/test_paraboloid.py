@@ -264,6 +264,18 @@ def test_projection_gives_every_surface_a_minimum_and_leaves_bowls_as_they_are()
     assert np.allclose(project_to_positive(saddle).A[0] @ up, 5 * up)
 
 
+def test_places_without_a_surface_have_no_say_in_how_surfaces_are_projected():
+    """Such as are out of the image, or hidden."""
+    rng = np.random.default_rng(14)
+    A = np.append(1e3 * bowls(rng, 20), np.tile(np.eye(2), (40, 1, 1)), 0)
+    A[:5] *= -1
+    before = Paraboloids(np.zeros((60, 2)), A, rng.normal(size=(60, 2)), np.zeros(60),
+                         np.arange(60) < 20)
+    seen = np.flatnonzero(before.usable)
+    assert np.array_equal(project_to_positive(before).A[seen],
+                          project_to_positive(before.of(seen)).A)
+
+
 def test_inverses_of_two_by_two_matrices_are_exact_and_those_of_singular_ones_finite():
     rng = np.random.default_rng(13)
     A = bowls(rng, 100)

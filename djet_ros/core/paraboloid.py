@@ -146,7 +146,8 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
     A = paraboloids.A
     mean = (A[:, 0, 0] + A[:, 1, 1]) / 2
     spread = np.hypot((A[:, 0, 0] - A[:, 1, 1]) / 2, A[:, 0, 1])
-    eigenvalues = np.concatenate([mean - spread, mean + spread])
+    # What stands where there is no surface has a curvature of its own.
+    eigenvalues = np.concatenate([mean - spread, mean + spread])[np.tile(paraboloids.usable, 2)]
     positive = eigenvalues[eigenvalues > 0]
     floor = _CURVATURE_FLOOR * (median(positive) if len(positive) else 1.0)
     low = np.flatnonzero(mean - spread < floor)
