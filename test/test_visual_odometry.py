@@ -16,7 +16,9 @@ from djet_ros.odometry.messages import twist
 from djet_ros.odometry.scale import (
     ConstantScale,
     GroundTruthScale,
+    GuessScale,
     Length,
+    Scale,
     scale_source,
     SpeedScale,
     UnitScale,
@@ -245,6 +247,49 @@ def test_a_step_back_in_time_begins_everything_anew(cards):
     assert np.array_equal(again.pose, np.eye(4))
     assert not again.pose_covariance.any()
     assert vo.process(cards.frame(1.1, STEP)).status is Status.OK
+
+
+def told_of(scale, stamp_ns, way):
+    """Tell a scale how far the camera is, or how fast that makes it."""
+    if isinstance(scale, SpeedScale):
+        scale.add_speed(stamp_ns, 4 * way)
+    else:
+        scale.guess.add(stamp_ns, pose(x=way))
+
+
+def by_guess():
+    scale = GuessScale()
+    scale.guess.mount(np.eye(4))
+    return scale
+
+
+@pytest.mark.parametrize('source', [SpeedScale, by_guess])
+def test_what_has_told_of_the_new_time_before_its_first_image_counts(cards, source):
+    """A bag that begins again brings its speeds with its images, or before them."""
+    scale = source()
+    vo, lengths = odometry(scale), []
+    for start in (100.0, 1.0):
+        for i in range(3):
+            frame = cards.frame(start + 0.1 * i, pose(x=0.25 * i))
+            told_of(scale, frame.stamp_ns, 0.25 * (1 + i))
+            result = vo.process(frame)
+            if i:
+                assert result.scale_kind is Scale.METRIC
+                lengths.append(result.scale)
+    assert lengths[:2] == pytest.approx(lengths[2:], rel=1e-6)
+
+
+@pytest.mark.parametrize('source', [SpeedScale, by_guess])
+def test_what_was_told_of_the_time_before_does_not_count_in_the_new_one(cards, source):
+    """A bag that is played anew from its middle; its speeds do not come this time."""
+    scale = source()
+    for i in range(30):
+        told_of(scale, i * 10**8, 0.25 * i)
+    vo = odometry(scale)
+    drive(vo, cards, [np.eye(4), STEP], start=2.8)
+    assert scale.between(2_800_000_000, 2_900_000_000).known
+    vo.process(cards.frame(1.0))
+    assert not scale.between(10**9, 1_100_000_000).known
 
 
 def test_a_gap_begins_a_new_reference_at_the_last_pose(cards):

@@ -35,6 +35,10 @@ class FrameGuess(Guess):
         super().reset()
         self._frames.reset()
 
+    def go_back(self, stamp_ns: int) -> None:
+        """Hear that time begins anew at a stamp; what came of the new time already stays."""
+        self._frames.go_back(stamp_ns)
+
     def covers(self, stamp_ns: int) -> bool:
         """Tell whether all that moves between the two is known at a stamp, or after it."""
         return self._frames.covers(self._still, self.camera, stamp_ns)

@@ -21,6 +21,10 @@ class Guess:
         """Forget all poses."""
         self._poses.reset()
 
+    def go_back(self, stamp_ns: int) -> None:
+        """Hear that time begins anew at a stamp; what came of the new time already stays."""
+        self._poses.go_back(stamp_ns)
+
     def mount(self, mounting: Array) -> None:
         """Take the camera (4, 4) in the frame whose poses come."""
         self.mounting = mounting

@@ -36,6 +36,11 @@ class MovingFrames:
         """Forget all that moves."""
         self._moving.clear()
 
+    def go_back(self, stamp_ns: int) -> None:
+        """Hear that time begins anew at a stamp; what came of the new time already stays."""
+        for link in self._moving.values():
+            link.poses.go_back(stamp_ns)
+
     def add(self, message: Any, *, static: bool) -> None:
         """Take a TFMessage of /tf or, static, of /tf_static."""
         if static:

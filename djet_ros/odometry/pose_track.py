@@ -26,6 +26,11 @@ class PoseTrack:
         """Forget all poses."""
         self._poses.clear()
 
+    def go_back(self, stamp_ns: int) -> None:
+        """Forget all poses unless the last ones are of the time that begins anew at a stamp."""
+        if self._poses.goes_back(stamp_ns):
+            self.reset()
+
     def add(self, stamp_ns: int, pose: Array) -> None:
         """Take a pose (4, 4); NaN ones are ignored, and so are those of a stamp that is known."""
         if not np.isfinite(pose).all() or stamp_ns in self._poses:

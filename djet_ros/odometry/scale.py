@@ -153,6 +153,15 @@ class ScaleSource(Protocol):
         """Forget what was measured."""
         return
 
+    def go_back(self, stamp_ns: int) -> None:
+        """
+        Hear that time begins anew with the image of a stamp.
+
+        What was measured before that time did is forgotten; what comes on a topic of its own may
+        have told of the new time already, and that stays.
+        """
+        self.reset()
+
 
 class UnitScale(ScaleSource):
     """Every translation has length one, and nothing is known."""
@@ -236,6 +245,11 @@ class SpeedScale(ScaleSource):
     def reset(self) -> None:
         """Forget all speeds."""
         self._speeds = Stamped[float](_KEPT_SPEEDS)
+
+    def go_back(self, stamp_ns: int) -> None:
+        """Forget the speeds unless the last ones are of the new time: then all of them are."""
+        if self._speeds.goes_back(stamp_ns):
+            self.reset()
 
 
 class CameraHeightScale(ScaleSource):
@@ -374,6 +388,10 @@ class GuessScale(ScaleSource):
     def reset(self) -> None:
         """Forget all poses."""
         self.guess.reset()
+
+    def go_back(self, stamp_ns: int) -> None:
+        """Forget the poses, but not those of the new time."""
+        self.guess.go_back(stamp_ns)
 
 
 class GroundTruthScale(ScaleSource):

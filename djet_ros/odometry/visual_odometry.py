@@ -363,7 +363,8 @@ class VisualOdometry:
                backwards: bool) -> OdometryResult:
         """Begin a new reference: from nothing, or at the last pose with its motion unknown."""
         if backwards:
-            self.reset()
+            self._scale.go_back(frame.stamp_ns)
+            self._begin()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
             motion, covariance = self._carried(frame)
