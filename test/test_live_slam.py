@@ -203,7 +203,8 @@ def test_the_status_says_whether_a_length_is_known():
 @pytest.mark.parametrize('spoil', [
     lambda message: message.status.clear(), lambda message: message.status[0].values.clear(),
     lambda message: setattr(message.status[0].values[0], 'value', 'FINE'),
-    lambda message: setattr(message.status[0].values[1], 'value', 'long ago')])
+    lambda message: setattr(message.status[0].values[1], 'value', 'long ago'),
+    lambda message: setattr(message.status[0].values[-1], 'value', 'nan')])
 def test_a_status_of_another_kind_is_refused(spoil):
     odometry, steps = Odometry(), StepMessages('optical')
     status, _ = odometry.start()

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
 from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.self_calibration import SelfCalibration
-from djet_ros.core.types import Status
+from djet_ros.core.types import Status, TRACKED
 from djet_ros.lab.scenes import make_scene
-from djet_ros.odometry.tracker import Tracker
+from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.posegraph.step_messages import StepMessages
+from djet_ros.replay.graph_of_results import read_steps
+from djet_ros.replay.results import ResultsFolder
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -154,6 +159,27 @@ def test_images_of_a_turn_tell_what_the_calibration_leaves_and_that_is_said(
     assert 30 < first < 60
     with_it, without = (float(bent.off(some)[first:].mean()) for some in (results, unknowing))
     assert with_it < 0.8 * without
+
+
+def test_a_backend_hears_by_what_lens_each_image_was_seen(
+        told: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
+    """Live by messages, later by the results: loops are seen alike."""
+    _, results = told
+    lenses = [one.k1 for one in results]
+    assert not any(lenses[:30])
+    # What is certain of it.
+    assert 0 < lenses[-1] < 0.018
+    make, heard, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []
+    with ResultsFolder(tmp_path / 'results', Config()) as folder:
+        for number, one in enumerate(results):
+            folder.add_frame(number, one, 0.0)
+            live += [*heard.status(make.status(one)), *heard.odometry(make.odometry(one))]
+            if one.status in TRACKED:
+                message = make.relative_pose_cov(one)
+                folder.publish(Outgoing('relative_pose_cov', message), one.stamp_ns)
+                live += heard.relative_pose(message)
+    assert [step.k1 for step in live] == lenses
+    assert [step.k1 for step in read_steps(tmp_path / 'results')] == lenses
 
 
 def test_a_distortion_that_was_found_is_that_of_one_camera(bent: Bent) -> None:

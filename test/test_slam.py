@@ -14,7 +14,8 @@ import cv2
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rotation_exp, unit
+from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
+from djet_ros.core.radial import straight_image
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
@@ -315,6 +316,34 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
         assert (edge.source, edge.target) == (other.source, other.target)
         assert np.array_equal(edge.motion, other.motion)
         assert np.array_equal(edge.covariance, other.covariance)
+
+
+def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
+    """What landmarks have found of it by the end, they did not know at the beginning."""
+    cards, k1 = Cards(), 0.06
+    poses = [pose(x=0.5 * i, yaw=0.03 * i) for i in (*range(4), *range(2, -1, -1))]
+    poses = [here @ pose(z=0.2 * (i > 3)) for i, here in enumerate(poses)]
+    edges = chain(np.array(poses)).edges
+
+    def off(bends, known):
+        """Degrees and metres that loops of the way back are off, in the root mean square."""
+        finder, errors = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
+        for i, here in enumerate(poses):
+            frame = cards.frame(1 + 0.1 * i, here, noise=i)
+            seen = straight_image(frame.gray, K, 0.0, before=k1)[0] if bends else frame.gray
+            finder.add(replace(frame, gray=seen), edges[i - 1] if i else None,
+                       k1 if known and i > 3 else 0.0)
+            for loop in finder.loops(i) if i > 3 else ():
+                true = np.linalg.inv(poses[i]) @ poses[loop.target]
+                assert loop.scale_known
+                errors.append([np.degrees(rotation_angle(loop.motion[:3, :3], true[:3, :3])),
+                               np.linalg.norm(loop.motion[:3, 3] - true[:3, 3])])
+        assert len(errors) > 3
+        return np.sqrt(np.mean(np.square(errors), axis=0))
+
+    straight, unknown, known = off(False, False), off(True, False), off(True, True)
+    assert (known < 2 * straight).all()
+    assert (known < unknown / 10).all()
 
 
 def test_no_loop_is_sought_between_images_of_two_sizes():

@@ -244,6 +244,14 @@ class MessageFactory:
         return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
 
 
+def k1_of(word: str | None) -> float:
+    """Read a radial distortion, none where an older odometry wrote; ValueError for no number."""
+    k1 = float(word or 0.0)
+    if not np.isfinite(k1):
+        raise ValueError(f'k1 is {word}')
+    return k1
+
+
 class FrameStatus(NamedTuple):
     """
     What a backend has to know of a frame beside its poses: see ``Messages.status``.
@@ -251,7 +259,7 @@ class FrameStatus(NamedTuple):
     reference_ns: stamp of the frame that it was related to, or None; scale: what the length of
     the translation is in; stationary: whether the camera stood still, so that the next frame
     is related to the same reference; keyframe: whether the odometry took the frame for a keyframe,
-    None where it takes none or does not say.
+    None where it takes none or does not say; k1: radial distortion without which it saw the frame.
     """
 
     stamp_ns: int
@@ -260,6 +268,7 @@ class FrameStatus(NamedTuple):
     scale: Scale
     stationary: bool
     keyframe: bool | None = None
+    k1: float = 0.0
 
 
 def frame_status(message: Any) -> FrameStatus:
@@ -270,7 +279,7 @@ def frame_status(message: Any) -> FrameStatus:
         reference = values['reference_stamp_ns']
         return FrameStatus(stamp, Status(values['status']), int(reference) if reference else None,
                            Scale(values['length']), values['stationary'] == 'true',
-                           IS_KEYFRAME[values.get('keyframe', '')])
+                           IS_KEYFRAME[values.get('keyframe', '')], k1_of(values.get('k1')))
     except (IndexError, KeyError, ValueError) as error:
         raise DjetError(f'the status of {stamp} ns lacks something: {error}') from None
 
@@ -310,8 +319,9 @@ class Messages(MessageFactory):
         One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
         frame that the relative poses of the same stamp start from, empty where there is none;
         'length' is metric, relative (to the first step of the track) or unknown; 'stationary' is
-        true or false, and so is 'keyframe', or empty where none are chosen. Level OK: there is a
-        relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
+        true or false, and so is 'keyframe', or empty where none are chosen; 'k1' is the radial
+        distortion that landmarks had shown, without which the image was seen. Level OK: there is
+        a relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
         """
         tracked = result.status in TRACKED
         level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
@@ -322,7 +332,8 @@ class Messages(MessageFactory):
                 'reference_stamp_ns': str(result.previous_stamp_ns) if tracked else '',
                 'length': (result.scale_kind if tracked else Scale.UNKNOWN).value,
                 'stationary': str(result.stationary).lower(),
-                'keyframe': KEYFRAME_WORDS[result.keyframe]}, result.frame_id, frame)
+                'keyframe': KEYFRAME_WORDS[result.keyframe],
+                'k1': repr(float(result.k1))}, result.frame_id, frame)
 
     def odometry(self, result: OdometryResult) -> Any:
         """

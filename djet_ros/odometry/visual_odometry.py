@@ -71,6 +71,8 @@ class OdometryResult:
     keyframe: whether the frame is a keyframe of the window that carries the scale; None where
     there is no window, or the motion to the frame is not known.
 
+    k1: radial distortion that landmarks had shown by then, without which the images were seen.
+
     common: of the length, what of its error other steps have too. It is in pose_covariance, from
     the first frame on: also by how much a relative scale may have wandered since.
     """
@@ -93,6 +95,7 @@ class OdometryResult:
     measured: bool = True
     common: Common | None = None
     keyframe: bool | None = None
+    k1: float = 0.0
 
     @property
     def scale_kind(self) -> Scale:
@@ -377,7 +380,8 @@ class VisualOdometry:
         self._prior, self._bad_pairs = None, 0
         return OdometryResult(
             frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), self._pose,
-            UNKNOWN_MOTION, self._path.pose, 0.0, False, keyframe=self._one_scale.keyframe)
+            UNKNOWN_MOTION, self._path.pose, 0.0, False, keyframe=self._one_scale.keyframe,
+            k1=self._estimator.k1)
 
     def _carried(self, frame: Frame) -> tuple[Array, Array]:
         """Motion (4, 4) and covariance (6, 6) where the images tell none: the gyro's rotation."""
@@ -453,7 +457,7 @@ class VisualOdometry:
             frame.stamp_ns, frame.frame_id, status, self._reference.stamp_ns, relative, motion,
             pose, covariance, path.pose, length.value, length.known, stationary,
             self._since_ns, self._since_covariance, length.metric, length.measured, length.common,
-            keyframe)
+            keyframe, self._estimator.k1)
 
 
 def _not_turned(frame: Frame) -> tuple[int, Array, Array]:

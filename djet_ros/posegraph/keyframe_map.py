@@ -67,10 +67,15 @@ class KeyframeOffset(Motion):
 
 
 class _Unsought(NamedTuple):
-    """A keyframe whose loops have not been sought yet, and the edge from its neighbour."""
+    """
+    A keyframe whose loops have not been sought yet, and the edge from its neighbour.
+
+    k1: radial distortion without which the odometry saw it.
+    """
 
     frame: Frame
     before: Edge | None
+    k1: float
 
 
 class KeyframeMap:
@@ -181,7 +186,7 @@ class KeyframeMap:
         if before is not None:
             self._chain.append(before)
         self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose))
-        self._unsought.append(_Unsought(frame, before))
+        self._unsought.append(_Unsought(frame, before, step.k1))
         if self._max_keyframes is not None and len(self.keyframes) > self._max_keyframes:
             self._forget_oldest()
         return KeyframeOffset(number)
@@ -191,8 +196,8 @@ class KeyframeMap:
         if not self._unsought:
             return False
         number = self._sought
-        frame, before = self._unsought.popleft()
-        self._finder.add(frame, before)
+        frame, before, k1 = self._unsought.popleft()
+        self._finder.add(frame, before, k1)
         self._sought += 1
         self._finder.forget(min(self.first, self._sought))
         # Without a step before it a loop has no length, nor anything that bears it out: the next

@@ -13,6 +13,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.masks import blocked
+from djet_ros.core.radial import straight_image
 from djet_ros.core.types import Array, of_one_camera, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
@@ -52,6 +53,8 @@ class EdgeFinder:
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
         self._kept: MutableMapping[int, KeyframeImage] = {} if kept is None else kept
         self._stamps: list[int] = []
+        # The k1 without which each keyframe's features are.
+        self._lenses: list[float] = []
         self._places = PlaceIndex()
         # The neighbour before each keyframe: the motion to it has a length.
         self._before: dict[int, Edge] = {}
@@ -59,13 +62,20 @@ class EdgeFinder:
         # The newest keyframe that was asked, and its motion back to its neighbour.
         self._newest: tuple[int, RelativePose] | None = None
 
-    def add(self, frame: Frame, before: Edge | None = None) -> None:
-        """Take the next keyframe, later than all others, and the edge from its neighbour."""
+    def add(self, frame: Frame, before: Edge | None = None, k1: float = 0.0) -> None:
+        """
+        Take the next keyframe, later than all others, and the edge from its neighbour.
+
+        k1: radial distortion without which the odometry saw it.
+        """
         number = self._first + len(self._stamps)
-        mask = None if frame.left_out is None else blocked(frame.left_out)
-        features = self._near.features(frame.gray, mask)
+        gray, left_out = frame.gray, frame.left_out
+        if k1:
+            gray, left_out = straight_image(gray, frame.K, k1, left_out)
+        features = self._near.features(gray, None if left_out is None else blocked(left_out))
         self._kept[number] = KeyframeImage(frame, features)
         self._stamps.append(frame.stamp_ns)
+        self._lenses.append(k1)
         self._places.add(features)
         if before is not None and before.kind == 'odometry':
             self._before[number] = before
@@ -75,7 +85,7 @@ class EdgeFinder:
         for number in range(self._first, first):
             self._kept.pop(number, None)
             self._before.pop(number, None)
-        del self._stamps[:first - self._first]
+        del self._stamps[:first - self._first], self._lenses[:first - self._first]
         self._first = first
         self._places.forget(first)
 
@@ -95,7 +105,8 @@ class EdgeFinder:
                 yield from self._link(current, previous, float(np.linalg.norm(motion[:3, 3])))
 
     def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
-        relative = self._near.estimate(self._view(previous), self._view(current))
+        k1 = self._lens(current)
+        relative = self._near.estimate(self._view(previous, k1), self._view(current, k1))
         if relative.status is Status.OK and self._is_sure(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
@@ -115,7 +126,8 @@ class EdgeFinder:
             yield from self._loop(current, place, units)
 
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
-        view, other = self._view(current), self._view(place)
+        k1 = self._lens(current)
+        view, other = self._view(current, k1), self._view(place, k1)
         if not of_one_camera(view, other):
             return
         relative = self._wide.estimate(view, other)
@@ -128,25 +140,26 @@ class EdgeFinder:
     def _stretch(self, current: int, place: int, loop: RelativePose,
                  length: Length) -> tuple[float, float] | None:
         """Compare the units at both ends of a loop, by points that the steps to both saw too."""
-        near, far = self._depths(current), self._depths(place)
+        k1 = self._lens(current)
+        near, far = self._depths(current, k1), self._depths(place, k1)
         if not length.known or near is None or far is None:
             return None
         return unit_change(*near, loop, length.value, *far, self._kept[current].frame.K)
 
-    def _depths(self, number: int) -> tuple[RelativePose, float] | None:
+    def _depths(self, number: int, k1: float) -> tuple[RelativePose, float] | None:
         """Motion from a keyframe back to its neighbour, and its length; None if not known."""
         step = self._before.get(number)
         if step is None or step.source not in self._kept or not step.scale_known:
             return None
-        back = self._back(number, step.source)
+        back = self._back(number, step.source, k1)
         length = float(np.linalg.norm(step.motion[:3, 3]))
         return (back, length) if back.status is Status.OK and length else None
 
-    def _back(self, number: int, neighbour: int) -> RelativePose:
+    def _back(self, number: int, neighbour: int, k1: float) -> RelativePose:
         """Estimate a keyframe's motion back to its neighbour; several loops may ask the newest."""
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
-        back = self._near.estimate(self._view(number), self._view(neighbour))
+        back = self._near.estimate(self._view(number, k1), self._view(neighbour, k1))
         if number == self._first + len(self._stamps) - 1:
             self._newest = number, back
         return back
@@ -160,7 +173,7 @@ class EdgeFinder:
         if relative.status is Status.NO_PARALLAX:
             # The same place again: nearer than any step, in whatever direction.
             return Length(guess, guess, True)
-        depths = self._depths(current)
+        depths = self._depths(current, self._lens(current))
         if depths is None:
             return unknown(guess)
         share = np.sqrt(_variance_along(step)) / guess
@@ -172,9 +185,22 @@ class EdgeFinder:
         return (inliers >= self._config.loop_inliers
                 and inliers >= self._config.loop_share * len(relative.x))
 
-    def _view(self, keyframe: int) -> View:
+    def _lens(self, keyframe: int) -> float:
+        return self._lenses[keyframe - self._first]
+
+    def _view(self, keyframe: int, k1: float) -> View:
+        """
+        Give the view of a keyframe without a radial distortion, as the newest of a loop has it.
+
+        All of a loop are seen through one lens so: what is found of it later is true of before.
+        Where nothing is known any more, the lens may be another one, and each keeps its own.
+        """
+        own = self._lens(keyframe)
+        k1 = k1 or own
         frame, features = self._kept[keyframe]
-        return self._wide.view(frame.gray, frame.K, features, frame.left_out)
+        estimator = TwoViewEstimator(self._wide.config, k1) if k1 else self._wide
+        return estimator.view(frame.gray, frame.K, features if k1 == own else None,
+                              frame.left_out)
 
 
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,

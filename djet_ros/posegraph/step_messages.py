@@ -109,7 +109,7 @@ class StepMessages:
         here = _of_camera(pose, self._mounting)
         if said.status in STARTED:
             return [Step(said.stamp_ns, said.status, here, odom_frame=frame,
-                         keyframe=said.keyframe)]
+                         keyframe=said.keyframe, k1=said.k1)]
         if said.status not in TRACKED:
             return []
         expected = self._base_frame or parts.relative.header.frame_id
@@ -124,7 +124,7 @@ class StepMessages:
         step = Step(said.stamp_ns, said.status, here, said.reference_ns,
                     _of_camera(motion, self._axes), rotated(self._axes[:3, :3].T, covariance),
                     said.scale is not Scale.UNKNOWN, frame, said.scale is Scale.METRIC,
-                    said.keyframe)
+                    said.keyframe, said.k1)
         if step.tracked:
             step.check(f'odometry edge to {said.stamp_ns} ns')
         return [step]

@@ -21,7 +21,8 @@ class Step(Motion):
     previous_stamp_ns: of the frame that it was related to, or None; motion (4, 4), covariance
     (6, 6): from there to here, where that is known; odom_frame: name of the odometry's frame,
     where messages say it; metric: whether a known length is in metres; keyframe: whether the
-    odometry took the frame for a keyframe, None where it takes none or that is not known.
+    odometry took the frame for a keyframe, None where it takes none or that is not known; k1:
+    radial distortion that its landmarks had shown, without which it saw the frame.
     """
 
     stamp_ns: int
@@ -34,6 +35,7 @@ class Step(Motion):
     odom_frame: str = ''
     metric: bool = True
     keyframe: bool | None = None
+    k1: float = 0.0
 
     @property
     def tracked(self) -> bool:

@@ -13,7 +13,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import IS_KEYFRAME, OPTICAL_TO_BODY, pose_of
+from djet_ros.odometry.messages import IS_KEYFRAME, k1_of, OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.posegraph.pose_graph import PoseGraph
@@ -73,6 +73,7 @@ class _Row(NamedTuple):
     previous_stamp_ns: int | None
     scale: Scale
     keyframe: bool | None
+    k1: float
 
 
 def _rows(path: Path) -> list[_Row]:
@@ -86,7 +87,7 @@ def _rows(path: Path) -> list[_Row]:
             rows.append(_Row(int(row['stamp_ns']), Status(row['status']),
                              int(previous) if previous else None,
                              Scale(row['scale_kind'] or Scale.UNKNOWN),
-                             IS_KEYFRAME[row.get('keyframe') or '']))
+                             IS_KEYFRAME[row.get('keyframe') or ''], k1_of(row.get('k1'))))
         except (KeyError, TypeError, ValueError) as error:
             raise DjetError(f'{path} line {number} is no row of a replay: {error}') from error
     return rows
@@ -124,7 +125,7 @@ def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array
                                 'missing from the bag; replay the recording once more')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
                        *motions[row.stamp_ns], row.scale is not Scale.UNKNOWN,
-                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe)
+                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe, k1=row.k1)
         elif row.status in STARTED or row.stamp_ns in references:
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       keyframe=row.keyframe)
+                       keyframe=row.keyframe, k1=row.k1)

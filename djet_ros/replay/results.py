@@ -51,7 +51,7 @@ UNFINISHED = {'complete': False, 'error': 'the run did not come to its end'}
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
-           'keyframe', 'ms')
+           'keyframe', 'k1', 'ms')
 
 
 class ResultsFolder(Closing):
@@ -111,7 +111,8 @@ class ResultsFolder(Closing):
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
-                   KEYFRAME_WORDS[result.keyframe], f'{1e3 * seconds:.2f}'))
+                   KEYFRAME_WORDS[result.keyframe], repr(float(result.k1)),
+                   f'{1e3 * seconds:.2f}'))
 
     def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
         """Write that an image was dropped or rejected, and why."""
@@ -183,7 +184,7 @@ class ResultsFolder(Closing):
 def _details(result: OdometryResult) -> tuple[Any, ...]:
     relative = result.relative
     if relative is None:
-        return ('',) * (len(COLUMNS) - 6)
+        return ('',) * (len(COLUMNS) - 7)
     residuals = np.abs(relative.residuals[relative.inliers])
     hamming = relative.hamming[np.isfinite(relative.hamming)]
     return (result.previous_stamp_ns, len(relative.x), int(relative.inliers.sum()),
