@@ -146,6 +146,8 @@ class RelativePose:
     TOO_FEW_INLIERS, where no more matches agree than false ones might. covariance_5: (5, 5) over
     (rotation vector in rad, two coordinates of t in the basis ``sphere_tangents(t)``);
     covariance_6: (6, 6) over (rotation vector, t), of rank 5 because the length of t is fixed.
+    Where t is zeros only the rotation's (3, 3) of either tells anything: the rest is of the
+    direction that was fitted first, which is not told.
 
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
     the place of y after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,)
@@ -153,7 +155,8 @@ class RelativePose:
     where gray levels have y, seen through the pose and the depths, or y itself;
     placed_covariances: (N, 2, 2) of these in square pixels, up to a common factor (see
     `core.patches`), all alike where gray levels were not asked;
-    residuals: (N,) signed distances in pixels of y to its epipolar line;
+    residuals: (N,) signed distances in pixels of y to its epipolar line, for which the t that was
+    fitted first stands in where t is zeros;
     hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
     losses: (N,) each match's loss on its surface, the last known one where it was culled;
     culled: how many matches had no surface in the end; indefinite: how many surfaces had no
