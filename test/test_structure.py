@@ -5,9 +5,10 @@ from types import SimpleNamespace
 
 from cards import Cards, DEPTHS, pose
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.covariance import lift
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rotation_exp
+from djet_ros.core.geometry import rotation_exp, sphere_tangents
 from djet_ros.core.landmark_choice import around_patches, PATCH
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
@@ -489,6 +490,27 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     assert step.length.value == pytest.approx(usual)
     assert step.length.sigma >= 0.99 * usual
     assert np.exp(scale._log) == pytest.approx(usual)
+
+
+def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariances_are_theirs():
+    ahead, aside = np.array([0, 0, -1.0]), np.array([0.5, 0, 0])
+    sure = np.diag([1, 2, 3, 4, 5, 6]) * 1e-6
+    added = [Addition(np.eye(3), t, float(np.linalg.norm(t)), 1e-3, sure, np.eye(4))
+             for t in (ahead, aside)]
+    scale = OneScale()
+    scale.configure(ESTIMATOR, Unmeasured(), 0.0)
+    scale._window = SimpleNamespace(
+        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
+        add=lambda view, relative, guess: added.pop(0))
+    known = {'covariance_5': np.eye(5), 'covariance_6': np.eye(6)}
+    scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
+    pair = scale.of_step((10**8, 2 * 10**8), None,
+                         RelativePose(Status.NO_PARALLAX, **known)).relative
+    assert np.allclose(pair.t, [1, 0, 0])
+    # Radians of a direction aside, by what half a unit is off along the other axes.
+    assert np.allclose(pair.covariance_6, np.diag([1, 2, 3, 0, 20, 24]) * 1e-6)
+    basis = lift(sphere_tangents(pair.t))
+    assert np.allclose(basis @ pair.covariance_5 @ basis.T, pair.covariance_6)
 
 
 class Ground(ScaleSource):

@@ -12,7 +12,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+from djet_ros.core.covariance import lift
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import sphere_tangents
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, View
 from djet_ros.core.window import Addition, Window
@@ -367,11 +369,14 @@ def _as_landmarks_tell(relative: RelativePose, addition: Addition, usual: float)
     """
     Give a pair without parallax the motion of the window, where that is surer than none.
 
-    usual: length of a step, which is how unsure no translation would be.
+    usual: length of a step, which is how unsure no translation would be. Its status stays, which
+    is that of the two images.
     """
     if np.linalg.eigvalsh(addition.covariance[3:, 3:])[-1] > usual**2:
         return relative
     to_unit = np.diag(np.repeat([1.0, 1 / addition.length], 3))
     to_unit[3:, 3:] -= np.outer(addition.t, addition.t) / addition.length**3
-    return replace(relative, R=addition.R, t=addition.t / addition.length,
-                   covariance_6=to_unit @ addition.covariance @ to_unit)
+    t, covariance = addition.t / addition.length, to_unit @ addition.covariance @ to_unit
+    basis = lift(sphere_tangents(t))
+    return replace(relative, R=addition.R, t=t, covariance_5=basis.T @ covariance @ basis,
+                   covariance_6=covariance)
