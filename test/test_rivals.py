@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import cv2
 from djet_ros.core.basins import lowest_around
@@ -12,15 +13,23 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import jet_problem, Loss, minimise
 from djet_ros.core.pair import Pair
-from djet_ros.core.rivals import apart, false_alarms, goes_on, lie_on_a_plane, preferences
+from djet_ros.core.rivals import (
+    apart,
+    false_alarms,
+    goes_on,
+    lie_on_a_plane,
+    preferences,
+    Rival,
+)
 from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import all_round
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.core.verdict import _judged
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 from two_view import (
     FORWARD,
     K,
@@ -305,6 +314,24 @@ def test_a_covariance_that_spans_a_pose_is_that_of_errors_where_it_may_be_true()
     errors = rng.multivariate_normal(np.zeros(5), A @ A.T, 200_000)
     errors[rng.random(len(errors)) < 1 / 9] += off
     assert np.allclose(errors.T @ errors / len(errors), five, atol=0.03 * np.abs(five).max())
+
+
+@pytest.mark.parametrize(('preference', 'two_bodies', 'spanned'), [
+    (2.4, False, True), (4.5, False, True), (4.8, False, False), (8.0, False, False),
+    (4.8, True, True)])
+def test_a_motion_far_off_that_is_true_of_less_than_one_pair_of_a_hundred_blurs_none_of_them(
+        preference: float, two_bodies: bool, spanned: bool) -> None:
+    seen = two_views(np.random.default_rng(7), count=100)
+    around, aside = np.cross(seen.t, (0, 0, 1)), np.radians(60)
+    rival = Rival(Pose(seen.R, rotation_exp(aside * unit(around)) @ seen.t), preference)
+    track = SimpleNamespace(rivals=(rival,), beside=(), guess=two_bodies)
+    own = np.radians(0.2)**2 * np.eye(5), np.zeros((6, 6))
+    _, (covariance, _) = _judged(Pose(seen.R, seen.t), own, track, seen.x, None, other_way=False)
+    claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
+    # As far as it is off, as often as it is the true one; else what is known of the pose alone.
+    probable = norm.cdf(-preference / 2) if spanned else 0.0
+    assert claimed == pytest.approx(np.hypot(
+        0.2 * np.sqrt(2), np.degrees(np.sqrt(probable) * np.sin(aside))), rel=0.01)
 
 
 def test_only_what_is_like_the_motion_before_goes_on() -> None:
