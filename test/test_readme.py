@@ -13,8 +13,12 @@ import subprocess
 import sys
 from typing import Any
 
+import djet_ros
 from djet_ros.cli.main import main
+from djet_ros.core.geometry import direction_angle, rotation_angle
 from djet_ros.core.matching import RIGID
+from djet_ros.lab.scenes import make_scene
+import numpy as np
 import pytest
 from test_layers import ORDER
 import yaml
@@ -43,6 +47,28 @@ def exists(test: str) -> bool:
 
 def test_the_readme_fits_in_the_hand():
     assert len((ROOT / 'README.md').read_bytes()) <= 8000
+
+
+def test_the_lines_of_python_in_the_readme_give_the_motion_between_two_images(capsys):
+    code, = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
+    scene = make_scene('road', 0, (620, 188))
+    poses = scene.trajectory(2)
+    names = {'K': scene.K, 'one': scene.render(poses[0], 0), 'other': scene.render(poses[1], 1)}
+    exec(code, names)
+    assert capsys.readouterr().out.startswith('OK [[')
+    pair, true = names['pair'], np.linalg.inv(poses[1]) @ poses[0]
+    assert pair.status is djet_ros.Status.OK
+    assert np.degrees(rotation_angle(pair.R, true[:3, :3])) < 0.1
+    assert np.degrees(direction_angle(pair.t, true[:3, 3])) < 1
+
+
+def test_what_the_package_gives_is_imported_where_it_is_asked_for():
+    subprocess.run([sys.executable, '-c', 'import sys, djet_ros\n'
+                    'assert not {"numpy", "cv2", "scipy"} & set(sys.modules)\n'
+                    'from djet_ros import preset, Status, TwoViewEstimator\n'
+                    'TwoViewEstimator(preset("fast"))\n'
+                    'assert "matplotlib" not in sys.modules\n'
+                    'assert not hasattr(djet_ros, "Statues")'], check=True)
 
 
 def test_the_pages_show_what_the_data_give(tmp_path):
