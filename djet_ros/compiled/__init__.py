@@ -2,8 +2,9 @@
 Inner loops of the core in C, where the package was built with a C compiler.
 
 The core does without: each has its like there in NumPy, which says what it does, and a test holds
-both together. They are the same to rounding. Arguments are of the shapes that are told, of any
-layout. `library` is None where there is none, and where the environment says ``DJET_COMPILED=0``.
+both together. They are the same to rounding. What goes in is of the shapes that are told, of any
+layout; what comes out is contiguous. `library` is None where there is none, and where the
+environment says ``DJET_COMPILED=0``.
 """
 
 from __future__ import annotations

@@ -338,11 +338,14 @@ def _alike(pulls: Array, products: Array, inverse: Array, by_itself: Array, size
     """
     Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
 
-    Residuals of pairs of matches are multiplied; as the pose follows what all have in common, too
-    little is left of that, by what its covariance and its own share make of the pulls.
-    The product over its weight falls with distance. How large it is, is told best by patches that
-    overlap; then by pairs farther and farther apart, whether there is more between these than that
-    lets expect.
+    Errors of matches i and j at a distance d are taken to have E[r_i r_j] = a f(d), with f as in
+    _FALLS. Of residuals less is left, as the pose follows what all have in common:
+
+        E[r_i r_j] = a f(d) - J_i^T C J_j - a J_i^T H^-1 (sum_kl f w_k J_k J_l^T w_l) H^-1 J_j,
+
+    with C the covariance of each by itself. How large a is, is told best by patches that overlap;
+    then by pairs farther and farther apart, whether there is more between these than that lets
+    expect.
 
     pulls, products: of cells of each side, from the smallest on, see `sums_of_cells`; inverse:
     (5, 5) that of H; noise: variance of a match, which bounds what is told.

@@ -148,10 +148,10 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     surface: on the matches of the pair. The cheapest of the refined `starts` goes on; of those
     that the matches do not decide between, each is led to its own end, and the one next to the
     motion before is taken where they are still undecided. Without any starts they are looked for
-    around the pose ahead, which is likely, and from which the keypoints were followed: exactly
-    enough for the first round to go by them alone. Where two bodies move, it is the camera's
-    motion, as far as that can be told. None where too few matches have a usable surface, or where
-    the pair is beyond its limits.
+    around the pose ahead, which is likely, and from which the keypoints were followed: accurately
+    enough that round one uses re-projection errors instead of surfaces. Where two bodies move, it
+    is the camera's motion, as far as that can be told. None where too few matches have a usable
+    surface, or where the pair is beyond its limits.
     """
     everything, turn = np.ones(len(pair.y), bool), pair.known.turn
     algorithm = _Algorithm(pair, surface, config, everything)
