@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from djet_ros import compiled
-from djet_ros.core.cells import beginnings, short
+from djet_ros.core.cells import by_cell, CELL, short
 from djet_ros.core.geometry import rotation_log, sphere_tangents
 from djet_ros.core.jet import (
     epipolar_residuals,
@@ -20,10 +20,6 @@ from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
-
-# Matches in one cell of this side (pixels) are taken to err together: corners are found in several
-# sizes, and neighbours share what is wrong with a surface (an occlusion edge, leaves).
-CELL = 32
 
 # Into so many cells the matches are cut too: none of these may hold all that is known either.
 LARGE_CELLS = 20
@@ -65,10 +61,6 @@ _LONG_TAILS = 1.5
 
 # chosen: no direction is taken to be told more than twenty times as badly as the curvature says.
 _LEAST_RISE = 0.05
-
-# Where cells are summed without a jackknife: over the ground, and in the length of a loop. It is
-# what the pose's was before patches were warped, and has not been measured anew.
-CAUTIOUS_INFLATION = 4.0
 
 # rad^2; a nanoradian, far below any noise: perfect data must not divide by nothing.
 _LEAST_VARIANCE = 1e-18
@@ -219,7 +211,7 @@ class _Cells:
 
     def in_larger(self, side: float) -> _Cells:
         """Give larger cells, each made of whole small ones; places are those of one of them."""
-        order, first = _by_cell(self.places, side)
+        order, first = by_cell(self.places, side)
         return _Cells(self.whole, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
 
@@ -454,18 +446,3 @@ def _along_curve(places: Array) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
     code = short(cells[:, 0] | cells[:, 1] << 1)
     order = np.argsort(code, kind='stable')
     return order, code[order].astype(np.uint64)
-
-
-def summed_by_cell(places: Array, values: Array) -> Array:
-    """Sum values (V, N) of matches at pixels (N, 2) over the C small cells in use, (V, C)."""
-    order, first = _by_cell(places, CELL)
-    return np.asarray(np.add.reduceat(values.take(order, axis=1), first, axis=1))
-
-
-def _by_cell(places: Array, side: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Give the order of points (N, 2) by cells of a side, and where each cell begins in that."""
-    columns, rows = np.floor(places / side).astype(np.int64).T
-    columns, rows = columns - columns.min(initial=0), rows - rows.min(initial=0)
-    cell = short(columns * (rows.max(initial=0) + 1) + rows)
-    order = np.argsort(cell, kind='stable')
-    return order, beginnings(cell[order])

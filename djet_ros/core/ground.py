@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import math
 
 import cv2
-from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
+from djet_ros.core.cells import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.geometry import rays, rotation_exp, skew, sphere_tangents
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.types import Array, RelativePose, Status, View

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
-from djet_ros.core.covariance import summed_by_cell
+from djet_ros.core.cells import summed_by_cell
 from djet_ros.core.geometry import inverse_depths, sides
 from djet_ros.core.jet import JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from djet_ros.config.sections import SlamConfig
-from djet_ros.core.covariance import CAUTIOUS_INFLATION, CELL
+from djet_ros.core.cells import CAUTIOUS_INFLATION, CELL
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import inverse_depths, rays, unit
