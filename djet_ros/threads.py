@@ -12,7 +12,7 @@ VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 def one_blas_thread() -> None:
     """
-    Have NumPy's matrix library work in the calling thread, unless the environment says otherwise.
+    Have NumPy's matrix library work in the calling thread, unless its own variable says otherwise.
 
     The matrices of an odometry are small: on a busy machine further threads cost many times what
     they gain, because each product waits for the slowest of them.
