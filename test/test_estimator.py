@@ -48,6 +48,7 @@ from two_view import (
     project,
     SIDEWAYS,
     SIZE,
+    SKEWED,
     textured,
     TURN,
     two_views,
@@ -809,3 +810,15 @@ def test_a_camera_matrix_cut_out_of_a_larger_one_is_as_good_as_any():
     for robust in (False, True):
         whole, cut = (five_point(camera, seen.x, seen.y, 1.0, robust) for camera in (K, P[:, :3]))
         assert np.array_equal(whole[0].R, cut[0].R) and np.array_equal(whole[0].t, cut[0].t)
+
+
+@pytest.mark.parametrize('robust', [False, True])
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD])
+def test_pixels_that_are_aslant_start_as_exactly_as_any(robust, t):
+    """Plain RANSAC of OpenCV takes the axes of all sensors to be at right angles."""
+    for seed in range(5):
+        seen = two_views(np.random.default_rng(seed), t=t, K=SKEWED)
+        start, inliers = five_point(SKEWED, seen.x, seen.y, 1.0, robust)
+        assert inliers.all()
+        assert np.degrees(rotation_angle(start.R, seen.R)) < 0.01
+        assert np.degrees(direction_angle(start.t, seen.t)) < 0.1

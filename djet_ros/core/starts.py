@@ -35,6 +35,11 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
     x, y: (N, 2) pixels; threshold in pixels. `robust` takes MAGSAC++ instead of plain RANSAC.
     None where no essential matrix was found.
     """
+    if K[0, 1]:
+        # OpenCV's RANSAC knows of no skew: it gets pixels of the same camera without any.
+        upright = K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]
+        x, y = (rays(K, places) @ upright[:2].T for places in (x, y))
+        K = upright
     method = cv2.USAC_MAGSAC if robust else cv2.RANSAC
     E, mask = cv2.findEssentialMat(x, y, np.ascontiguousarray(K), method=method, prob=0.999,
                                    threshold=threshold)  # a view of a 3x4 matrix finds nothing
