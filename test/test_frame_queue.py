@@ -36,6 +36,20 @@ def test_what_comes_next_can_be_looked_at_and_stays():
     assert [queue.get(), queue.get()] == ['first', 'second']
 
 
+def test_who_looks_for_what_comes_next_waits_for_it_or_for_the_end():
+    queue, seen = FrameQueue('latest', 2), []
+    one = in_thread(lambda: seen.append(queue.peek(timeout=20)))
+    queue.put('first')
+    one.join(5)
+    assert seen == ['first']
+    queue.get()
+    one = in_thread(lambda: seen.append(queue.peek(timeout=20)))
+    queue.close()
+    one.join(5)
+    assert seen == ['first', None]
+    assert queue.peek(timeout=0.01) is None
+
+
 def test_every_loses_nothing_while_there_is_room():
     queue, got = FrameQueue('every', 3, room=2000), []
 

@@ -766,6 +766,16 @@ def test_stamps_that_go_back_are_said_with_where_poses_begin_again(tmp_path):
     assert np.array_equal(poses[3], np.eye(4))
 
 
+def test_an_image_stamped_ahead_leaves_no_trace_in_the_poses(tmp_path):
+    for name, messages in (('ahead', shifted({3}, 5)),
+                           ('without', drive(lambda i, message: None if i == 3 else message))):
+        djet('replay', record(tmp_path / name, messages), '--output', tmp_path / f'{name}_r')
+    poses = [(tmp_path / f'{name}_r' / 'trajectory_tum.txt').read_bytes()
+             for name in ('ahead', 'without')]
+    assert poses[0] == poses[1]
+    assert summary(tmp_path / 'ahead_r')['dropped'] == {'ahead': 1}
+
+
 def test_a_gap_over_which_the_motion_is_missing_is_said_with_its_length(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3, FRAMES), 5))
     said = djet('replay', path, '--output', tmp_path / 'r').stderr

@@ -147,6 +147,27 @@ def test_every_gives_the_poses_of_the_tracker_to_the_last_bit(live, drive):
     assert not one.tracker.counts.dropped
 
 
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_an_image_stamped_ahead_is_dropped_once_the_next_one_has_come(live, drive, policy):
+    one = live(**{'ros.queue_policy': policy})
+    for i, gray in enumerate(drive):
+        one.session.image(image(gray, stamp_ns=(i + 50 * (i == 6)) * PERIOD))
+        # a camera's time, also for an image that waits for the next one
+        sleep(0.02 if i == 6 else 0.2)
+    one.wait_for_images(len(drive))
+    assert one.tracker.counts.dropped == {'ahead': 1}
+    assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'OK': 10}
+
+
+def test_an_image_after_a_gap_is_worked_on_though_no_other_comes(live, drive, monkeypatch):
+    monkeypatch.setattr(sessions, '_NEXT_PATIENCE', 0.05)
+    one = live()
+    one.send(drive[:2])
+    one.send(drive[2:3], first=100)
+    one.wait_for_images(3)
+    assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'OK': 1, 'TIME_JUMP': 1}
+
+
 def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live, drive):
     one = live(**{'ros.queue_policy': 'latest'})
     one.graph.delay = 0.05
@@ -397,9 +418,9 @@ def test_a_new_beginning_is_explained_in_the_log(live, drive):
 def test_a_step_back_is_logged_though_a_gap_was_just_before(live, drive):
     one = live()
     one.send(drive[:3])
-    one.send(drive[3:4], first=100)
-    one.send(drive[4:6], first=4)
-    one.wait_for_images(6)
+    one.send(drive[3:5], first=100)
+    one.send(drive[5:7], first=4)
+    one.wait_for_images(7)
     gap, back = one.graph.lines
     assert 'it goes on at the last pose' in gap
     assert 'odom jumps to the origin' in back

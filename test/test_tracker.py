@@ -355,6 +355,33 @@ def test_a_late_image_is_dropped_and_counted_and_changes_no_pose(drive, late):
     assert np.array_equal(one.last.pose, undisturbed.last.pose)
 
 
+def in_a_row(one, stamped):
+    """Send pairs of an image and its seconds, each with the one after it."""
+    messages = [image(gray, stamp_ns=ns(seconds)) for gray, seconds in stamped]
+    for message, following in zip(messages, [*messages[1:], None]):
+        one.image(message, following)
+
+
+@pytest.mark.parametrize('ahead', [1.5, 5.0, 1e6])
+def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_goes_on(drive, ahead):
+    one, undisturbed = tracker(), tracker()
+    in_a_row(one, [(gray, 50 + 0.1 * i + (ahead if i == 6 else 0))
+                   for i, gray in enumerate(drive)])
+    in_a_row(undisturbed, [(gray, 50 + 0.1 * i) for i, gray in enumerate(drive) if i != 6])
+    assert one.counts.dropped == {'ahead': 1}
+    assert accounted(one.counts) == one.counts.received == 12
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 10}
+    assert np.array_equal(one.last.pose, undisturbed.last.pose)
+
+
+@pytest.mark.parametrize('then', [2.1, 4.1, -40.0])
+def test_after_a_gap_or_where_stamps_go_back_for_good_no_image_counts_as_ahead(drive, then):
+    one = tracker()
+    in_a_row(one, [(drive[0], 50.0), (drive[1], 50.1), (drive[2], 52.0), (drive[3], 50 + then)])
+    assert one.counts.dropped == {}
+    assert one.counts.processed == 4
+
+
 def test_stamps_that_went_back_a_little_and_stay_there_begin_anew(drive):
     one = tracker(**{'odometry.max_backwards': 3.0})
     play(one, drive[:3], start=50.0)

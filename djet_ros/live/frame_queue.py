@@ -64,9 +64,10 @@ class FrameQueue(Generic[Item]):
                 return None
             return self._pop()
 
-    def peek(self) -> Item | None:
-        """Give the oldest item without taking it; None where nothing waits."""
+    def peek(self, timeout: float = 0.0) -> Item | None:
+        """Give the oldest item without taking it; None where none comes in time, or if closed."""
         with self._changed:
+            self._changed.wait_for(lambda: self._items or self._closed, timeout)
             return self._items[0][0] if self._items else None
 
     @property

@@ -49,6 +49,9 @@ _PATIENCE = 0.1
 # With the queue policy 'every': from the last message beside the images, and this in all.
 _LONGEST_PATIENCE = 2.0
 
+# Seconds for which an image after a gap waits for the one after it, which tells a wrong stamp.
+_NEXT_PATIENCE = 1.0
+
 _LATENCIES = 100
 
 # States that somebody asked for, or that are logged with the names of topics.
@@ -343,6 +346,7 @@ class Session:
         try:
             while (received := self._queue.get()) is not None:
                 self._await_what_belongs_to(received)
+                self._await_the_next_if_it_leaps(received)
                 with self._turnstile:
                     pass
                 with self._lock:
@@ -363,9 +367,11 @@ class Session:
         if not tracker.mounted:
             self._mount(frame)
         self._mount_beside(frame)
-        if (following := self._queue.peek()) is not None:
-            tracker.expect(following.image)
-        self._publish(tracker.image(received.image))
+        waiting = self._queue.peek()
+        following = None if waiting is None else waiting.image
+        if following is not None:
+            tracker.expect(following)
+        self._publish(tracker.image(received.image, following))
         self._latencies.add(received.at)
         self._log_trouble()
         for topic, make in (('debug_image', tracker.debug_image),
@@ -390,6 +396,12 @@ class Session:
             if not lacking or left <= 0:
                 return
             self._came.wait(left)
+
+    def _await_the_next_if_it_leaps(self, received: _Received) -> None:
+        with self._lock:
+            leaps = self._tracker.leaps(received.image)
+        if leaps and received.at > self._forgotten:
+            self._queue.peek(timeout=_NEXT_PATIENCE)
 
     def _present(self, received: _Received) -> float:
         """Tell until when messages count for an image: what came later is for those that wait."""

@@ -220,8 +220,22 @@ class Tracker:
                 break
         return _seen(message, camera, self._limits, None)
 
-    def image(self, message: Any) -> list[Outgoing]:
-        """Take an Image or a CompressedImage, and give what comes of it."""
+    def leaps(self, image: Any) -> bool:
+        """
+        Tell whether an image comes after a gap, or has a wrong stamp: the one after it knows.
+
+        A face waits for that one, a live one for a moment.
+        """
+        newest = self._frame
+        return newest is not None and not self._paused and (
+            stamp_ns(image.header) - newest.stamp_ns > self.config.odometry.max_gap * 1e9)
+
+    def image(self, message: Any, following: Any = None) -> list[Outgoing]:
+        """
+        Take an Image or a CompressedImage, and give what comes of it.
+
+        following: the image after it, where that is known; it matters where this one leaps.
+        """
         self.counts.received += 1
         stamp = stamp_ns(message.header)
         if self._paused:
@@ -229,7 +243,9 @@ class Tracker:
             return self._diagnostics_if_due(stamp)
         if self._camera is None:
             return self._without_camera(stamp)
-        if self._frame is not None and (reason := self._out_of_order(stamp, self._frame)):
+        if self._frame is not None and (
+                reason := self._astray(message, following, self._frame)
+                or self._out_of_order(stamp, self._frame)):
             self._drop(reason, message.header.frame_id)
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
@@ -420,6 +436,13 @@ class Tracker:
         self._drop('waiting_for_camera_info')
         self._await()
         return self._diagnostics_if_due(stamp)
+
+    def _astray(self, image: Any, following: Any, newest: Frame) -> str:
+        """Why an image that leaps is of no use: ahead, where the next one goes on before it."""
+        if following is None or not self.leaps(image):
+            return ''
+        step = stamp_ns(following.header) - newest.stamp_ns
+        return 'ahead' if 0 < step <= self.config.odometry.max_gap * 1e9 else ''
 
     def _out_of_order(self, stamp: int, newest: Frame) -> str:
         """Why an image is of no use beside the newest one: equal_stamp, late, or nothing."""

@@ -174,12 +174,21 @@ class Replay:
             if first.topic == self._recording.info_topic:
                 self._info(self._waiting.popleft())
                 continue
-            if now_ns is not None and now_ns - first.stamp_ns < _PATIENCE_NS \
-                    and self._tracker.lacks(first.message):
+            following = self._after_the_first
+            if now_ns is not None and (
+                    (following is None and self._tracker.leaps(first.message))
+                    or (now_ns - first.stamp_ns < _PATIENCE_NS
+                        and self._tracker.lacks(first.message))):
                 break
-            self._image(self._waiting.popleft())
+            self._image(self._waiting.popleft(), following)
             done += 1
         return done
+
+    @property
+    def _after_the_first(self) -> Any:
+        """Give the second image that waits, if there is one."""
+        images = [one for one in self._waiting if one.topic == self._recording.image_topic]
+        return images[1].message if len(images) > 1 else None
 
     def _info(self, message: BagMessage) -> None:
         tracker = self._tracker
@@ -188,7 +197,7 @@ class Replay:
         if tracker.counts.rejected_infos.total() > rejected:
             self._log.first_problem = self._log.first_problem or str(tracker.problem)
 
-    def _image(self, message: BagMessage) -> None:
+    def _image(self, message: BagMessage, following: Any) -> None:
         tracker, log = self._tracker, self._log
         number, processed = tracker.counts.received, tracker.counts.processed
         rejected = tracker.counts.rejected.total()
@@ -201,7 +210,7 @@ class Replay:
         if self._following is not None:
             tracker.expect(self._following.message)
         started = perf_counter()
-        outgoing = tracker.image(message.message)
+        outgoing = tracker.image(message.message, following)
         seconds = perf_counter() - started
         if tracker.counts.processed > processed and tracker.last is not None:
             result = tracker.last
