@@ -121,7 +121,7 @@ def test_integers_are_taken_for_floats_and_floats_not_for_integers():
     ('odometry.max_gap', -1, 'between'),
     ('odometry.residual_k1', float('inf'), 'finite'),
     ('odometry.odom_frame', '', "^odometry.odom_frame is ''; name a frame"),
-    ('odometry.odom_frame', '/odom', 'without a slash'),
+    ('odometry.odom_frame', '/', 'name a frame'),
     ('odometry.residual_k1', -1001.0, 'between'),
     ('odometry.max_gap', None, 'of type float'),
     ('ros.publish_tf', 1, 'of type bool'),

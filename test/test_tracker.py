@@ -558,6 +558,27 @@ def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
     assert mended(one)[2] == {}
 
 
+@pytest.mark.parametrize('parameters, parent, child', [
+    ({}, 'odom', 'camera_frame'),
+    ({'odometry.odom_frame': '/left/odom', 'odometry.camera_frame': '/left/cam'},
+     'left/odom', 'left/cam'),
+    ({'odometry.base_frame': '/base_link'}, 'odom', 'base_link')])
+def test_names_of_frames_are_as_tf2_takes_them_whatever_is_before_them(
+        drive, parameters, parent, child):
+    one = tracker(**{'ros.publish_tf': True, **parameters})
+    asked = []
+    if not one.mounted:
+        one.mount(lambda *frames: asked.append(frames) or np.eye(4), 'camera_optical_frame')
+    for i, gray in enumerate(drive[:2]):
+        out = by_topic(one.image(image(gray, stamp_ns=ns(0.1 * i),
+                                       frame_id='/camera_optical_frame')))
+    there, = out['/tf'].transforms
+    assert (there.header.frame_id, there.child_frame_id) == (parent, child)
+    assert (out['odometry'].header.frame_id, out['odometry'].child_frame_id) == (parent, child)
+    assert not any(frame.startswith('/') for frames in asked for frame in frames)
+    assert mended(one) == ('OK', 'tracking', {})
+
+
 # Bad images
 
 def of_another_size():

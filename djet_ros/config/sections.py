@@ -11,6 +11,12 @@ from djet_ros.core.parameter import check, parameter
 NODE_NAME, GRAPH_NAME = 'vo_node', 'pose_graph_node'
 
 
+def _without_slashes(config: OdometryConfig | SlamConfig, *frames: str) -> None:
+    """Write names of frames as tf2 has them; those of ROS 1 have a slash in front."""
+    for frame in frames:
+        object.__setattr__(config, frame, getattr(config, frame).lstrip('/'))
+
+
 @dataclass(frozen=True)
 class OdometryConfig:
     """How pairs become a trajectory. Raises ValueError on a value outside its description."""
@@ -106,9 +112,9 @@ class OdometryConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""
         check(self)
-        if not self.odom_frame or self.odom_frame.startswith('/'):
-            raise ValueError(f"odom_frame is '{self.odom_frame:.80}'; name a frame, as tf does, "
-                             'without a slash before it')
+        _without_slashes(self, 'guess_frame', 'camera_frame', 'odom_frame', 'base_frame')
+        if not self.odom_frame:
+            raise ValueError("odom_frame is ''; name a frame")
         self.imu_quaternion()
         self.gray_limits()
 
@@ -199,6 +205,7 @@ class SlamConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their described range."""
         check(self)
+        _without_slashes(self, 'map_frame')
 
 
 @dataclass(frozen=True)

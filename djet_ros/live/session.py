@@ -20,7 +20,7 @@ from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.rate_limit import RateLimit
 from djet_ros.odometry.diagnostics import LEVELS, State
 from djet_ros.odometry.health import Complaint
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
@@ -363,7 +363,7 @@ class Session:
         self._tell_of_the_face()
         self._take_info(received.info)
         self._hand_on(self._present(received))
-        frame = received.image.header.frame_id
+        frame = frame_of(received.image.header)
         if not tracker.mounted:
             self._mount(frame)
         self._mount_beside(frame)

@@ -13,7 +13,7 @@ from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.masks import Masks
-from djet_ros.odometry.messages import mounted_frame, pose_of, stamp_ns
+from djet_ros.odometry.messages import frame_of, mounted_frame, pose_of, stamp_ns
 from djet_ros.odometry.scale import GuessScale, ScaleSource
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +83,7 @@ class Beside:
         if self.gyro is None:
             return
         self._samples += 1
-        self._frames['imu'] = message.header.frame_id
+        self._frames['imu'] = frame_of(message.header)
         rate = message.angular_velocity
         self.gyro.add(stamp_ns(message.header), np.array([rate.x, rate.y, rate.z], np.float64))
 
@@ -91,7 +91,7 @@ class Beside:
         """Take an Odometry; of it the pose."""
         if self.guess is None or isinstance(self.guess, FrameGuess):
             return
-        self._frames['guess'] = message.child_frame_id
+        self._frames['guess'] = message.child_frame_id.lstrip('/')
         self.guess.add(*pose_of(message))
 
     def tf(self, message: Any, *, static: bool) -> None:

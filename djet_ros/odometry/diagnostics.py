@@ -44,7 +44,8 @@ class Counts:
     """
     Every image that came in is counted once more: processed, dropped or rejected.
 
-    dropped: by why it was of no use (equal_stamp, late, ahead, waiting_for_camera_info, queue_full …);
+    dropped: by why it was of no use (equal_stamp, late, ahead, waiting_for_camera_info,
+    queue_full …);
     rejected: by what was wrong with an image; rejected_infos: the same for CameraInfo messages;
     status: of the processed frames.
     """

@@ -55,6 +55,11 @@ def stamp_ns(header: Any) -> int:
     return ns_of_time(header.stamp)
 
 
+def frame_of(header: Any) -> str:
+    """Name the frame of a header; names of ROS 1 have a slash in front, which tf2 refuses."""
+    return str(header.frame_id).lstrip('/')
+
+
 def seconds_and_rest(stamp: int) -> tuple[int, int]:
     """Whole seconds of a stamp in nanoseconds, and the nanoseconds beyond them, as in a Time."""
     return divmod(int(stamp), 10**9)

@@ -23,7 +23,13 @@ from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import bent, Complaint, has_frame, Health, why_restarted
 from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
-from djet_ros.odometry.messages import Messages, MessageType, mounted_frame, stamp_ns
+from djet_ros.odometry.messages import (
+    frame_of,
+    Messages,
+    MessageType,
+    mounted_frame,
+    stamp_ns,
+)
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
 from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
@@ -246,11 +252,11 @@ class Tracker:
         if self._frame is not None and (
                 reason := self._astray(message, following, self._frame)
                 or self._out_of_order(stamp, self._frame)):
-            self._drop(reason, message.header.frame_id)
+            self._drop(reason, frame_of(message.header))
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
             seen = self._see(message, self._camera)
-            left_out = self._beside.left_out(stamp, message.header.frame_id, seen.shape,
+            left_out = self._beside.left_out(stamp, frame_of(message.header), seen.shape,
                                              self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
@@ -259,7 +265,7 @@ class Tracker:
         self._health.gray(seen.coarse)
         # A view that was begun leaves out what the camera does not see, and no more.
         whole = left_out is self._camera.unseen(seen.shape)
-        return self._process(Frame(seen.gray, self._camera.K, stamp, message.header.frame_id,
+        return self._process(Frame(seen.gray, self._camera.K, stamp, frame_of(message.header),
                                    left_out), seen.view if whole else None)
 
     @property
@@ -338,7 +344,7 @@ class Tracker:
 
         A face waits for it for a moment. What comes later is of no use to that image.
         """
-        return self._beside.lacks(stamp_ns(image.header), image.header.frame_id)
+        return self._beside.lacks(stamp_ns(image.header), frame_of(image.header))
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
         """Name frames (parent, child) of which a mounting is still wanted, by 'imu' or 'guess'."""

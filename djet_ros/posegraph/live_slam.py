@@ -17,6 +17,7 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import (
+    frame_of,
     MessageFactory,
     MessageType,
     mounted_frame,
@@ -103,7 +104,7 @@ class LiveSlam:
             return 'no image has come that tells the frame of the camera'
         config = self.config.odometry
         newest, _ = next(reversed(self._images.values()))
-        camera, axes = mounted_frame(config, newest.header.frame_id)
+        camera, axes = mounted_frame(config, frame_of(newest.header))
         found = transform(config.base_frame, camera)
         if found is None:
             return f"tf does not know where '{camera}' is on '{config.base_frame}'"
@@ -225,7 +226,7 @@ class LiveSlam:
         return Outgoing('/diagnostics', self._messages.diagnostics(
             stamp, f'{self._node}: pose graph', level,
             f'{summary}: {self.problem}' if self.problem else summary, values,
-            self._info.header.frame_id if self._info is not None else ''))
+            frame_of(self._info.header) if self._info is not None else ''))
 
     def _take(self, steps: list[Step]) -> list[Outgoing]:
         outgoing = []
@@ -252,7 +253,7 @@ class LiveSlam:
             return None
         try:
             raw = gray_image(message, self.config.odometry.gray_limits())
-            return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
+            return Frame(camera.undistort(raw), camera.K, stamp, frame_of(message.header),
                          self._masks.of(stamp, raw.shape, camera))
         except BadMessage as problem:
             self._reject('image', problem)

@@ -12,7 +12,7 @@ from djet_ros.odometry.camera import Camera, means_rectified
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
 
@@ -33,7 +33,7 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
         for camera, message in images:
             if stamp_ns(message.header) == stamp:
                 raw = gray_image(message, config.odometry.gray_limits())
-                return Frame(camera.undistort(raw), camera.K, stamp, message.header.frame_id,
+                return Frame(camera.undistort(raw), camera.K, stamp, frame_of(message.header),
                              masks.of(stamp, raw.shape, camera))
         raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
                         'give the recording that was replayed')

@@ -17,7 +17,13 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.diagnostics import Counts
-from djet_ros.odometry.messages import mounted_frame, pose_of, seconds_text, stamp_ns
+from djet_ros.odometry.messages import (
+    frame_of,
+    mounted_frame,
+    pose_of,
+    seconds_text,
+    stamp_ns,
+)
 from djet_ros.odometry.scale import Scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
@@ -201,7 +207,7 @@ class Replay:
         tracker, log = self._tracker, self._log
         number, processed = tracker.counts.received, tracker.counts.processed
         rejected = tracker.counts.rejected.total()
-        frame = message.message.header.frame_id
+        frame = frame_of(message.message.header)
         for what, (parent, child) in tracker.wanted_mountings(frame).items():
             if (mounting := self._frames.transform(parent, child)) is not None:
                 tracker.mount_beside(what, mounting)
@@ -486,7 +492,7 @@ def _frame_of_images(recording: Recording) -> str | None:
     with suppress(DjetError):
         for message in recording.messages({recording.image_topic}):
             if message.topic == recording.image_topic:
-                return str(message.message.header.frame_id)
+                return frame_of(message.message.header)
     return None
 
 
