@@ -17,7 +17,7 @@ from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 import pytest
-from ros_messages import camera_info, image, message_type, serialised
+from ros_messages import camera_info, header, image, message_type, serialised
 
 PERIOD = 100_000_000
 POSES = ('relative_pose', 'relative_pose_cov', 'relative_pose_status', 'odometry')
@@ -398,6 +398,7 @@ def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(l
 def test_what_there_is_to_mend_is_said_once_in_the_log_with_the_remedy(live, drive):
     one = live()
     for gray in [*drive, *drive]:
+        one.session.camera_info(camera_info(K, SIZE, header=header(0, 'odom')))
         one.session.image(image(gray, stamp_ns=0, frame_id='odom'))
     one.wait_for_images(24)
     found = [line for line in one.graph.lines if 'rejected' not in line]

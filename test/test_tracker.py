@@ -527,15 +527,39 @@ def test_many_images_dropped_under_load_are_a_warning_and_few_are_none(drive):
     assert '43% of the newest 21 images' in found['images dropped under load']
 
 
-def test_two_cameras_on_one_topic_are_a_warning_where_they_have_equal_stamps(drive):
+@pytest.mark.parametrize(('apart', 'dropped'), [
+    (0.0, {'equal_stamp': 12}), (0.05, {}), (-0.12, {'late': 12})])
+def test_two_cameras_on_one_topic_are_a_warning_whatever_their_stamps_are(drive, apart, dropped):
     one = tracker()
     for i in range(12):
-        for gray, frame in zip(drive, ('left', 'right')):
-            one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=frame))
-    assert one.counts.dropped == {'equal_stamp': 12}
+        for gray, frame, later in zip(drive, ('left', 'right'), (0.0, apart)):
+            one.image(image(gray, stamp_ns=ns(5 + 0.1 * i + later), frame_id=frame))
+    assert {reason: n for reason, n in one.counts.dropped.items() if n > 2} == dropped
     level, _, found = mended(one)
     assert level != 'OK'
-    assert '50% of the newest 24 images' in found['images of two cameras']
+    assert '23 of the newest 24 images had another frame_id' in found['images of two cameras']
+
+
+def test_one_camera_that_is_renamed_is_not_taken_for_two(drive):
+    one = tracker()
+    for i in range(24):
+        one.image(image(drive[i % 2], stamp_ns=ns(0.1 * i), frame_id='a' if i < 12 else 'b'))
+    assert 'images of two cameras' not in mended(one)[2]
+
+
+@pytest.mark.parametrize(('info', 'images', 'said'), [
+    ('left', 'right', True), ('left', '/left', False), ('', 'left', False), ('left', '', False)])
+def test_a_camera_info_of_another_frame_is_a_warning(drive, info, images, said):
+    one = tracker(info=False)
+    one.camera_info(camera_info(K, SIZE, header=header(0, info)))
+    for i, gray in enumerate(drive[:2]):
+        one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=images))
+    level, _, found = mended(one)
+    assert ('camera_info of another frame' in found) is said
+    if said:
+        assert level == 'WARN'
+        assert "of frame 'left', the images are of 'right'" in found[
+            'camera_info of another frame']
 
 
 @pytest.mark.parametrize(('frame', 'parameters', 'name', 'remedy'), [
@@ -545,7 +569,8 @@ def test_two_cameras_on_one_topic_are_a_warning_where_they_have_equal_stamps(dri
 ])
 def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
         drive, frame, parameters, name, remedy):
-    one = tracker(**{'ros.publish_tf': True, **parameters})
+    one = tracker(info=False, **{'ros.publish_tf': True, **parameters})
+    one.camera_info(camera_info(K, SIZE, header=header(0, frame)))
     out = [by_topic(one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=frame)))
            for i, gray in enumerate(drive[:3])]
     assert not any('/tf' in messages for messages in out)
@@ -565,7 +590,8 @@ def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
     ({'odometry.base_frame': '/base_link'}, 'odom', 'base_link')])
 def test_names_of_frames_are_as_tf2_takes_them_whatever_is_before_them(
         drive, parameters, parent, child):
-    one = tracker(**{'ros.publish_tf': True, **parameters})
+    one = tracker(info=False, **{'ros.publish_tf': True, **parameters})
+    one.camera_info(camera_info(K, SIZE, header=header(0, 'camera_optical_frame')))
     asked = []
     if not one.mounted:
         one.mount(lambda *frames: asked.append(frames) or np.eye(4), 'camera_optical_frame')

@@ -22,9 +22,6 @@ _SHARE = 0.1
 # Images or pairs in a row from which on something is no accident.
 _IN_A_ROW = 5
 
-# The fate of images that have the stamp of the one before them, and come from another camera.
-_OTHER = 'of another camera'
-
 # What helps where a scale source does not know a length.
 _REMEDIES = {
     'speed': 'publish it on {topics}, stamped by the clock of the images (use_sim_time on both '
@@ -54,6 +51,9 @@ class Health:
         self._config = config
         self._speed_topics = speed_topics
         self._fates: deque[str] = deque(maxlen=_WINDOW)
+        # The frame_id of the newest image, and whether each of the newest had another than before.
+        self._image_frame: str | None = None
+        self._changes: deque[bool] = deque(maxlen=_WINDOW)
         self._equal = self._unknown_lengths = self._coarse_images = 0
         self._ways, self._measured = False, False
         # The most images in a row that ever had one stamp, and which.
@@ -68,13 +68,16 @@ class Health:
 
     def dropped(self, reason: str, number: int = 1, image_frame: str | None = None) -> None:
         """Take images that were dropped for a reason; image_frame: the frame_id of one of them."""
-        # The same image twice is nothing to mend.
-        other = (reason == 'equal_stamp' and self._last is not None
-                 and image_frame not in (None, self._last.frame_id))
-        self._fates.extend([_OTHER if other else reason] * min(number, _WINDOW))
+        self._fates.extend([reason] * min(number, _WINDOW))
+        if image_frame is not None:
+            self._saw(image_frame)
         self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
         if self._equal > self._most_equal and self._last is not None:
             self._most_equal, self._stood_ns = self._equal, self._last.stamp_ns
+
+    def _saw(self, image_frame: str) -> None:
+        self._changes.append(self._image_frame not in (None, image_frame))
+        self._image_frame = image_frame
 
     def gray(self, coarse: Coarse | None) -> None:
         """Take how few gray levels an image of 16 bits became, or that it is none of them."""
@@ -84,6 +87,7 @@ class Health:
     def processed(self, result: OdometryResult) -> None:
         """Take the result of an image."""
         self._fates.append('')
+        self._saw(result.frame_id)
         self._equal, self._last = 0, result
         self._ways = self._ways or result.status is Status.OK
         measured = result.scale_kind is Scale.METRIC and result.measured
@@ -98,7 +102,7 @@ class Health:
         return [one for one in (
             self._stamps(), self.few_levels(), self._frame(),
             None if mounted else self._mounting(), self._length(scale), self._load(),
-            self._way(), self._order(), self._two_cameras()) if one is not None]
+            self._way(), self._order(), self.two_cameras()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
         return None if self._last is None else _still(self._equal, self._last.stamp_ns)
@@ -193,13 +197,25 @@ class Health:
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
             'and dropped; do two cameras publish on one topic?'))
 
-    def _two_cameras(self) -> Complaint | None:
-        if (share := self._share(_OTHER)) < _SHARE:
+    def two_cameras(self) -> Complaint | None:
+        """Say that images have now one frame_id, now another."""
+        images, changes = len(self._changes), sum(self._changes)
+        if images < _FEW or changes < _SHARE * images:
             return None
         return Complaint('images of two cameras', 'WARN', (
-            f'{share:.0%} of the newest {len(self._fates)} images had the stamp of the one before '
-            'them, another frame_id, and were dropped; two cameras publish on one topic, and '
-            'poses are of now one, now the other'))
+            f'{changes} of the newest {images} images had another frame_id than the one before '
+            f"them, the newest of all '{self._image_frame}'; two cameras publish on one topic, "
+            'and poses are of now one, now the other'))
+
+
+def another_frame(info_frame: str, image_frame: str) -> Complaint | None:
+    """Say that a CameraInfo speaks of another frame than the images have; not where one is ''."""
+    if '' in (info_frame, image_frame) or info_frame == image_frame:
+        return None
+    return Complaint('camera_info of another frame', 'WARN', (
+        f"the CameraInfo is of frame '{info_frame}', the images are of '{image_frame}'; if it "
+        'is that of another camera, remap camera_info (--info-topic); if not, the driver should '
+        'give both one frame_id'))
 
 
 def bent(lens: SelfCalibration | None) -> Complaint | None:

@@ -21,7 +21,7 @@ from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.health import bent, Complaint, has_frame, Health, why_restarted
+from djet_ros.odometry.health import another_frame, bent, Complaint, has_frame, Health, why_restarted
 from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
 from djet_ros.odometry.messages import (
     frame_of,
@@ -108,6 +108,7 @@ class Tracker:
         self._mounting: Array | None = None
         self._messages = Messages(message_type, config.odometry, node)
         self._info: Any = None
+        self._info_frame = ''
         self._camera: Camera | None = None
         self._hides = still_mask is not None
         self._paused = False
@@ -173,6 +174,7 @@ class Tracker:
 
     def camera_info(self, message: Any) -> list[Outgoing]:
         """Take a CameraInfo; the camera is made anew only where it says something new."""
+        self._info_frame = frame_of(message.header)
         if self._info is not None and same_camera(self._info, message):
             return []
         self._info = message
@@ -367,16 +369,22 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Say what there is to mend beside the state: what is seen, and what helps."""
-        lens = bent(self._odometry.lens)
-        return [*self._health.complaints(self._scale, self.mounted), *([lens] if lens else []),
+        more = self._of_calibration
+        return [*self._health.complaints(self._scale, self.mounted),
+                *(one for one in more if one is not None),
                 *self.complaints_beside, *self.face_complaints]
+
+    @property
+    def _of_calibration(self) -> tuple[Complaint | None, ...]:
+        frame = self.last.frame_id if self.last else ''
+        return bent(self._odometry.lens), another_frame(self._info_frame, frame)
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
         """Say what there is to mend of what a whole recording holds."""
         found = (self._health.stamps_stood(), self._health.few_levels(),
-                 self._health.never_measured(self._scale), bent(self._odometry.lens),
-                 *self.complaints_beside)
+                 self._health.never_measured(self._scale), self._health.two_cameras(),
+                 *self._of_calibration, *self.complaints_beside)
         return [one for one in found if one is not None]
 
     @property
