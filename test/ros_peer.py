@@ -43,6 +43,10 @@ class Peer:
         """Wait until so many listen."""
         self._until(lambda: self._publishers[topic].get_subscription_count() >= count)
 
+    def alone(self, topic):
+        """Wait until nobody listens any more."""
+        self._until(lambda: not self._publishers[topic].get_subscription_count())
+
     def send(self, topic, data):
         self._publishers[topic].publish(b64decode(data))
 

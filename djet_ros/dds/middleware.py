@@ -43,6 +43,7 @@ class DdsMiddleware:
         self._names = names
         self._clock: int | None = None
         self._frames = StaticFrames()
+        self._follows_frames = False
         self._last_garbage = self._last_look = -float('inf')
         self._services: list[TriggerServer] = []
         if use_sim_time:
@@ -93,9 +94,15 @@ class DdsMiddleware:
 
     def follow_frames(self) -> None:
         """Hear what /tf_static says from now on; frames that move are for tf2, which ROS has."""
-        # Whoever publishes there latches its newest message.
-        self._graph.listen(TOPIC, TYPE, self._frames.add,
-                           Profile(depth=_FRAMES_DEPTH, latched=True), garbage=self._note_garbage)
+        if not self._follows_frames:
+            # Whoever publishes there latches its newest message.
+            self._graph.listen(TOPIC, TYPE, self._frames.add,
+                               Profile(depth=_FRAMES_DEPTH, latched=True),
+                               garbage=self._note_garbage)
+        self._follows_frames = True
+
+    def forget_frames(self) -> None:
+        """Stay as it is: /tf_static costs nothing where nothing new is told."""
 
     def transform(self, parent: str, child: str) -> Array | None:
         """Give a frame in another (4, 4), or None where /tf_static has not told it."""

@@ -40,6 +40,10 @@ class LiveSession(Protocol):
         """Say what no message makes it say; called once a second."""
 
     @property
+    def wants_frames(self) -> bool:
+        """Whether tf is still to be asked how anything is mounted."""
+
+    @property
     def has_room(self) -> bool:
         """Whether an image would be taken at once."""
 
@@ -67,7 +71,7 @@ class Face:
         self._kinds: dict[str, str] = {}
         self._refused: list[Subscription] = []
         self._images: Subscription | None = None
-        self._latched = False
+        self._latched = self._follows_frames = False
         self._remedy = 'ros.qos_reliability to best_effort'
         self._last_tick = -float('inf')
 
@@ -167,9 +171,21 @@ class Face:
         """Tell whether images are to come now: always, where none waits without being lost."""
         return not self._middleware.senders_wait or self.session.has_room
 
+    def follow_frames_while_wanted(self) -> None:
+        """Hear tf until what is asked of it is known: all that robots send there costs time."""
+        wanted = self.session.wants_frames
+        if wanted == self._follows_frames:
+            return
+        self._follows_frames = wanted
+        if wanted:
+            self._middleware.follow_frames()
+        else:
+            self._middleware.forget_frames()
+
     # Once a second
 
     def _tick(self) -> None:
+        self.follow_frames_while_wanted()
         if self._images is not None:
             self.session.count_lost(self._images.new_losses())
         # Who publishes is known by name a little after it is refused.

@@ -21,14 +21,13 @@ class GraphFace(Face):
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
-        if config.odometry.base_frame:
-            middleware.follow_frames()
         image, info = self.image_topics(config.ros)
         topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
         self.session: GraphSession = GraphSession(
             LiveSlam(config, middleware.message_type, image, middleware.node.strip('/'),
                      still_mask(config.odometry.mask_file)), self,
             {**topics, 'image': image, 'camera_info': info})
+        self.follow_frames_while_wanted()
         self.advertise(graph_outputs(tf=config.slam.publish_tf))
         for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
                                                  self.session.relative_pose,

@@ -119,6 +119,11 @@ class GraphSession:
         self._wiring.log('info', text)
         return text
 
+    @property
+    def wants_frames(self) -> bool:
+        """Whether tf is still to be asked where the camera is on base_frame."""
+        return not self._slam.mounted
+
     def tick(self) -> None:
         """Say what no message makes the graph say; to be called about once a second."""
         silent = monotonic() - self._heard['odometry'] > SILENCE

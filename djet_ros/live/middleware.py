@@ -122,6 +122,9 @@ class Middleware(Protocol):
     def follow_frames(self) -> None:
         """Hear what tf says from now on."""
 
+    def forget_frames(self) -> None:
+        """Hear no more of it, until it is asked for again."""
+
     def transform(self, parent: str, child: str) -> Array | None:
         """Give a frame in another (4, 4), or None where tf does not know it."""
 

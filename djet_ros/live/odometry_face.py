@@ -7,7 +7,6 @@ from dataclasses import replace
 from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.parameters import why_frames
 from djet_ros.live.session import Session
 from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
@@ -32,7 +31,6 @@ class OdometryFace(Face):
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)
-        self._follows_frames = False
         image, info = self.image_topics(config.ros)
         self.session: Session = Session(
             Tracker(config, middleware.message_type, image_topic=image,
@@ -43,6 +41,7 @@ class OdometryFace(Face):
         self._hears_speed = self._hears_tf = False
         self._hears_beside: set[str] = set()
         self.connect(config)
+        self.follow_frames_while_wanted()
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
         for name in ('reset', 'pause', 'resume'):
             middleware.serve(f'~/{name}', getattr(self.session, name))
@@ -59,9 +58,6 @@ class OdometryFace(Face):
         odometry = config.odometry
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,
                   'guess': odometry.guess_by_topic}
-        if why_frames(odometry) and not self._follows_frames:
-            self._middleware.follow_frames()
-            self._follows_frames = True
         for what in [what for what in wanted if wanted[what] and what not in self._hears_beside]:
             self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
                         getattr(self.session, what),

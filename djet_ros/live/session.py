@@ -198,6 +198,11 @@ class Session:
     # What comes in
 
     @property
+    def wants_frames(self) -> bool:
+        """Whether tf is still to be asked how anything is mounted."""
+        return self._tracker.wants_frames
+
+    @property
     def has_room(self) -> bool:
         """Whether an image would be taken; with the policy 'every' it may be better to wait."""
         return self._queue.has_room

@@ -133,6 +133,15 @@ class Beside:
             wanted['guess'] = self._frames['guess'], camera
         return wanted
 
+    @property
+    def wants_mountings(self) -> bool:
+        """Tell whether a mounting will be asked for, of frames that may still have no names."""
+        gyro = self.gyro is not None and self.gyro.to_camera is None
+        # One on tf finds its own way there.
+        guess = self.guess is not None and not isinstance(self.guess, FrameGuess) \
+            and self.guess.mounting is None
+        return gyro or guess
+
     def mount(self, what: str, mounting: Array) -> None:
         """Take a mounting (4, 4) that was wanted."""
         # The images' axes in the frame that was asked for.

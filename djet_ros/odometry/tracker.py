@@ -352,6 +352,11 @@ class Tracker:
         """Name frames (parent, child) of which a mounting is still wanted, by 'imu' or 'guess'."""
         return self._beside.wanted_mountings(image_frame)
 
+    @property
+    def wants_frames(self) -> bool:
+        """Tell whether tf is still to be asked how anything is mounted."""
+        return not self.mounted or self._beside.wants_mountings
+
     def mount_beside(self, what: str, mounting: Array) -> None:
         """Take a mounting (4, 4) that was wanted."""
         self._beside.mount(what, mounting)

@@ -133,6 +133,7 @@ class RosMiddleware:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._frames: Any = None
+        self._listener: Any = None
         self._looks, self._last_look = False, -float('inf')
         self._events = _WhenReady(lambda: self._looks)
 
@@ -198,11 +199,18 @@ class RosMiddleware:
         self._frames = tf2.Buffer()
         self._listener = tf2.TransformListener(self._frames, self._node)
 
+    def forget_frames(self) -> None:
+        """Hear no more of tf."""
+        self._listener.unregister()
+        self._listener = self._frames = None
+
     def transform(self, parent: str, child: str) -> Array | None:
         """Give a frame in another (4, 4), the newest that is known, or None."""
-        if self._frames is None or not self._frames.can_transform(parent, child, Time()):
+        # Asked from another thread than lets go of it.
+        frames = self._frames
+        if frames is None or not frames.can_transform(parent, child, Time()):
             return None
-        return pose_of(self._frames.lookup_transform(parent, child, Time()))[1]
+        return pose_of(frames.lookup_transform(parent, child, Time()))[1]
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""

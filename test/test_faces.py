@@ -1,0 +1,136 @@
+"""The wiring of a live node, on a graph that only writes down what is asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from time import monotonic, sleep
+from types import SimpleNamespace
+from typing import Any
+
+from cards import Cards, K, pose, SIZE
+from djet_ros.config.flat import from_flat, with_values
+from djet_ros.config.sections import Config
+from djet_ros.live.middleware import Profile
+from djet_ros.live.odometry_face import OdometryFace
+import numpy as np
+import pytest
+from ros_messages import camera_info, image, message_type
+
+
+class Graph:
+    """A middleware of nobody else; frames: what tf knows, by parent and child."""
+
+    qos_remedy, senders_wait, node = '', False, '/vo_node'
+    message_type = staticmethod(message_type)
+
+    def __init__(self) -> None:
+        self.callbacks: dict[str, Callable[[Any], None]] = {}
+        self.frames: dict[tuple[str, str], Any] = {}
+        self.hears_tf = False
+
+    def resolve(self, name: str) -> str:
+        return f'/{name.lstrip("~/")}'
+
+    def is_remapped(self, name: str) -> bool:
+        return False
+
+    def now_ns(self) -> int:
+        return 0
+
+    def log(self, level: str, text: str) -> None:
+        pass
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        pass
+
+    def advertise(self, topic: str, kind: str) -> Any:
+        return SimpleNamespace(publish=lambda message: True, listeners=0)
+
+    def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
+               ready: Callable[[], bool] | None = None) -> Any:
+        self.callbacks[topic] = callback
+        return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
+                               new_refusals=lambda: 0)
+
+    def offers(self, topic: str) -> list[Any]:
+        return []
+
+    def published(self, kind: str) -> list[str]:
+        return []
+
+    def follow_frames(self) -> None:
+        assert not self.hears_tf
+        self.hears_tf = True
+
+    def forget_frames(self) -> None:
+        assert self.hears_tf
+        self.hears_tf = False
+
+    def transform(self, parent: str, child: str) -> Any:
+        return self.frames.get((parent, child)) if self.hears_tf else None
+
+
+class Node:
+    """The odometry's face on such a graph."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.graph = Graph()
+        self.config: Config = from_flat({'estimator.max_features': 500, **parameters})
+        self.face = OdometryFace(self.graph, self.config)
+        self.face.session.start()
+        self.graph.callbacks['/camera_info'](camera_info(K, SIZE))
+        self._cards, self._sent = Cards(), 0
+
+    def look(self) -> None:
+        """Send an image, wait until it is worked on, and let a second pass."""
+        here = np.linalg.matrix_power(pose(x=0.25, z=0.15), self._sent % 4)
+        self.graph.callbacks['/image'](image(self._cards.gray(here),
+                                             stamp_ns=self._sent * 10**8))
+        self._sent += 1
+        counts, end = self.face.session._tracker.counts, monotonic() + 20
+        while counts.received < self._sent and monotonic() < end:
+            sleep(0.01)
+        self.face.session.configure(self.config)
+        self.face._tick()
+
+    def set(self, **values: Any) -> None:
+        """Change parameters, as the middleware does it while the node runs."""
+        self.config = with_values(self.config, values)
+        self.face.connect(self.config)
+        self.face.configure(self.config)
+        self.face._tick()
+
+
+@pytest.fixture
+def node() -> Iterator[Callable[..., Node]]:
+    started: list[Node] = []
+
+    def start(**parameters: Any) -> Node:
+        started.append(Node(**parameters))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.face.session.stop(10)
+
+
+def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node):
+    one = node(**{'odometry.base_frame': 'base_link'})
+    one.look()
+    assert one.graph.hears_tf
+    one.graph.frames['base_link', 'camera'] = np.eye(4)
+    one.look()
+    assert not one.graph.hears_tf
+    one.set(**{'odometry.max_gap': 2.0})
+    assert not one.graph.hears_tf
+    one.set(**{'odometry.guess': True})
+    one.look()
+    assert one.graph.hears_tf
+    one.set(**{'odometry.guess': False})
+    assert not one.graph.hears_tf
+
+
+@pytest.mark.parametrize('parameters', [
+    {}, {'odometry.imu': True, 'odometry.imu_rotation': '0 0 0 1'}])
+def test_tf_is_not_heard_where_nothing_is_asked_of_it(node, parameters):
+    assert not node(**parameters).graph.hears_tf
