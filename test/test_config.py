@@ -1,11 +1,13 @@
 """The configuration: one source, read strictly, written so that it reads back."""
 
 import argparse
+from array import array
+from dataclasses import replace
 from pathlib import Path
 
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
-from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, OdometryConfig, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
@@ -100,7 +102,24 @@ def test_integers_are_taken_for_floats_and_floats_not_for_integers():
         from_flat({'estimator.window': 7.0})
 
 
+@pytest.mark.parametrize('values', [
+    "{imu_rotation: '0 0 0 1', gray_range: '0 4095'}",
+    '{imu_rotation: [0.0, 0.0, 0.0, 1.0], gray_range: [0, 4095]}',
+    '{imu_rotation: [0, 0, 0, 1], gray_range: [0, 4095]}',
+    "{imu_rotation: '[0, 0, 0, 1]', gray_range: '[0, 4095]'}"])
+def test_several_numbers_are_a_text_or_a_list(tmp_path, values):
+    config = load_yaml(written(tmp_path, f'odometry: {values}')).odometry
+    assert config.imu_quaternion() == (0, 0, 0, 1)
+    assert config.gray_limits() == (0, 4095)
+    assert from_flat({'odometry.gray_range': array('q', [0, 4095])}).odometry == replace(
+        OdometryConfig(), gray_range='0 4095')
+
+
 @pytest.mark.parametrize('name, value, message', [
+    ('odometry.gray_range', [0, True], 'of type str'),
+    ('odometry.gray_range', [4095, 0], "gray_range is '4095 0'; give 'low high'"),
+    ('odometry.imu_rotation', [1.0], 'give a quaternion'),
+    ('odometry.odom_frame', [1, 2], 'of type str'),
     ('estimator.windw', 7, "did you mean 'estimator.window'"),
     ('max_gap', 1.0, "did you mean 'odometry.max_gap'"),
     ('loop_gaps', 1.0, "did you mean 'slam.loop_gap'"),

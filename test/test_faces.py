@@ -93,7 +93,7 @@ class Node:
         self.face.session.configure(self.config)
         self.face._tick()
 
-    def set(self, **values: Any) -> None:
+    def change(self, **values: Any) -> None:
         """Change parameters, as the middleware does it while the node runs."""
         self.config = with_values(self.config, values)
         self.face.connect(self.config)
@@ -121,12 +121,12 @@ def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node)
     one.graph.frames['base_link', 'camera'] = np.eye(4)
     one.look()
     assert not one.graph.hears_tf
-    one.set(**{'odometry.max_gap': 2.0})
+    one.change(**{'odometry.max_gap': 2.0})
     assert not one.graph.hears_tf
-    one.set(**{'odometry.guess': True})
+    one.change(**{'odometry.guess': True})
     one.look()
     assert one.graph.hears_tf
-    one.set(**{'odometry.guess': False})
+    one.change(**{'odometry.guess': False})
     assert not one.graph.hears_tf
 
 

@@ -499,12 +499,14 @@ def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
         node, publisher, tmp_path):
     path = tmp_path / 'own.yaml'
     path.write_text('vo_node: {ros__parameters: {preset: paper, odometry: {max_gap: 3, '
-                    'rectified: true}, estimator: {windw: 5}, slam: {loop_gap: 5.0}, '
+                    'rectified: true, gray_range: [0, 4095]}, estimator: {windw: 5}, '
+                    'slam: {loop_gap: 5.0}, '
                     'name_of_robot: r2}}')
     one = node('--params-file', str(path), **{'estimator.loss': 'cauchy'})
     assert publisher.ask('configured', node=NODE, names=[
         'preset', 'estimator.starts', 'estimator.loss', 'odometry.max_gap',
-        'odometry.rectified']) == ['paper', 'five_point', 'cauchy', 3.0, 'true']
+        'odometry.rectified', 'odometry.gray_range']) == [
+            'paper', 'five_point', 'cauchy', 3.0, 'true', '0 4095']
     assert "unknown parameter 'estimator.windw'; did you mean 'estimator.window'?" in one.log
     assert "unknown parameter 'name_of_robot'" in one.log
     # The file may serve the pose graph too.

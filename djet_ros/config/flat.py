@@ -6,6 +6,7 @@ ROS parameters, YAML files and command-line flags are all derived from these.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 import difflib
@@ -52,8 +53,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Give the configuration with the values of some parameters changed, by flat name.
 
     A preset among the values first sets the whole estimator to it; the others come on top.
-    Integers are taken for floats. Raises DjetError on an unknown name (naming the nearest), on a
-    value of another type, and on one outside its described range.
+    Integers are taken for floats, and a list of numbers for a text that holds them. Raises
+    DjetError on an unknown name (naming the nearest), on a value of another type, and on one
+    outside its described range.
     """
     known = flat(config)
     if strange := [name for name in values if name not in known]:
@@ -104,6 +106,10 @@ def _typed(item: FlatParameter, value: Any) -> Value:
         return _finite(item, value)
     if item.kind is str and type(value) is bool and str(value).lower() in item.description.choices:
         return str(value).lower()
+    # rclpy has an array for what was a list.
+    if item.description.numbers and isinstance(value, (list, tuple, array)) \
+            and all(type(one) in (int, float) for one in value):
+        return ' '.join(map(str, value))
     if type(value) is not item.kind:
         raise _wrong_type(item, value)
     return cast(Value, value)

@@ -17,6 +17,11 @@ def _without_slashes(config: OdometryConfig | SlamConfig, *frames: str) -> None:
         object.__setattr__(config, frame, getattr(config, frame).lstrip('/'))
 
 
+def _words(numbers: str) -> list[str]:
+    """Cut a text of several numbers, which may be written as a list."""
+    return numbers.strip().removeprefix('[').removesuffix(']').replace(',', ' ').split()
+
+
 @dataclass(frozen=True)
 class OdometryConfig:
     """How pairs become a trajectory. Raises ValueError on a value outside its description."""
@@ -59,7 +64,7 @@ class OdometryConfig:
         'the images do not, and is weighed into what they tell')
     imu_rotation: str = parameter(
         '', "rotation of the IMU's axes to those of the camera (optical: z forward, x right, y "
-        "down), as a quaternion 'x y z w'; empty asks tf")
+        "down), as a quaternion 'x y z w'; empty asks tf", numbers=True)
     imu_offset: float = parameter(
         0.0, "seconds by which the IMU's clock is ahead of that of the images (t_imu = t_image + "
         'offset); djet lab imu-offset finds it', minimum=-10.0, maximum=10.0)
@@ -94,7 +99,7 @@ class OdometryConfig:
     gray_range: str = parameter(
         '0 65535', "'low high': of images of 16 bits, the values that become black and white; all "
         'others go in equal steps between them. A camera of 12 bits wants 0 4095. Images of 8 '
-        'bits stay as they are')
+        'bits stay as they are', numbers=True)
     frame_convention: str = parameter(
         'body', 'axes of all poses in messages: body (x forward, y left, z up, as REP 103 has it '
         'for what moves) or optical (z forward, x right, y down, as it has it for images)',
@@ -123,7 +128,7 @@ class OdometryConfig:
         if not self.imu_rotation.strip():
             return None
         try:
-            values = [float(word) for word in self.imu_rotation.replace(',', ' ').split()]
+            values = [float(word) for word in _words(self.imu_rotation)]
         except ValueError:
             values = []
         length = math.hypot(*values)
@@ -148,7 +153,7 @@ class OdometryConfig:
 
     def gray_limits(self) -> tuple[int, int]:
         """Give the two values of gray_range."""
-        words = self.gray_range.replace(',', ' ').split()
+        words = _words(self.gray_range)
         values = [int(word) for word in words if word.isdecimal() and len(word) < 6]
         if len(values) != len(words) or len(values) != 2 or not values[0] < values[1] < 65536:
             raise ValueError(f"gray_range is '{self.gray_range:.80}'; give 'low high', whole "

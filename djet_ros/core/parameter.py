@@ -13,20 +13,25 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Description:
-    """What a parameter means and which values it takes; units belong into the text."""
+    """
+    What a parameter means and which values it takes; units belong into the text.
+
+    numbers: that a text holds several, and may be given as a list of them.
+    """
 
     text: str
     minimum: float | None = None
     maximum: float | None = None
     choices: tuple[str, ...] = ()
     odd: bool = False
+    numbers: bool = False
 
 
 def parameter(default: Any, text: str, *, minimum: float | None = None,
               maximum: float | None = None, choices: tuple[str, ...] = (),
-              odd: bool = False) -> Any:
+              odd: bool = False, numbers: bool = False) -> Any:
     """Declare a dataclass field with its default and its description."""
-    description = Description(text, minimum, maximum, choices, odd)
+    description = Description(text, minimum, maximum, choices, odd, numbers)
     return field(default=default, metadata={'description': description})
 
 

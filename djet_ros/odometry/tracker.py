@@ -21,7 +21,14 @@ from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.health import another_frame, bent, Complaint, has_frame, Health, why_restarted
+from djet_ros.odometry.health import (
+    another_frame,
+    bent,
+    Complaint,
+    has_frame,
+    Health,
+    why_restarted,
+)
 from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
 from djet_ros.odometry.messages import (
     frame_of,
