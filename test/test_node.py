@@ -649,6 +649,23 @@ def test_what_the_user_can_mend_ends_it_with_one_line_and_code_2(tmp_path, words
     assert reason in line
 
 
+@pytest.mark.parametrize(('variable', 'value', 'reason'), [
+    ('ROS_DOMAIN_ID', 'abc', 'ROS_DOMAIN_ID is not an integral number'),
+    ('CYCLONEDDS_URI', '<bad', 'error creating node; look'),
+    ('ROS_LOG_DIR', '/proc/none', "log directory '/proc/none'")])
+def test_a_fault_of_the_environment_is_not_blamed_on_the_command_line(variable, value, reason):
+    if variable == 'CYCLONEDDS_URI' and 'cyclone' not in ENVIRONMENT.get('RMW_IMPLEMENTATION', ''):
+        pytest.skip('another middleware')
+    done = subprocess.run(command('vo_node'), env={**ENVIRONMENT, variable: value},
+                          capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith('vo_node: error: ROS can not start a node: ')
+    assert reason in last
+    assert 'look at the lines above, if any, and at the environment: ROS_DOMAIN_ID' in last
+    assert 'Traceback' not in done.stderr
+
+
 # Outputs on demand
 
 def test_path_transform_and_debug_image_come_on_demand(
