@@ -51,6 +51,19 @@ def test_stamps_that_go_back_start_anew():
     assert taken(limit, early) == taken(RateLimit(10), early)
 
 
+@pytest.mark.parametrize('behind', [0.02, 0.4])
+def test_a_stream_out_of_order_gives_no_more_images_than_one_in_order(behind):
+    there, here = camera(30), camera(30, start=round(-behind * SECOND))
+    crossed = [stamp for pair in zip(there, here) for stamp in pair]
+    assert len(taken(RateLimit(10, max_backwards=0.5), crossed)) <= 20 * 10 + 1
+
+
+def test_stamps_that_stay_back_a_little_start_anew():
+    limit = RateLimit(10, max_backwards=3600.0)
+    taken(limit, camera(10, 60))
+    assert len(taken(limit, camera(10, 30))) > 280
+
+
 def test_who_begins_an_image_later_takes_others_for_good():
     """So a pose graph keeps all images: by a limit of its own none may be the odometry's."""
     stamps = camera(60)

@@ -154,7 +154,7 @@ class Session:
         self._wiring = wiring
         self._topics = topics
         self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size, ROOM)
-        self._limit = RateLimit(node.max_rate)
+        self._limit = _limit(tracker.config)
         # Held while an image is worked on and published, and by what happens in between.
         self._lock = Lock()
         self._turnstile = Lock()
@@ -266,7 +266,7 @@ class Session:
             self._log.clear()
             self._counted_drops = self._queue.dropped
             self._lost = self._counted_lost = self._left_out = 0
-            self._limit = RateLimit(self._tracker.config.ros.max_rate)
+            self._limit = _limit(self._tracker.config)
             self._said_drops = False
             self._tracker.reset()
             self._say()
@@ -294,8 +294,10 @@ class Session:
         """Take other parameters from the next image on; the queue stays as it was made."""
         with self._between_images():
             before = flat(self._tracker.config)
-            if config.ros.max_rate != self._tracker.config.ros.max_rate:
-                self._limit = RateLimit(config.ros.max_rate)
+            same = all(before[name].value == flat(config)[name].value
+                       for name in ('ros.max_rate', 'odometry.max_backwards'))
+            if not same:
+                self._limit = _limit(config)
             self._tracker.configure(config)
         changed = [f'{item.name} = {item.value}' for item in flat(config).values()
                    if item.value != before[item.name].value]
@@ -500,6 +502,10 @@ class Session:
             if one.name not in self._complained:
                 self._log.warn(one.name, f'{one.name}: {one.text}')
         self._complained = {one.name for one in complaints}
+
+
+def _limit(config: Config) -> RateLimit:
+    return RateLimit(config.ros.max_rate, config.odometry.max_backwards)
 
 
 def _bytes(message: Any) -> int:

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 _DIAGNOSTICS_PERIOD_NS = 10**9
 
 # Late images in a row that are no accident: the stamps have gone back, and stay there.
-_LATE_IN_A_ROW = 10
+LATE_IN_A_ROW = 10
 
 
 class Outgoing(NamedTuple):
@@ -478,7 +478,7 @@ class Tracker:
             return 'equal_stamp'
         self._late_in_a_row += 1
         late = newest.stamp_ns - stamp <= self.config.odometry.max_backwards * 1e9
-        return 'late' if late and self._late_in_a_row < _LATE_IN_A_ROW else ''
+        return 'late' if late and self._late_in_a_row < LATE_IN_A_ROW else ''
 
     def _drop(self, reason: str, image_frame: str | None = None) -> None:
         self.counts.dropped[reason] += 1

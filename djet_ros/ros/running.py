@@ -29,8 +29,8 @@ def own_words() -> list[str]:
 
 
 # What rcl goes by beside the command line, which own_words has seen to be readable.
-_SURROUNDINGS = ('ROS_DOMAIN_ID, RMW_IMPLEMENTATION, ROS_LOG_DIR and the settings of the middleware '
-                 'such as CYCLONEDDS_URI or FASTRTPS_DEFAULT_PROFILES_FILE')
+_SURROUNDINGS = ('ROS_DOMAIN_ID, RMW_IMPLEMENTATION, ROS_LOG_DIR and the settings of the '
+                 'middleware such as CYCLONEDDS_URI or FASTRTPS_DEFAULT_PROFILES_FILE')
 
 
 def run_node(name: str, make: Callable[[Node], Face], stop: Event) -> int:
