@@ -2,7 +2,13 @@
 
 from djet_ros.ros.launching import arguments, CONFIG
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    LogInfo,
+    Shutdown,
+)
 from launch.conditions import IfCondition, UnlessCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -11,10 +17,18 @@ from launch_ros.substitutions import FindPackageShare
 LOOP = LaunchConfiguration('loop')
 
 
+def end_without_a_player(event, context):
+    """End all where the player failed; what it has played to its end can still be looked at."""
+    if event.returncode and not context.is_shutdown:
+        why = 'the bag is not played; see what bag_player says'
+        return [LogInfo(msg=why), Shutdown(reason=why)]
+    return []
+
+
 def player(*options, condition):
     """Play the bag, once the node has had the time to find the player."""
     return ExecuteProcess(
-        name='bag_player', output='screen', condition=condition,
+        name='bag_player', output='screen', condition=condition, on_exit=end_without_a_player,
         cmd=['ros2', 'bag', 'play', LaunchConfiguration('bag'), '--clock', '--delay', '3',
              '--rate', LaunchConfiguration('rate'), '--disable-keyboard-controls', *options])
 
