@@ -9,8 +9,10 @@ def generate_launch_description():
     """Describe the node and, if asked for, RViz."""
     return LaunchDescription([
         *arguments('image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
-                   'log_level', 'respawn', 'use_sim_time', 'rviz'),
+                   'log_level', 'respawn', 'publish_tf', 'image_transport', 'use_sim_time',
+                   'rviz'),
         # Before the node, which is not to be started where there is no RViz.
         rviz(),
-        node('vo_node', LaunchConfiguration('name'), 'params_file'),
+        node('vo_node', LaunchConfiguration('name'), 'params_file',
+             says=('base_frame', 'publish_tf', 'image_transport')),
     ])

@@ -29,9 +29,11 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
 
 ARGUMENTS = {
     'vo.launch.py': {'image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
-                     'log_level', 'respawn', 'use_sim_time', 'rviz'},
+                     'log_level', 'respawn', 'publish_tf', 'image_transport', 'use_sim_time',
+                     'rviz'},
     'slam.launch.py': {'image', 'camera_info', 'params_file', 'slam_params_file', 'base_frame',
-                       'namespace', 'log_level', 'respawn', 'publish_tf', 'use_sim_time'},
+                       'namespace', 'log_level', 'respawn', 'publish_tf', 'image_transport',
+                       'use_sim_time'},
     'replay.launch.py': {'bag', 'rate', 'loop', 'image', 'params_file', 'base_frame', 'rviz'},
 }
 
@@ -227,6 +229,7 @@ OWN = '/**: {ros__parameters: {use_sim_time: true, ros: {publish_tf: true}}}'
 @pytest.mark.parametrize(('file', 'given', 'clock', 'tf'), [
     ('vo.launch.py', (), True, True),
     ('vo.launch.py', ('use_sim_time:=false',), False, True),
+    ('vo.launch.py', ('publish_tf:=false',), True, False),
     ('slam.launch.py', (), True, True),
     ('slam.launch.py', ('publish_tf:=false',), True, False)])
 def test_what_a_file_of_parameters_says_holds_unless_the_launch_is_told_otherwise(
@@ -242,6 +245,18 @@ def test_what_a_file_of_parameters_says_holds_unless_the_launch_is_told_otherwis
 def test_a_slam_has_the_odometry_on_tf_as_it_stands(
         environment: dict[str, str], tmp_path: Path) -> None:
     assert parameters_of_launched(environment, tmp_path, 'slam.launch.py') == (False, True)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('included', ['vo.launch.py', 'replay.launch.py'])
+def test_tf_and_compressed_images_can_be_asked_for_by_an_argument(
+        environment: dict[str, str], tmp_path: Path, included: str) -> None:
+    given = ['publish_tf:=true', 'image_transport:=compressed', 'image:=/eye/image_raw']
+    told = [*given, 'bag:=/no/bag'] if included == 'replay.launch.py' else given
+    outside = with_player(environment, tmp_path, 'exec sleep 60')
+    said = launched(outside, tmp_path / 'out', included, *told, until='queue policy')
+    assert 'images from /eye/image_raw/compressed, camera_info from /eye/camera_info' in said
+    assert parameters_of_launched(outside, tmp_path, included, *told)[1]
 
 
 @pytest.mark.ros

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,10 @@ from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 CONFIG = PathJoinSubstitution([FindPackageShare('djet_ros'), 'config'])
+
+# Arguments by which parameters are set on top of files, where they are not empty.
+_SAID = {'base_frame': ('odometry.base_frame', str), 'publish_tf': ('ros.publish_tf', bool),
+         'image_transport': ('ros.image_transport', str)}
 
 _TRUTH = {'choices': ['true', 'false'], 'default_value': 'false'}
 
@@ -39,7 +44,10 @@ _ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     'log_level': ('from which level on the nodes log', {
         'default_value': 'info', 'choices': ['debug', 'info', 'warn', 'error', 'fatal']}),
     'respawn': ('start a node again that has ended by an error', _TRUTH),
-    'publish_tf': ("whether the odometry's pose goes to tf, whatever params_file says", _TRUTH),
+    'publish_tf': ("whether the odometry's pose goes to tf; empty: as the parameters say",
+                   {'choices': ['true', 'false', ''], 'default_value': ''}),
+    'image_transport': ('raw, or compressed for <image>/compressed; empty: as the parameters say',
+                        {'choices': ['raw', 'compressed', ''], 'default_value': ''}),
     'use_sim_time': ('take the time from /clock; empty: as the parameters or an outer launch file '
                      'say', {'choices': ['true', 'false', ''], 'default_value': ''}),
     'rviz': ('show it in RViz (package rviz2), for the names as they stand', _TRUTH),
@@ -53,15 +61,11 @@ def arguments(*names: str, **defaults: str | Substitution) -> list[DeclareLaunch
             for name in names for text, more in [_ARGUMENTS[name]]]
 
 
-def truth(argument: str) -> ParameterValue:
-    """Give the value of an argument that is true or false as a parameter."""
-    return ParameterValue(LaunchConfiguration(argument), value_type=bool)
-
-
 def _sim_time(context: LaunchContext) -> dict[str, ParameterValue]:
     """Give the parameter use_sim_time where it was asked for, as files may say it too."""
-    given = LaunchConfiguration('use_sim_time').perform(context)
-    return {'use_sim_time': truth('use_sim_time')} if given else {}
+    given = LaunchConfiguration('use_sim_time')
+    return ({'use_sim_time': ParameterValue(given, value_type=bool)} if given.perform(context)
+            else {})
 
 
 def rviz() -> OpaqueFunction:
@@ -79,23 +83,25 @@ def rviz() -> OpaqueFunction:
     return OpaqueFunction(function=describe, condition=IfCondition(LaunchConfiguration('rviz')))
 
 
-def node(executable: str, name: str | Substitution, *files: str, **parameters: Any
-         ) -> OpaqueFunction:
+def node(executable: str, name: str | Substitution, *files: str,
+         says: Sequence[str] = ('base_frame', 'image_transport')) -> OpaqueFunction:
     """
     Describe a node of ours on the camera that the arguments name.
 
-    files: arguments that hold a parameter file; parameters: on top of these, with __ for a dot.
+    files: arguments that hold a parameter file; says: those that say more on top of these.
     """
     def describe(context: LaunchContext) -> list[Node]:
         for file in files:
             # ROS would say it in passing and start the node without.
             if not (path := Path(LaunchConfiguration(file).perform(context))).is_file():
                 raise DjetError(f'{file}:={path} is no file')
-        values = {key.replace('__', '.'): value for key, value in parameters.items()}
-        values.update(_sim_time(context))
-        # An empty one would take away what a file says.
-        if base_frame := LaunchConfiguration('base_frame').perform(context):
-            values['odometry.base_frame'] = base_frame
+        values = _sim_time(context)
+        for argument in says:
+            parameter, kind = _SAID[argument]
+            # An empty one would take away what a file says.
+            given = LaunchConfiguration(argument)
+            if given.perform(context):
+                values[parameter] = ParameterValue(given, value_type=kind)
         return [Node(
             package='djet_ros', executable=executable, name=name, output='screen',
             namespace=LaunchConfiguration('namespace'), respawn=LaunchConfiguration('respawn'),
