@@ -547,7 +547,9 @@ def bad_config(tmp_path, bag):
 
 @pytest.mark.parametrize('make, message', [
     (missing, 'does not exist'), (empty_bag, 'holds no message'), (no_images, 'no image topic'),
-    (no_info, 'no CameraInfo'), (late_info, 'came after a CameraInfo'), (zeros, 'all zeros'),
+    (no_info, 'no CameraInfo'), (zeros, 'all zeros'),
+    (late_info, f'came after a CameraInfo on {INFO_TOPIC} (the first one was recorded 8.000 s '
+                'after the first image); record it before'),
     (sepia, "'sepia'"), (short, '9 bytes'), (wrong_poses, '5 poses'),
     (bad_config, "did you mean 'estimator.window'"),
     (lambda t, b: [b, '--method', 'sift'], "'sift'"),
@@ -746,6 +748,21 @@ def test_another_image_size_in_the_middle_is_named(tmp_path):
                 expect=2).stderr
     assert 'changes 1 times' in said
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
+
+
+def test_images_before_the_first_camera_info_are_told(tmp_path):
+    def messages():
+        for i, (topic, message, stamp) in enumerate(drive(info=False)):
+            if i == 2:
+                yield INFO_TOPIC, camera_info(K, SIZE, stamp), stamp
+            yield topic, message, stamp
+
+    path = record(tmp_path / 'bag', messages())
+    said = djet('replay', path, '--output', tmp_path / 'r').stderr
+    assert said == (
+        f'djet: warning: 2 of {FRAMES} images came before a CameraInfo on {INFO_TOPIC} and were '
+        'left out, as live: the first one was recorded 0.200 s after the first image\n')
+    assert summary(tmp_path / 'r')['dropped'] == {'waiting_for_camera_info': 2}
 
 
 def shifted(frames, seconds):

@@ -123,6 +123,8 @@ class Replay:
         self._waiting: deque[BagMessage] = deque()
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
+        # When the first message of each topic of the camera was recorded.
+        self._first_ns: dict[str, int] = {}
         self._log = _Log()
         if not self._tracker.mounted and (frame := _frame_of_images(recording)) is not None:
             self._mount(frame)
@@ -155,13 +157,14 @@ class Replay:
         self._evaluate(summary)
         self._folder.finish(summary)
         return Outcome(summary, problem or None, (
-            *self._log.advice(), *self._of_truth(), *(
+            *self._log.advice(), *self._of_late_info(), *self._of_truth(), *(
                 f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> int:
         """Hand one message on; give how many images were worked on."""
         recording, what = self._recording, self._names.get(message.topic)
         if message.topic in (recording.image_topic, recording.info_topic):
+            self._first_ns.setdefault(message.topic, message.stamp_ns)
             self._waiting.append(message)
         elif message.topic == recording.ground_truth_topic:
             self._truth.add(*pose_of(message.message))
@@ -253,9 +256,10 @@ class Replay:
             return (f'{self._name}: none of {counts.received} images could be used; '
                     f'{log.first_problem}')
         if not counts.processed:
+            seen = self._when_info_came()
             return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
-                    f'{self._recording.info_topic}; record it too, or choose one with '
-                    '--info-topic')
+                    f'{self._recording.info_topic}{f" ({seen})" if seen else ""}; record it '
+                    'before the images, or choose one with --info-topic')
         found = []
         if log.first_problem:
             found.append(f'{_unusable(counts)} could not be used; {log.first_problem}')
@@ -266,6 +270,25 @@ class Replay:
             found.append(f'the stamps go back {len(back)} times; poses begin at the origin again '
                          f'from stamp {", ".join(map(seconds_text, back[:3]))} on')
         return f'{self._name}: {"; ".join(found)}' if found else ''
+
+    def _when_info_came(self) -> str:
+        """Say when the first CameraInfo was recorded; nothing where there is none."""
+        first = [self._first_ns.get(topic) for topic in (
+            self._recording.image_topic, self._recording.info_topic)]
+        image, info = first
+        return '' if image is None or info is None else (
+            f'the first one was recorded {(info - image) * 1e-9:.3f} s after the first image')
+
+    def _of_late_info(self) -> list[str]:
+        """Say that a recording begins with images of which no CameraInfo tells the camera."""
+        counts = self._tracker.counts
+        early = counts.dropped['waiting_for_camera_info']
+        # Those of a CameraInfo that can't be used are spoken of elsewhere.
+        if not early or not counts.processed or counts.rejected_infos:
+            return []
+        return [f'{early} of {counts.received} images came before a CameraInfo on '
+                f'{self._recording.info_topic} and were left out, as live: '
+                f'{self._when_info_came()}']
 
     def _of_truth(self) -> list[str]:
         """Say that there is ground truth, and none of it at the images."""
