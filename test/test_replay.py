@@ -501,6 +501,10 @@ def missing(tmp_path, bag):
     return [tmp_path / 'absent']
 
 
+def device(tmp_path, bag):
+    return ['/dev/null']
+
+
 def empty_bag(tmp_path, bag):
     return [record(tmp_path / 'empty', [])]
 
@@ -547,6 +551,7 @@ def bad_config(tmp_path, bag):
 
 @pytest.mark.parametrize('make, message', [
     (missing, 'does not exist'), (empty_bag, 'holds no message'), (no_images, 'no image topic'),
+    (device, '/dev/null is neither a file nor a folder; give a bag or a folder'),
     (no_info, 'no CameraInfo'), (zeros, 'all zeros'),
     (late_info, f'came after a CameraInfo on {INFO_TOPIC} (the first one was recorded 8.000 s '
                 'after the first image); record it before'),
@@ -581,6 +586,14 @@ def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_
         assert said.count('\n') == 1
         assert 'readable' not in said
     assert file.read_text() == ''
+
+
+def test_a_place_that_is_a_link_to_nothing_or_has_no_name_is_said(folder, tmp_path):
+    (tmp_path / 'link').symlink_to(tmp_path / 'gone')
+    for place, why in ((tmp_path / 'link', f'is a link to {tmp_path}/gone, which does not exist'),
+                       ('', 'argument --output: it is empty; name a place')):
+        assert why in djet('replay', folder, '--output', place, expect=2).stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['link']
 
 
 def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_path):

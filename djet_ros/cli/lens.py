@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from djet_ros.cli.options import add_overwrite, add_topics
+from djet_ros.cli.options import add_overwrite, add_topics, place
 from djet_ros.cli.replay import configured
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.flags import add_flags
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE',
                         help='bag or folder, as for djet replay')
-    parser.add_argument('--output', type=Path, metavar='DIR',
+    parser.add_argument('--output', type=place, metavar='DIR',
                         help=f'folder for {PLOT}, pixels by radius, and {YAML}, the CameraInfo '
                         'with another k1 as camera_info_manager reads it, where that is worth '
                         'correcting and the images are not rectified')

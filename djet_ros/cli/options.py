@@ -12,10 +12,17 @@ from djet_ros.errors import DjetError
 from djet_ros.recordings.outputs import check_file, make_folder, write_whole
 
 
+def place(text: str) -> Path:
+    """Give the place that an --output names; '' is more likely a variable that is not set."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError('it is empty; name a place')
+    return Path(text)
+
+
 def add_output(parser: argparse.ArgumentParser, what: str, default: str | None = None,
                metavar: str = 'DIR') -> None:
     """Add --output, required unless there is a default, and --overwrite."""
-    parser.add_argument('--output', type=Path, metavar=metavar, required=default is None,
+    parser.add_argument('--output', type=place, metavar=metavar, required=default is None,
                         default=default and Path(default),
                         help=what + (' (default: %(default)s)' if default else ''))
     add_overwrite(parser)

@@ -71,6 +71,9 @@ def make_folder(folder: Path) -> None:
 
 def _check_bars(folder: Path) -> None:
     for place in (*reversed(folder.parents), folder):
+        if place.is_symlink() and not place.exists():
+            raise DjetError(f'{place} is a link to {os.readlink(place)}, which does not exist; '
+                            'choose another --output')
         if place.exists() and not place.is_dir():
             raise DjetError(f'{place} exists and is no folder; choose another --output')
 

@@ -306,6 +306,8 @@ def open_recording(path: Path, image_topic: str | None = None, info_topic: str |
     that can't be decoded are handed on as a bag's are, as CompressedImage. Raises DjetError.
     """
     beside = beside or {}
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise DjetError(f'{path} is neither a file nor a folder; give a bag or a folder of images')
     if is_bag(path) or not path.exists():
         return BagRecording(path, image_topic, info_topic, poses, beside, strict)
     if strict and (image_topic or info_topic or beside.keys() - {'imu'} or any(beside.values())):
