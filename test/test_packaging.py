@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 from xml.etree import ElementTree
 
 import djet_ros
@@ -52,6 +53,21 @@ def environment(copied: Callable[[str], Path]) -> Path:
     run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', folder, cwd=source)
     archive, = folder.glob('*.tar.gz')
     return installed(archive, folder)
+
+
+def test_the_source_distribution_is_the_whole_source_tree(tmp_path: Path) -> None:
+    tree = tmp_path / 'djet_ros'
+    shutil.copytree(ROOT, tree, ignore=NOT_SOURCE)
+    shutil.copytree(ROOT / '.ci', tree / '.ci', ignore=NOT_SOURCE)
+    files = {str(path.relative_to(tree)) for path in tree.rglob('*') if path.is_file()}
+    assert {'test/conftest.py', 'test/lowest.txt', 'doc/node.md', 'CHANGELOG.rst'} <= files
+    run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', tmp_path, cwd=tree)
+    archive, = tmp_path.glob('*.tar.gz')
+    with tarfile.open(archive) as packed:
+        names = {member.name.partition('/')[2] for member in packed if member.isfile()}
+    assert names >= files
+    made = {name for name in names - files if '.egg-info/' not in name}
+    assert made == {'PKG-INFO'}
 
 
 def installed(source: Path, folder: Path) -> Path:
