@@ -1,6 +1,7 @@
 """Installs djet_ros, with pip as well as with colcon (build type ament_python)."""
 
 from glob import glob
+from pathlib import Path
 
 from setuptools import Extension
 from setuptools import find_packages
@@ -11,6 +12,20 @@ package_name = 'djet_ros'
 setup(
     name=package_name,
     description='Visual odometry by D-JET: pose optimisation on descriptor surfaces',
+    # Where colcon links the sources, this file leads to them.
+    long_description=Path(__file__).resolve().with_name('README.md').read_text('utf-8'),
+    long_description_content_type='text/markdown',
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Environment :: Console',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: C',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Topic :: Scientific/Engineering :: Image Recognition',
+    ],
     maintainer='The djet_ros maintainers',
     maintainer_email='maintainers@djet-ros.invalid',
     license='Apache-2.0',

@@ -187,6 +187,14 @@ def test_the_manifest_is_valid_and_agrees_with_setup_py(distribution: Distributi
     assert {'launch', 'launch_xml'} <= {one.name for one in manifest.exec_depends}
 
 
+def test_the_package_tells_people_what_it_is(distribution: Distribution) -> None:
+    metadata = distribution.metadata
+    assert metadata['Description-Content-Type'] == 'text/markdown'
+    told = metadata.get_payload() or metadata['Description']
+    assert told.strip() == (ROOT / 'README.md').read_text('utf-8').strip()
+    assert 'Operating System :: POSIX :: Linux' in metadata.get_all('Classifier')
+
+
 def test_every_dependency_is_bounded_and_the_lower_bounds_are_tested(
         distribution: Distribution) -> None:
     requirements = [Requirement(line) for line in distribution.requires or []]
