@@ -418,12 +418,21 @@ def test_what_was_built_of_other_sources_is_left_out(monkeypatch: pytest.MonkeyP
         assert compiled._loaded() is None
 
 
-def test_who_wants_to_can_do_without() -> None:
+SAID = '''
+from djet_ros import compiled
+from djet_ros.config.sections import Config
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.decoding import message_type
+print(compiled.library is None, Tracker(Config(), message_type).diagnosis().values['inner loops'])
+'''
+
+
+def test_who_wants_to_can_do_without_and_the_diagnostics_say_so() -> None:
     answers = [subprocess.run(
-        [sys.executable, '-c', 'from djet_ros import compiled; print(compiled.library is None)'],
+        [sys.executable, '-c', SAID],
         env={**os.environ, 'DJET_COMPILED': told}, capture_output=True, text=True, check=True
     ).stdout.strip() for told in ('0', '1')]
-    assert answers == ['True', 'False']
+    assert answers == ['True NumPy', 'False compiled']
 
 
 def test_what_cannot_be_loaded_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -61,6 +61,11 @@ def _loaded() -> ctypes.CDLL | None:
 library = _loaded()
 
 
+def in_use() -> str:
+    """Say for people which inner loops run: 'compiled' ones, or those in 'NumPy'."""
+    return 'NumPy' if library is None else 'compiled'
+
+
 def place(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
           inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """

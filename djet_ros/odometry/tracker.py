@@ -12,6 +12,7 @@ from collections.abc import Callable
 import math
 from typing import Any, NamedTuple
 
+from djet_ros import compiled
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.parallel import started_beside
@@ -409,6 +410,7 @@ class Tracker:
         diagnosis = diagnose(self.state, self.detail, self.counts,
                              self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
+        diagnosis.values['inner loops'] = compiled.in_use()
         if (lens := self._odometry.lens) is not None:
             diagnosis.values['distortion left (k1)'] = f'{lens.k1:.4f} +- {lens.sigma:.4f}'
         diagnosis.values.update(self._beside.values())

@@ -12,7 +12,7 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import cv2
-from djet_ros import __version__
+from djet_ros import __version__, compiled
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError, one_line
@@ -322,7 +322,7 @@ class Replay:
             'seconds': round(seconds, 3),
             'images': counts.received, 'dropped': dict(counts.dropped),
             'rejected': dict(counts.rejected), 'rejected_infos': dict(counts.rejected_infos),
-            'status': dict(counts.status),
+            'status': dict(counts.status), 'inner_loops': compiled.in_use(),
             'versions': {'djet_ros': __version__, 'numpy': np.__version__,
                          'opencv': cv2.__version__},
         }
