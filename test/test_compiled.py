@@ -418,13 +418,13 @@ def test_what_was_built_of_other_sources_is_left_out(monkeypatch: pytest.MonkeyP
         assert compiled._loaded() is None
 
 
-SAID = '''
+SAID = """
 from djet_ros import compiled
 from djet_ros.config.sections import Config
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
 print(compiled.library is None, Tracker(Config(), message_type).diagnosis().values['inner loops'])
-'''
+"""
 
 
 def test_who_wants_to_can_do_without_and_the_diagnostics_say_so() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
-from djet_ros.live.middleware import Profile
+from djet_ros.live.middleware import Offer, Profile
 from djet_ros.live.odometry_face import OdometryFace
 import numpy as np
 import pytest
@@ -20,10 +20,13 @@ from ros_messages import camera_info, image, message_type
 class Graph:
     """A middleware of nobody else; frames: what tf knows, by parent and child."""
 
-    qos_remedy, senders_wait, node = '', False, '/vo_node'
+    qos_remedy, senders_wait, node = 'overrides of {topic}', False, '/vo_node'
     message_type = staticmethod(message_type)
 
     def __init__(self) -> None:
+        self.lines: list[str] = []
+        # What publishers offer, by topic.
+        self.offered: dict[str, Profile] = {}
         self.callbacks: dict[str, Callable[[Any], None]] = {}
         self.frames: dict[tuple[str, str], Any] = {}
         self.hears_tf = False
@@ -38,7 +41,7 @@ class Graph:
         return 0
 
     def log(self, level: str, text: str) -> None:
-        pass
+        self.lines.append(text)
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
         pass
@@ -50,10 +53,10 @@ class Graph:
                ready: Callable[[], bool] | None = None) -> Any:
         self.callbacks[topic] = callback
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
-                               new_refusals=lambda: 0)
+                               new_refusals=lambda: int(topic in self.offered))
 
     def offers(self, topic: str) -> list[Any]:
-        return []
+        return [Offer('/sender', '', self.offered[topic])] if topic in self.offered else []
 
     def published(self, kind: str) -> list[str]:
         return []
@@ -134,3 +137,17 @@ def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node)
     {}, {'odometry.imu': True, 'odometry.imu_rotation': '0 0 0 1'}])
 def test_tf_is_not_heard_where_nothing_is_asked_of_it(node, parameters):
     assert not node(**parameters).graph.hears_tf
+
+
+@pytest.mark.parametrize(('topic', 'offered', 'remedy'), [
+    ('/image', Profile(reliable=False), 'set ros.queue_policy to latest or overrides of /image'),
+    ('/imu', Profile(reliable=False), 'set ros.queue_policy to latest or overrides of /imu'),
+    ('/tf_static', Profile(latched=False), 'have it offer reliable, transient_local')])
+def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic, offered, remedy):
+    one = node(**{'ros.queue_policy': 'every', 'odometry.imu': True, 'odometry.guess': True,
+                  'odometry.guess_frame': 'wheels'})
+    one.graph.offered[topic] = offered
+    for _ in range(2):
+        one.face._tick()
+    line, = (line for line in one.graph.lines if line.startswith('incompatible QoS'))
+    assert line.endswith(f'Nothing is received from it; {remedy}')

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 import signal
 import subprocess
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
@@ -154,6 +154,16 @@ def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
     assert len(first) == len(WAYS)
     for stamp, here in first.items():
         assert np.allclose(map_to_odom[stamp] @ odom_to_child[stamp], here, atol=1e-9)
+
+
+def test_an_odometry_that_does_not_fit_is_said_with_what_can_be_mended(nodes, camera):
+    one = nodes('pose_graph_node', **SLAM_PARAMETERS)
+    camera.advertise(ODOMETRY, TYPES[ODOMETRY], listeners=0, reliability='best_effort')
+    end = monotonic() + 30
+    while 'incompatible QoS' not in one.log and monotonic() < end:
+        sleep(0.1)
+    assert ('Nothing is received from it; have it offer reliable, volatile, or set '
+            f'qos_overrides.{ODOMETRY}.subscription.*') in one.log
 
 
 def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:

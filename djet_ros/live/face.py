@@ -70,6 +70,8 @@ class Face:
         # ROS types of what is heard, by topic.
         self._kinds: dict[str, str] = {}
         self._refused: list[Subscription] = []
+        # Topics whose quality of service is as our parameters say.
+        self._as_configured: set[str] = set()
         self._images: Subscription | None = None
         self._latched = self._follows_frames = False
         self._remedy = 'ros.qos_reliability to best_effort'
@@ -152,9 +154,16 @@ class Face:
                 self._middleware.resolve(full_name(topic)), outputs[topic])
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
-        """Subscribe to a resolved topic; a publisher that does not fit is reported."""
+               profile: Profile, ready: Callable[[], bool] | None = None, *,
+               as_configured: bool = True) -> Subscription:
+        """
+        Subscribe to a resolved topic; a publisher that does not fit is reported.
+
+        as_configured: whether its profile is that of ``input_profile``, which a parameter mends.
+        """
         self._kinds[topic] = kind
+        if as_configured:
+            self._as_configured.add(topic)
         self._inputs.append(self._middleware.listen(topic, kind, callback, profile, ready))
         return self._inputs[-1]
 
@@ -214,8 +223,15 @@ class Face:
             if ours.incompatible_with(offered):
                 self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
                          f'{self._middleware.node} asks for {ours}. Nothing is received from it; '
-                         f'set {self._remedy}'
-                         + self._middleware.qos_remedy.format(topic=topic))
+                         + self._qos_remedy(topic, ours))
+
+    def _qos_remedy(self, topic: str, ours: Profile) -> str:
+        overrides = self._middleware.qos_remedy.format(topic=topic)
+        if topic in self._as_configured:
+            return ' or '.join(filter(None, [f'set {self._remedy}', overrides]))
+        # What is latched is asked for as it is offered, whatever overrides say.
+        return f'have it offer {ours}' + (
+            f', or set {overrides}' if overrides and not ours.latched else '')
 
 
 def _transport_remedy(kinds: Collection[str]) -> str:

@@ -32,7 +32,8 @@ class GraphFace(Face):
         for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
                                                  self.session.relative_pose,
                                                  self.session.relative_pose_status)):
-            self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH))
+            self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH),
+                        as_configured=False)
         if config.odometry.mask:
             self.listen(middleware.resolve('mask'), BESIDE_TYPES['mask'], self.session.mask,
                         replace(input_profile(config.ros), depth=config.slam.image_buffer))

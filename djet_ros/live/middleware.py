@@ -74,8 +74,7 @@ class Subscription(Protocol):
 class Middleware(Protocol):
     """The graph as one node sees it. Callbacks come from the thread that calls ``spin``."""
 
-    # What else to set, beside our own parameter, where a publisher's quality of service does not
-    # fit.
+    # What else can be set where a publisher's quality of service does not fit; {topic} in it.
     qos_remedy: str
 
     # Whether publishers can be made to wait for a subscription that does not take messages.

@@ -68,7 +68,7 @@ class OdometryFace(Face):
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))
             self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
-                        Profile(depth=_FRAMES_DEPTH, latched=True))
+                        Profile(depth=_FRAMES_DEPTH, latched=True), as_configured=False)
             self._hears_tf = True
         if config.odometry.scale == 'speed' and not self._hears_speed:
             for topic, kind in SPEED_TYPES.items():

@@ -124,7 +124,7 @@ class RosSubscription:
 class RosMiddleware:
     """The ROS graph as a node sees it."""
 
-    qos_remedy = ' or qos_overrides.{topic}.subscription.*'
+    qos_remedy = 'qos_overrides.{topic}.subscription.*'
     senders_wait = False
     message_type = staticmethod(message_type)
 
