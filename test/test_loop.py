@@ -33,8 +33,8 @@ def block(tmp_path_factory):
     return render_sequence('loop', tmp_path_factory.mktemp('dataset'), size=(310, 94))
 
 
-@pytest.mark.parametrize(('keyframes', 'least'), [('distance', 3), ('odometry', 2)])
-def test_closing_the_loop_divides_the_trajectory_error(block, tmp_path, keyframes, least):
+@pytest.mark.parametrize('keyframes', ['distance', 'odometry'])
+def test_closing_the_loop_halves_the_trajectory_error(block, tmp_path, keyframes):
     done = subprocess.run(
         [*DJET, 'slam', block, '--output', tmp_path / 'slam',
          '--keyframes', keyframes, '--scale', 'ground_truth', '--scale-uncertainty', '0.01'],
@@ -46,10 +46,12 @@ def test_closing_the_loop_divides_the_trajectory_error(block, tmp_path, keyframe
     assert said['frames'] == 427
     assert said['edges']['loop'] > 100
     assert said['rejected']['loop'] < 0.2 * said['edges']['loop']
-    assert before['ape_m'] > 0.1  # there is something to be closed
-    assert after['ape_m'] < before['ape_m'] / least
+    # How much there is to be closed, rounding decides: 9 to 14 cm after 362 m. What is left does
+    # not depend on it.
+    assert after['ape_m'] < 0.05
+    assert after['ape_m'] < before['ape_m'] / 2
     if 'evo_ape_m' in before:
-        assert after['evo_ape_m'] < before['evo_ape_m'] / least
+        assert after['evo_ape_m'] < before['evo_ape_m'] / 2
         # Loops mend the way as a whole. From frame to frame, lengths that were exact give way by
         # no more than they were said to be unsure.
         step = said['way'] / (said['frames'] - 1)
