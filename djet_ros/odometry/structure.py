@@ -298,7 +298,7 @@ class OneScale:
             self._speed = addition.length / seconds
         else:
             usual = max(usual, self._speed * seconds)
-        self._doubt((_WANDERING * own * addition.length / usual)**2)
+        self._doubt((_WANDERING * min(addition.sigma / usual, 1.0))**2)
         return own
 
     def _doubt(self, variance: float) -> None:
