@@ -285,10 +285,11 @@ def spanning(covariance: Array, t: Array, apart: Array, probability: float
 
 def widened(covariance: Array, t: Array, other: Array) -> tuple[Array, Array]:
     """
-    Widen a covariance (5, 5) by that of another pose (6, 6), over (rotation vector, t).
+    Widen a covariance (5, 5) by another one (6, 6), over (rotation vector, t), of what errs too.
 
-    Where that may as well be the true one, which is spanned, the truth is as far from it as it
-    says. Gives it as ``spanning`` does; as it was where the other is not determined.
+    That is what a calibration does; and a rival, which is spanned and may as well be the true
+    motion, is as far from the truth as its own covariance says. Gives it as ``spanning`` does; as
+    it was where the other is not determined.
     """
     if np.isfinite(other).all():
         basis = lift(sphere_tangents(t))

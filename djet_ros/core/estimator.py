@@ -190,7 +190,7 @@ class TwoViewEstimator:
                 return None
             start, agree = found
             pair = replace(pair, x=pair.x[agree], y=pair.y[agree], ahead=None, bits=None,
-                           covariances=_of(pair.covariances, agree), left_out=int((~agree).sum()))
+                           covariances=_of(pair.covariances, agree), outliers=int((~agree).sum()))
             return pair, [start], self._sampled(pair)
         if pair.ahead is not None:
             with _timed(pair.timings, 'jet'):

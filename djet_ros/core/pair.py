@@ -55,8 +55,8 @@ class Pair:
     may be zeros; limits: beyond these it is given up; bits: (N,) in which descriptors at x and y
     differ, where that is known already; covariances: (N, 2, 2) of y, up to a common factor, which
     re-projection errors count by, all alike where they are not told; sought: of how many features,
-    see ``RelativePose``; left_out: how many matches more there were, with which a starting pose
-    does not agree; observe: is shown each round of Algorithm 1; timings: gets the seconds of each
+    see ``RelativePose``; outliers: how many matches more there were, which do not agree with a
+    starting pose; observe: is shown each round of Algorithm 1; timings: gets the seconds of each
     stage.
     """
 
@@ -71,6 +71,6 @@ class Pair:
     bits: Array | None = None
     covariances: Array | None = None
     sought: int = 0
-    left_out: int = 0
+    outliers: int = 0
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)

@@ -133,7 +133,7 @@ def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfi
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
     chance = 4 * TRACK_TUNING.inlier * track.scale / (np.pi * radius)
-    return false_alarms(agreeing, len(track.voting) + pair.left_out, chance) > 0
+    return false_alarms(agreeing, len(track.voting) + pair.outliers, chance) > 0
 
 
 def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: Array,

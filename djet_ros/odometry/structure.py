@@ -167,15 +167,10 @@ class OneScale:
         if addition is None:
             return Step(relative, self._in_metres(measured) if measured.known
                         else self.of_rest(span_ns))
-        pair = relative
-        if not pair.t.any():
-            told = _as_landmarks_tell(relative, addition, guess)
-            if told is relative:
-                # A window that tells nothing has its newest frame anywhere; the way may be that
-                # of a usual step.
-                addition = replace(addition, length=guess, sigma=guess)
-            relative = told
-        own = self._wandered(addition, pair, seconds)
+        parallax = bool(relative.t.any())
+        if not parallax:
+            relative, addition = _as_landmarks_tell(relative, addition, guess)
+        own = self._wandered(addition, seconds, parallax)
         if measured.known:
             self._hear(measured, addition.length, own, seconds)
             # Until the factor is known, lengths are as sure as they are measured.
@@ -217,7 +212,7 @@ class OneScale:
                 Pose(relative.R, relative.t), relative.x, relative.y_opt):
             self.begin(current)
         elif (addition := self._added(current, relative, self._speed * seconds)) is not None:
-            self._wandered(addition, relative, seconds)
+            self._wandered(addition, seconds, parallax=True)
             self._window.tell(told)
 
     def of_rest(self, span_ns: tuple[int, int]) -> Length:
@@ -285,7 +280,7 @@ class OneScale:
         self._kept = np.ones(2)
         return common
 
-    def _wandered(self, addition: Addition, relative: RelativePose, seconds: float) -> float:
+    def _wandered(self, addition: Addition, seconds: float, parallax: bool) -> float:
         """
         Take note of what a step was, and give how sure its length is, as a share of it.
 
@@ -294,7 +289,7 @@ class OneScale:
         """
         own, self._torn = min(addition.sigma / addition.length, 1.0), False
         usual = addition.length
-        if relative.t.any() or self._speed is None:
+        if parallax or self._speed is None:
             self._speed = addition.length / seconds
         else:
             usual = max(usual, self._speed * seconds)
@@ -365,18 +360,20 @@ def _tells(lengths: Array) -> bool:
     return bool(lengths[0]**2 > _SURPRISE * lengths[1])
 
 
-def _as_landmarks_tell(relative: RelativePose, addition: Addition, usual: float) -> RelativePose:
+def _as_landmarks_tell(relative: RelativePose, addition: Addition, usual: float
+                       ) -> tuple[RelativePose, Addition]:
     """
     Give a pair without parallax the motion of the window, where that is surer than none.
 
-    usual: length of a step, which is how unsure no translation would be. Its status stays, which
-    is that of the two images.
+    usual: length of a step, which is how unsure no translation would be. A window that tells less
+    has its newest frame anywhere: the pair stays, and may have gone as far as usual. Its status
+    stays in any case, which is that of the two images.
     """
     if np.linalg.eigvalsh(addition.covariance[3:, 3:])[-1] > usual**2:
-        return relative
+        return relative, replace(addition, length=usual, sigma=usual)
     to_unit = np.diag(np.repeat([1.0, 1 / addition.length], 3))
     to_unit[3:, 3:] -= np.outer(addition.t, addition.t) / addition.length**3
     t, covariance = addition.t / addition.length, to_unit @ addition.covariance @ to_unit
     basis = lift(sphere_tangents(t))
     return replace(relative, R=addition.R, t=t, covariance_5=basis.T @ covariance @ basis,
-                   covariance_6=covariance)
+                   covariance_6=covariance), addition

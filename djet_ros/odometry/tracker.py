@@ -467,10 +467,9 @@ class Tracker:
 
     def _astray(self, image: Any, following: Any, newest: Frame) -> str:
         """Why an image that leaps is of no use: ahead, where the next one goes on before it."""
-        if following is None or not self.leaps(image):
-            return ''
-        step = stamp_ns(following.header) - newest.stamp_ns
-        return 'ahead' if 0 < step <= self.config.odometry.max_gap * 1e9 else ''
+        goes_on = (following is not None and stamp_ns(following.header) > newest.stamp_ns
+                   and not self.leaps(following))
+        return 'ahead' if goes_on and self.leaps(image) else ''
 
     def _out_of_order(self, stamp: int, newest: Frame) -> str:
         """Why an image is of no use beside the newest one: equal_stamp, late, or nothing."""

@@ -273,9 +273,8 @@ class Replay:
 
     def _when_info_came(self) -> str:
         """Say when the first CameraInfo was recorded; nothing where there is none."""
-        first = [self._first_ns.get(topic) for topic in (
-            self._recording.image_topic, self._recording.info_topic)]
-        image, info = first
+        image, info = (self._first_ns.get(topic) for topic in (
+            self._recording.image_topic, self._recording.info_topic))
         return '' if image is None or info is None else (
             f'the first one was recorded {(info - image) * 1e-9:.3f} s after the first image')
 
