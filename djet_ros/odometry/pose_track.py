@@ -35,8 +35,7 @@ class PoseTrack:
         """Take a pose (4, 4); NaN ones are ignored, and so are those of a stamp that is known."""
         if not np.isfinite(pose).all() or stamp_ns in self._poses:
             return
-        if self._poses.goes_back(stamp_ns):
-            self.reset()
+        self.go_back(stamp_ns)
         self._poses.add(stamp_ns, pose)
 
     def covers(self, stamp_ns: int) -> bool:

@@ -219,8 +219,7 @@ class SpeedScale(ScaleSource):
         """Take a measured speed; one beyond any sense, or of a stamp that has one, is ignored."""
         if not abs(metres_per_second) <= _FASTEST or stamp_ns in self._speeds:
             return
-        if self._speeds.goes_back(stamp_ns):
-            self.reset()
+        self.go_back(stamp_ns)
         self._speeds.add(stamp_ns, abs(float(metres_per_second)))
 
     def between(self, start_ns: int, end_ns: int) -> Length:
