@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import SimpleNamespace
 
-import cv2
 from djet_ros.core.basins import lowest_around
 from djet_ros.core.covariance import difference, spanning, squared_distance
 from djet_ros.core.estimator import TwoViewEstimator
@@ -31,9 +30,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 from two_view import (
+    CLOSE_UP,
     FORWARD,
     K,
     moved_pose,
+    pictures_of_a_plane,
     project,
     SIDEWAYS,
     SIZE,
@@ -164,34 +165,12 @@ def test_the_motion_before_decides_between_them() -> None:
     assert estimate(x, y, Pose(guess.R, guess.t)).status is Status.OK
 
 
-CLOSE_UP, SMALL = np.array([[268.0, 0, 319.5], [0, 268.0, 170], [0, 0, 1]]), (640, 360)
-
-
-def view_of_a_plane(rng: np.random.Generator, texture: np.ndarray, turned: np.ndarray,
-                    R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Picture (H, W) of a plane that stands 8 before the first camera, turned (3, 3) from that."""
-    middle, finer = len(texture) / 2, np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
-    on_plane = np.column_stack([turned[:, :2] / 80, 8 * turned[:, 2]]) @ np.array(
-        [[1, 0, -middle], [0, 1, -middle], [0, 0, 1]])
-    H = finer @ CLOSE_UP @ (R @ on_plane + np.outer(t, [0, 0, 1]))
-    seen = cv2.resize(cv2.warpPerspective(texture, H, (2 * SMALL[0], 2 * SMALL[1])), SMALL,
-                      interpolation=cv2.INTER_AREA)
-    return np.clip(np.rint(seen + rng.normal(0, 1.5, seen.shape)), 0, 255).astype(np.uint8)
-
-
 @pytest.mark.parametrize('seed', range(4))
 def test_no_picture_of_a_plane_alone_is_sure_of_the_wrong_one_of_its_motions(seed: int) -> None:
     rng, estimator, sure = np.random.default_rng(seed), TwoViewEstimator(), 0
     for _ in range(8):
-        texture = 128 + 28 * sum(cv2.resize(rng.normal(size=(2048 // side, 2048 // side)),
-                                            (2048, 2048), interpolation=cv2.INTER_CUBIC)
-                                 for side in (8, 16, 64))
-        turned = Rotation.from_euler('xy', rng.uniform(-40, 40, 2), degrees=True).as_matrix()
-        R = Rotation.from_euler('xyz', rng.normal(0, 2, 3), degrees=True).as_matrix()
-        t = rng.choice([0.1, 0.4]) * unit(rng.normal(size=3))
-        one, other = (estimator.view(view_of_a_plane(rng, texture, turned, *motion), CLOSE_UP)
-                      for motion in ((np.eye(3), np.zeros(3)), (R, t)))
-        result = estimator.estimate(one, other)
+        R, t, *pictures = pictures_of_a_plane(rng)
+        result = estimator.estimate(*(estimator.view(gray, CLOSE_UP) for gray in pictures))
         assert result.status in (Status.OK, Status.AMBIGUOUS)
         # Where it is wrong, its ellipsoid spans both.
         off = difference(result.R, result.t, Pose(R, unit(t)))

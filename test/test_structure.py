@@ -323,6 +323,19 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
     assert scale.agrees(aside, pair.x[few], wrong[few]) is None
 
 
+def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_too(cards):
+    """On a slow way no frame but the first two stays, though many confirmed what these told."""
+    ways = [pose(x=0.04)] * 7
+    pair = Drive(cards).go(ways)[-1].relative
+    drive = Drive(cards)
+    drive.go(ways[:-1])
+    window = drive.odometry._one_scale._window
+    assert len(window._views) == 3
+    aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    agree, asked = window.agreement(aside, pair.x, pair.y_opt)
+    assert asked > 50 and agree > 0.9 * asked
+
+
 def test_another_estimator_goes_on_at_the_last_speed(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12)] * 3)

@@ -30,6 +30,8 @@ from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from two_view import CLOSE_UP, pictures_of_a_plane
 
 ESTIMATOR = EstimatorConfig(max_features=800)
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
@@ -137,6 +139,31 @@ def test_one_bad_frame_is_bridged_by_the_next_good_one(cards):
     assert np.array_equal(bad.pose, results[1].pose)
     assert np.diag(bad.motion_covariance).min() > 1
     assert np.degrees(rotation_angle(bridged.motion[:3, :3], STEP[:3, :3])) < 0.3
+
+
+def test_a_pair_whose_direction_is_in_doubt_still_turns_the_pose():
+    rng, doubted = np.random.default_rng(0), []
+    for _ in range(24):
+        R, _, *pictures = pictures_of_a_plane(rng)
+        result = drive_past(pictures)[-1]
+        if result.status is not Status.AMBIGUOUS:
+            continue
+        off = Rotation.from_matrix(result.pose[:3, :3] @ R).as_rotvec()
+        # Which way it went nobody knows, but how far it turned at most.
+        sure = result.pose_covariance[3:, 3:]
+        assert off @ np.linalg.solve(sure, off) < chi2.ppf(0.999, 3)
+        assert np.array_equal(result.pose[:3, 3], np.zeros(3))
+        assert np.linalg.eigvalsh(result.pose_covariance[:3, :3])[0] > 1e5
+        doubted.append((np.linalg.norm(off), rotation_angle(R, np.eye(3))))
+    assert len(doubted) >= 6
+    # Nearly always that is nearer than where it was last seen.
+    assert np.mean([off < turn for off, turn in doubted]) > 0.8
+
+
+def drive_past(pictures):
+    """Process pictures of the wide camera."""
+    vo = VisualOdometry()
+    return [vo.process(Frame(gray, CLOSE_UP, (i + 1) * 10**8)) for i, gray in enumerate(pictures)]
 
 
 def test_after_too_many_bad_pairs_the_reference_is_given_up_and_the_pose_says_so(cards):

@@ -88,3 +88,33 @@ def some(features: Features, chosen: np.ndarray | slice) -> Features:
 def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:
     """View of a wall without any texture."""
     return TwoViewEstimator().view(np.full(size[::-1], gray, np.uint8), K)
+
+
+# A wide camera, near to what it sees.
+CLOSE_UP, SMALL = np.array([[268.0, 0, 319.5], [0, 268.0, 170], [0, 0, 1]]), (640, 360)
+
+
+def pictures_of_a_plane(rng: np.random.Generator
+                        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Give R (3, 3), t (3,) and both pictures (H, W) of one textured plane, on some motion."""
+    texture = 128 + 28 * sum(cv2.resize(rng.normal(size=(2048 // side, 2048 // side)),
+                                        (2048, 2048), interpolation=cv2.INTER_CUBIC)
+                             for side in (8, 16, 64))
+    turned = Rotation.from_euler('xy', rng.uniform(-40, 40, 2), degrees=True).as_matrix()
+    R = Rotation.from_euler('xyz', rng.normal(0, 2, 3), degrees=True).as_matrix()
+    t = rng.choice([0.1, 0.4]) * unit(rng.normal(size=3))
+    one, other = (_view_of_a_plane(rng, texture, turned, *motion)
+                  for motion in ((np.eye(3), np.zeros(3)), (R, t)))
+    return R, t, one, other
+
+
+def _view_of_a_plane(rng: np.random.Generator, texture: np.ndarray, turned: np.ndarray,
+                     R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Picture (H, W) of a plane that stands 8 before the first camera, turned (3, 3) from that."""
+    middle, finer = len(texture) / 2, np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
+    on_plane = np.column_stack([turned[:, :2] / 80, 8 * turned[:, 2]]) @ np.array(
+        [[1, 0, -middle], [0, 1, -middle], [0, 0, 1]])
+    H = finer @ CLOSE_UP @ (R @ on_plane + np.outer(t, [0, 0, 1]))
+    seen = cv2.resize(cv2.warpPerspective(texture, H, (2 * SMALL[0], 2 * SMALL[1])), SMALL,
+                      interpolation=cv2.INTER_AREA)
+    return np.clip(np.rint(seen + rng.normal(0, 1.5, seen.shape)), 0, 255).astype(np.uint8)

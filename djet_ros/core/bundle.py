@@ -154,7 +154,8 @@ class Landmarks:
     patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
     where they would be seen without k1; rho: (N,) inverse depths there; slopes: (N, 2) by which
     share these change around them, a pixel; strengths: (N,) how much their patches differ from
-    pixel to pixel; minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
+    pixel to pixel; sightings: (N,) how often they were seen since, by frames that are gone too;
+    minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
     ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
     """
 
@@ -165,6 +166,7 @@ class Landmarks:
     rho: Array
     slopes: Array
     strengths: Array
+    sightings: NDArray[np.int64]
     minima: Array
     roots: Array
     seen: NDArray[np.bool_]
@@ -184,8 +186,9 @@ class Landmarks:
         return cls(np.full(n, anchor, np.int64), found, np.zeros((n, 2, 2)),
                    found if points is None else points, rho,
                    np.zeros((n, 2)) if slopes is None else slopes,
-                   np.ones(n) if strengths is None else strengths, np.zeros((n, frames, 2)),
-                   np.zeros((n, frames, 2, 2)), np.zeros((n, frames), bool))
+                   np.ones(n) if strengths is None else strengths, np.zeros(n, np.int64),
+                   np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),
+                   np.zeros((n, frames), bool))
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
         """Give some of the landmarks."""
@@ -237,7 +240,7 @@ class Landmarks:
 
     def _by_anchor(self) -> tuple[Any, ...]:
         return self.anchors, self.found, self.held, self.points, self.rho, self.slopes, \
-            self.strengths
+            self.strengths, self.sightings
 
     def _by_frame(self) -> tuple[Any, ...]:
         return self.minima, self.roots, self.seen

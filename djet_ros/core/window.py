@@ -312,7 +312,7 @@ class Window:
         that their depths do not come from one pair. The motion's length is the one that serves
         them best.
         """
-        newest = self._landmarks.seen[:, -1] & (self._landmarks.seen.sum(1) > 2)
+        newest = self._landmarks.seen[:, -1] & (self._landmarks.sightings > 2)
         finite = np.isfinite(y).all(1)
         x, y = x[finite], y[finite]
         known, match = self._beside(x, newest)
@@ -411,6 +411,7 @@ class Window:
             self._landmarks.minima[sighted.which, -1] = sighted.places
             self._landmarks.roots[sighted.which, -1] = sighted.roots
             self._landmarks.seen[sighted.which, -1] = True
+            self._landmarks.sightings[sighted.which] += 1
 
     def _refine(self) -> Array:
         """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
@@ -423,6 +424,7 @@ class Window:
             observed, prior = self._moved(observed, prior, step, reduced.change(step))
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
+        np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
         return H

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.covariance import UNKNOWN
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import agrees, fused, Turn
@@ -58,7 +59,7 @@ class OdometryResult:
     was related to, None where it restarted; relative: the estimator's answer for that pair;
     motion: (4, 4) the current camera in the reference camera; pose: (4, 4) the current camera in
     the first camera (where the motion could not be estimated the last known one, turned as far
-    as a gyro tells);
+    as a gyro tells, or a pair that is AMBIGUOUS);
     motion_covariance, pose_covariance: (6, 6) in ROS order; scale: length that a unit translation
     was given; scale_known: whether that means anything, in metres if `metric` and otherwise in the
     one unit of the track; measured: whether its source measured it, and not landmarks alone;
@@ -297,7 +298,7 @@ class VisualOdometry:
             return relative
         agrees = self._one_scale.agrees(Pose(relative.R, relative.t), relative.x, relative.y_opt)
         if relative.status is Status.OK and agrees is False:
-            return replace(relative, status=Status.AMBIGUOUS)
+            return _refuted(relative)
         if relative.status is Status.AMBIGUOUS and agrees and all(
                 self._one_scale.agrees(rival, relative.x, relative.y) is False
                 for rival in relative.rivals):
@@ -351,7 +352,7 @@ class VisualOdometry:
                 and frame.stamp_ns - self._known_ns < _NOT_FELT_NS
                 and self._standstill.may_stand(relative, self._config.standstill)
                 and self._at_rest(frame)):
-            return replace(relative, status=Status.AMBIGUOUS)
+            return _refuted(relative)
         return relative
 
     def _stands_still(self, frame: Frame, relative: RelativePose) -> bool:
@@ -383,14 +384,24 @@ class VisualOdometry:
             UNKNOWN_MOTION, self._path.pose, 0.0, False, keyframe=self._one_scale.keyframe,
             k1=self._estimator.k1)
 
-    def _carried(self, frame: Frame) -> tuple[Array, Array]:
-        """Motion (4, 4) and covariance (6, 6) where the images tell none: the gyro's rotation."""
+    def _carried(self, frame: Frame, relative: RelativePose | None = None,
+                 length: Length | None = None) -> tuple[Array, Array]:
+        """
+        Motion (4, 4) and covariance (6, 6) where the images tell none: a turn at most.
+
+        That is the gyro's, or else the one of a pair whose direction of translation is in doubt:
+        its covariance spans the turns of all motions that it may be.
+        """
         motion, covariance = np.eye(4), UNKNOWN_MOTION.copy()
         if self._gyro is not None and self._gyro.fits and (turn := self._turn(frame)) is not None:
             motion[:3, :3] = turn.R.T
             # An error of the bias is the same all along: n steps err n times as much as one.
             before = max(self._since_ns - self._known_ns, 0) / (frame.stamp_ns - self._since_ns)
             covariance[3:, 3:] = (1 + 2 * before) * turn.R.T @ turn.covariance @ turn.R
+        elif relative is not None and length is not None \
+                and relative.status is Status.AMBIGUOUS:
+            turned = replace(relative, t=np.zeros(3))
+            return camera_motion(turned), motion_covariance(turned, length)
         return motion, covariance
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
@@ -419,7 +430,7 @@ class VisualOdometry:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
         given_up = self._bad_pairs >= self._config.max_lost
-        motion, covariance = self._carried(frame)
+        motion, covariance = self._carried(frame, relative, length)
         path = self._path.moved(self._pose, motion, covariance)
         result = self._result(frame, relative.status, relative, length, motion, covariance,
                               self._pose @ motion, path)
@@ -458,6 +469,12 @@ class VisualOdometry:
             pose, covariance, path.pose, length.value, length.known, stationary,
             self._since_ns, self._since_covariance, length.metric, length.measured, length.common,
             keyframe, self._estimator.k1)
+
+
+def _refuted(relative: RelativePose) -> RelativePose:
+    """Give a pair that something else than its images speaks against: nothing of it is told."""
+    return replace(relative, status=Status.AMBIGUOUS, covariance_5=UNKNOWN[0],
+                   covariance_6=UNKNOWN[1])
 
 
 def _not_turned(frame: Frame) -> tuple[int, Array, Array]:
