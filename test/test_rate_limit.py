@@ -64,6 +64,12 @@ def test_stamps_that_stay_back_a_little_start_anew():
     assert len(taken(limit, camera(10, 30))) > 280
 
 
+def test_an_image_that_was_ahead_brings_no_time_twice():
+    ahead = [stamp + (3 * SECOND // 5 if i == 30 else 0) for i, stamp in enumerate(camera(30))]
+    limit = RateLimit(10, max_backwards=0.5, max_gap=1.0)
+    assert len(taken(limit, ahead)) <= 20 * 10 + 1
+
+
 def test_who_begins_an_image_later_takes_others_for_good():
     """So a pose graph keeps all images: by a limit of its own none may be the odometry's."""
     stamps = camera(60)

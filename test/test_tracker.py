@@ -374,6 +374,26 @@ def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_goes_on(drive, ahe
     assert np.array_equal(one.last.pose, undisturbed.last.pose)
 
 
+@pytest.mark.parametrize(('ahead', 'rate', 'late'), [(0.25, 10, 2), (0.55, 10, 5), (0.85, 10, 6),
+                                                     (0.55, 30, 16)])
+def test_an_image_stamped_ahead_within_a_gap_leaves_the_trajectory_where_it_is(
+        drive, ahead, rate, late):
+    one = tracker()
+    there_and_back = [*drive, *drive[-2:0:-1]]
+    in_a_row(one, [(gray, 50 + i / rate + (ahead if i == 3 else 0))
+                   for i, gray in enumerate(there_and_back[:10 if rate == 10 else 22])])
+    assert one.counts.dropped == {'late': late}
+    assert 'TIME_JUMP' not in one.counts.status
+    assert one.counts.status['FIRST_FRAME'] == 1
+
+
+def test_stamps_that_go_back_to_before_the_last_two_images_begin_anew_as_ever(drive):
+    one = tracker()
+    in_a_row(one, [(drive[i], seconds) for i, seconds in enumerate([50.0, 50.1, 50.9, 50.05])])
+    assert one.counts.dropped == {}
+    assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 2, 'TIME_JUMP': 1}
+
+
 @pytest.mark.parametrize('then', [2.1, 4.1, -40.0])
 def test_after_a_gap_or_where_stamps_go_back_for_good_no_image_counts_as_ahead(drive, then):
     one = tracker()

@@ -295,7 +295,7 @@ class Session:
         with self._between_images():
             before = flat(self._tracker.config)
             same = all(before[name].value == flat(config)[name].value
-                       for name in ('ros.max_rate', 'odometry.max_backwards'))
+                       for name in ('ros.max_rate', 'odometry.max_backwards', 'odometry.max_gap'))
             if not same:
                 self._limit = _limit(config)
             self._tracker.configure(config)
@@ -505,7 +505,8 @@ class Session:
 
 
 def _limit(config: Config) -> RateLimit:
-    return RateLimit(config.ros.max_rate, config.odometry.max_backwards)
+    odometry = config.odometry
+    return RateLimit(config.ros.max_rate, odometry.max_backwards, odometry.max_gap)
 
 
 def _bytes(message: Any) -> int:

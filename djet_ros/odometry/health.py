@@ -195,7 +195,7 @@ class Health:
             return None
         return Complaint('images out of order', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
-            'and dropped; do two cameras publish on one topic?'))
+            'and dropped; do two cameras publish on one topic, or was one image stamped ahead?'))
 
     def two_cameras(self) -> Complaint | None:
         """Say that images have now one frame_id, now another."""

@@ -38,6 +38,7 @@ from djet_ros.odometry.messages import (
     mounted_frame,
     stamp_ns,
 )
+from djet_ros.odometry.order import Order
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
 from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
@@ -45,9 +46,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DIAGNOSTICS_PERIOD_NS = 10**9
-
-# Late images in a row that are no accident: the stamps have gone back, and stay there.
-LATE_IN_A_ROW = 10
 
 
 class Outgoing(NamedTuple):
@@ -149,7 +147,8 @@ class Tracker:
         # The next images, of which a face knows one or two.
         self._expected: deque[_Expected] = deque(maxlen=2)
         self._health = Health(self.config.odometry, self._speed_topics)
-        self._late_in_a_row = 0
+        odometry = self.config.odometry
+        self._order = Order(odometry.max_backwards, odometry.max_gap)
         self._path: deque[Any] = deque(maxlen=self.config.ros.path_length)
         self._path_stamp: int | None = None
         self._rate = StampRate()
@@ -172,6 +171,7 @@ class Tracker:
         self._odometry.listen_to(self._beside.gyro, self._beside.guess)
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
+        self._order.configure(after.max_backwards, after.max_gap)
         # Poses of another frame are no part of a path.
         self._path = deque(self._path if _frames(before) == _frames(after) else (),
                            maxlen=config.ros.path_length)
@@ -477,9 +477,7 @@ class Tracker:
             return ''
         if stamp == newest.stamp_ns:
             return 'equal_stamp'
-        self._late_in_a_row += 1
-        late = newest.stamp_ns - stamp <= self.config.odometry.max_backwards * 1e9
-        return 'late' if late and self._late_in_a_row < LATE_IN_A_ROW else ''
+        return '' if self._order.goes_back(stamp) else 'late'
 
     def _drop(self, reason: str, image_frame: str | None = None) -> None:
         self.counts.dropped[reason] += 1
@@ -500,7 +498,7 @@ class Tracker:
         self.remark = why_restarted(result, self._frame.stamp_ns if self._frame else None,
                                     self.config.odometry)
         self.last, self._frame, self.problem = result, frame, None
-        self._late_in_a_row = 0
+        self._order.take(frame.stamp_ns)
         self._health.processed(result)
         self.counts.processed += 1
         self.verdict = result.status.value
