@@ -618,6 +618,15 @@ def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
         'paper', 'five_point']
 
 
+def test_what_was_dumped_is_loaded_as_it_was(node, publisher):
+    node()
+    features = 'estimator.max_features'
+    # in the order of ros2 param load, which sets them one by one
+    for values in ({features: 1000}, {features: 1000, 'preset': 'best'}):
+        assert publisher.ask('configure', node=NODE, values=values) == [[True, '']] * len(values)
+        assert publisher.ask('configured', node=NODE, names=[features, 'preset']) == [1000, 'best']
+
+
 BROKEN_YAML = '/**: {ros__parameters: {estimator: '
 
 

@@ -63,7 +63,7 @@ class Parameters:
         """Make integers floats where those belong, and let a preset set its values."""
         values = _values(parameters)
         try:
-            config = with_live_values(self.config, values)
+            config = self._with(values)
         except DjetError:
             # To be refused by _check, which can say why.
             return parameters
@@ -75,7 +75,7 @@ class Parameters:
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         values = _values(parameters)
         try:
-            config = _possible(with_live_values(self.config, values))
+            config = _possible(self._with(values))
             # What topics declare of their own, as qos_overrides, asks for none.
             if values:
                 self._prepare(config)
@@ -85,9 +85,19 @@ class Parameters:
 
     def _take(self, parameters: list[Parameter]) -> None:
         if values := _values(parameters):
-            config = with_live_values(self.config, values)
+            config = self._with(values)
             self._apply(config)
             self.config = config
+
+    def _with(self, values: Mapping[str, Any]) -> Config:
+        """
+        Give the configuration with values changed; the preset that it has changes nothing.
+
+        ``ros2 param load`` sets what ``dump`` wrote one by one, the preset after the estimator.
+        """
+        return with_live_values(self.config, {
+            name: value for name, value in values.items()
+            if name != 'preset' or value != self.config.preset})
 
 
 def graph_parameters(node: Node) -> Config:
