@@ -28,6 +28,7 @@ class Graph:
         # What publishers offer, by topic.
         self.offered: dict[str, Profile] = {}
         self.callbacks: dict[str, Callable[[Any], None]] = {}
+        self.kinds: dict[str, str] = {}
         self.frames: dict[tuple[str, str], Any] = {}
         self.hears_tf = False
 
@@ -51,12 +52,13 @@ class Graph:
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
                ready: Callable[[], bool] | None = None) -> Any:
-        self.callbacks[topic] = callback
+        self.callbacks[topic], self.kinds[topic] = callback, kind
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
                                new_refusals=lambda: int(topic in self.offered))
 
     def offers(self, topic: str) -> list[Any]:
-        return [Offer('/sender', '', self.offered[topic])] if topic in self.offered else []
+        return ([Offer('/sender', self.kinds[topic], self.offered[topic])]
+                if topic in self.offered else [])
 
     def published(self, kind: str) -> list[str]:
         return []
@@ -151,3 +153,17 @@ def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic,
         one.face._tick()
     line, = (line for line in one.graph.lines if line.startswith('incompatible QoS'))
     assert line.endswith(f'Nothing is received from it; {remedy}')
+
+
+@pytest.mark.parametrize(('asked', 'offered', 'remedy'), [
+    ('best_effort', True, ', or its images are too large to come whole by best effort: set '
+     'ros.qos_reliability to reliable, or give the middleware larger socket buffers'),
+    ('best_effort', False, ', or its images are too large to come whole by best effort: '
+     'give the middleware larger socket buffers'),
+    ('reliable', True, '')])
+def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
+        node, asked, offered, remedy):
+    one = node(**{'ros.qos_reliability': asked})
+    one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
+    assert one.face.why_silent('/image') == f'1 publish it, none sends{remedy}'
+    assert one.face.why_silent('/camera_info') == '1 publish it, none sends'

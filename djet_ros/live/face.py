@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from djet_ros.config.sections import NodeConfig
 from djet_ros.core.types import Array
-from djet_ros.live.middleware import Middleware, Profile, Publisher, Subscription
+from djet_ros.live.middleware import Middleware, Offer, Profile, Publisher, Subscription
 from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 from djet_ros.odometry.messages import seconds_and_rest
 from djet_ros.odometry.tracker import Outgoing
@@ -117,7 +117,7 @@ class Face:
             return f'it is published as {", ".join(sorted(kinds))}, and not as {wanted}' + (
                 _transport_remedy(kinds))
         if offers:
-            return f'{len(offers)} publish it, none sends'
+            return f'{len(offers)} publish it, none sends{self._loss_remedy(topic, offers)}'
         if _IMAGE in (wanted, *kinds) and self._middleware.offers(f'{topic}/compressed'):
             return (f'nobody publishes it, but {topic}/compressed; set '
                     'ros.image_transport:=compressed')
@@ -127,6 +127,16 @@ class Face:
             self._kinds, own) if not name.endswith('/debug_image'))
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
         return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
+
+    def _loss_remedy(self, topic: str, offers: Sequence[Offer]) -> str:
+        """Say what helps images that do not come whole, of which middlewares tell nothing."""
+        images = self._images
+        if images is None or topic != images.topic or images.profile.reliable:
+            return ''
+        reliable = all(offer.profile.reliable for offer in offers)
+        return (', or its images are too large to come whole by best effort: '
+                + 'set ros.qos_reliability to reliable, or ' * reliable
+                + 'give the middleware larger socket buffers')
 
     def wants(self, topic: str) -> bool:
         """Tell whether anybody subscribes to an output."""
