@@ -217,6 +217,24 @@ def test_a_compressed_image_is_decoded():
     assert np.abs(sixteen.astype(int) - GRAY).max() <= 1
 
 
+@pytest.mark.parametrize('bits', [8, 16])
+@pytest.mark.parametrize('pattern', MOSAICS)
+def test_a_mosaic_that_was_compressed_as_it_is_gives_the_gray_of_the_raw_one(pattern, bits):
+    encoding = f'bayer_{pattern}{bits}'
+    pixels = mosaic(pattern) if bits == 8 else wide(mosaic(pattern))
+    data = encoded('.png', pixels.astype(f'u{bits // 8}'))
+    expected = gray_image(image(pixels, encoding))
+    # compressed_image_transport's words for PNG, and for JPEG with its parameter for mosaics
+    for said in (f'{encoding}; png compressed ', f'{encoding}; jpeg compressed {encoding}'):
+        assert np.array_equal(gray_image(compressed(data, said)), expected)
+
+
+def test_what_became_gray_before_it_was_compressed_is_no_mosaic():
+    for said in ('bayer_rggb8; jpeg compressed mono8', 'bayer_rggb8; jpeg compressed bgr8',
+                 'bayer_rggb8; jpeg', 'mono8; png compressed ', 'bayer_of_none; png compressed '):
+        assert np.array_equal(gray_image(compressed(encoded('.png'), said)), GRAY)
+
+
 def test_trailing_zeros_after_a_jpeg_are_usual():
     assert gray_image(compressed(encoded('.jpg') + bytes(900))).shape == GRAY.shape
 

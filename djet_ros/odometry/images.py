@@ -109,7 +109,7 @@ def gray_image(message: Any, limits: tuple[int, int] = WHOLE_RANGE) -> Gray:
     BadMessage.
     """
     if not hasattr(message, 'encoding'):
-        return narrowed(_compressed(message), limits)
+        return _demosaiced(narrowed(_compressed(message), limits), message.format)
     pixels, values = _raw(message)
     # Most cameras send no padding: then a gray image is the message's own memory.
     return np.ascontiguousarray(pixels.to_gray(narrowed(values, limits)))
@@ -186,6 +186,21 @@ def _compressed(message: Any) -> NDArray[Any]:
         raise BadMessage('unknown_encoding', f"image format '{message.format:.40}' holds depths, "
                          'not brightness')
     return decoded(_bytes(message.data))
+
+
+def _demosaiced(gray: Gray, said: str) -> Gray:
+    """
+    Make gray of a mosaic (H, W) that was compressed as it is, which its format says.
+
+    So compressed_image_transport does with PNG ('bayer_rggb8; png compressed ') and, where it is
+    told to, with JPEG ('bayer_rggb8; jpeg compressed bayer_rggb8'), but not 'compressed mono8'.
+    """
+    encoding, _, how = said.partition('; ')
+    _, whole, became = how.partition(' compressed')
+    if not encoding.startswith('bayer_') or encoding not in _ENCODINGS \
+            or not whole or became.strip() not in ('', encoding):
+        return gray
+    return _ENCODINGS[encoding].to_gray(gray[..., None])
 
 
 def decoded(data: NDArray[np.uint8]) -> NDArray[Any]:
