@@ -422,6 +422,16 @@ def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
         Graph({**ENVIRONMENT, 'ROS_DOMAIN_ID': '232', 'CYCLONEDDS_URI': uri}).close()
 
 
+def test_a_robot_that_keeps_ros_to_itself_in_the_old_way_is_not_heard_outside():
+    from djet_ros.dds.graph import _configuration
+    beyond = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'ROS_STATIC_PEERS': '10.0.0.9'}
+    inside = _configuration({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
+    assert _configuration({'ROS_LOCALHOST_ONLY': '1'}) == inside
+    assert _configuration({**beyond, 'ROS_LOCALHOST_ONLY': '1'}) == inside
+    for off in ('', '0'):
+        assert _configuration({**beyond, 'ROS_LOCALHOST_ONLY': off}) == _configuration(beyond)
+
+
 def test_a_graph_that_was_left_can_be_entered_again():
     from djet_ros.dds.graph import Graph
     elsewhere = {**ENVIRONMENT, 'ROS_DOMAIN_ID': '231'}

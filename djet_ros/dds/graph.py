@@ -299,12 +299,14 @@ def _domain_id(environment: Mapping[str, str]) -> int:
 
 
 def _configuration(environment: Mapping[str, str]) -> str:
-    name = environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
+    # ROS before Iron knew this one alone. Later ones still take it, and it prevails.
+    only = environment.get('ROS_LOCALHOST_ONLY', '').startswith('1')
+    name = 'LOCALHOST' if only else environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
     if name not in _RANGES:
         raise DjetError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{name}'; choose from "
                         f'{", ".join(_RANGES)}')
-    peers = ''.join(f'<Peer address="{peer}"/>'
-                    for peer in environment.get('ROS_STATIC_PEERS', '').split(';') if peer)
+    named = '' if only else environment.get('ROS_STATIC_PEERS', '')
+    peers = ''.join(f'<Peer address="{peer}"/>' for peer in named.split(';') if peer)
     # What the user says comes last and counts; but interfaces add up, and none may come twice.
     uri = environment.get('CYCLONEDDS_URI', '')
     interfaces = '' if _chooses_interfaces(uri) else _LOOPBACK
