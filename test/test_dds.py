@@ -476,6 +476,15 @@ def test_compressed_images_may_be_named_with_or_without_their_transport(rule):
         '/cam/image_raw/compressed', '/cam/camera_info')
 
 
+@pytest.mark.parametrize('rules', [
+    ['image/compressed:=/cam/jpeg'],
+    ['image:=/cam/image_raw', '/cam/image_raw/compressed:=/cam/jpeg']])
+def test_compressed_images_may_be_called_anything(rules):
+    names = Names('vo_node', rules)
+    assert image_topics(names.resolve, names.is_remapped, 'compressed') == (
+        '/cam/jpeg', '/cam/camera_info')
+
+
 def test_rules_for_topics_are_found_among_the_words_for_ros():
     words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
              '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']

@@ -29,6 +29,8 @@ class Graph:
         self.offered: dict[str, Profile] = {}
         self.callbacks: dict[str, Callable[[Any], None]] = {}
         self.kinds: dict[str, str] = {}
+        # Topics that somebody else publishes, whatever the type.
+        self.elsewhere: list[str] = []
         self.frames: dict[tuple[str, str], Any] = {}
         self.hears_tf = False
 
@@ -61,7 +63,7 @@ class Graph:
                 if topic in self.offered else [])
 
     def published(self, kind: str) -> list[str]:
-        return []
+        return self.elsewhere
 
     def follow_frames(self) -> None:
         assert not self.hears_tf
@@ -167,3 +169,15 @@ def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
     one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
     assert one.face.why_silent('/image') == f'1 publish it, none sends{remedy}'
     assert one.face.why_silent('/camera_info') == '1 publish it, none sends'
+
+
+@pytest.mark.parametrize(('transport', 'elsewhere', 'hint'), [
+    ('raw', '/cam/picture', '; did you mean /cam/picture?'),
+    ('compressed', '/cam/raw/compressed', '; did you mean /cam/raw/compressed?'),
+    ('compressed', '/cam/jpeg',
+     '; did you mean /cam/jpeg? remap /image/compressed:=/cam/jpeg')])
+def test_a_hint_at_a_topic_can_be_followed(node, transport, elsewhere, hint):
+    one = node(**{'ros.image_transport': transport})
+    one.graph.elsewhere = [elsewhere]
+    topic = '/image' if transport == 'raw' else '/image/compressed'
+    assert one.face.why_silent(topic) == f'nobody publishes it{hint}'

@@ -126,7 +126,12 @@ class Face:
         elsewhere = sorted(name for name in set(self._middleware.published(wanted)).difference(
             self._kinds, own) if not name.endswith('/debug_image'))
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
-        return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')
+        if not near:
+            return 'nobody publishes it'
+        # By the image's name alone only compressed images with the usual ending can be had.
+        how = ('' if wanted != IMAGE_TYPES['compressed'] or near[0].endswith('/compressed')
+               else f' remap {topic}:={near[0]}')
+        return f'nobody publishes it; did you mean {near[0]}?{how}'
 
     def _loss_remedy(self, topic: str, offers: Sequence[Offer]) -> str:
         """Say what helps images that do not come whole, of which middlewares tell nothing."""

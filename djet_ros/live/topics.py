@@ -66,17 +66,16 @@ def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], boo
     image_transport, only the image's name needs to be remapped: camera_info is taken beside it,
     and the compressed images below it.
     """
-    image = resolve('image').removesuffix('/compressed')
+    image = topic = resolve('image').removesuffix('/compressed')
     if transport == 'compressed':
-        # Many remap this one, as ROS 2's republish asks for.
-        image = resolve(f'{image}/compressed').removesuffix('/compressed')
+        # Many remap this one, as ROS 2's republish asks for. It may be called anything.
+        topic = resolve(f'{image}/compressed')
+        image = topic.removesuffix('/compressed')
     if is_remapped('camera_info'):
         info = resolve('camera_info')
     else:
         info = f'{image.rpartition("/")[0]}/camera_info'
-    if transport == 'compressed':
-        image += '/compressed'
-    return image, info
+    return topic, info
 
 
 def full_name(topic: str) -> str:
