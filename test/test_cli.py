@@ -36,9 +36,9 @@ def djet(*arguments: str) -> subprocess.CompletedProcess[str]:
                           text=True, timeout=60, check=False)
 
 
-def start_probe(body: str) -> subprocess.Popen[str]:
-    """Start a subcommand with this body."""
-    return subprocess.Popen([sys.executable, '-c', PROBE.format(body=body)], text=True,
+def start_probe(body: str, *before: str) -> subprocess.Popen[str]:
+    """Start a subcommand with this body; before: what runs it."""
+    return subprocess.Popen([*before, sys.executable, '-c', PROBE.format(body=body)], text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -145,7 +145,8 @@ def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
 
 
 @pytest.mark.parametrize(('number', 'said', 'code'), [
-    (signal.SIGINT, 'interrupted', 130), (signal.SIGTERM, 'terminated', 143)])
+    (signal.SIGINT, 'interrupted', 130), (signal.SIGTERM, 'terminated', 143),
+    (signal.SIGHUP, 'terminated', 129)])
 def test_an_interrupt_gives_one_line_and_the_exit_code_of_a_shell(
         number: signal.Signals, said: str, code: int) -> None:
     probe = start_probe("import time; print('ready', flush=True); time.sleep(60)")
@@ -156,10 +157,22 @@ def test_an_interrupt_gives_one_line_and_the_exit_code_of_a_shell(
     assert probe.returncode == code
 
 
-def test_who_calls_the_command_from_python_keeps_the_handler_of_sigterm(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_who_calls_the_command_from_python_keeps_the_handler(
+        tmp_path: Path, number: signal.Signals) -> None:
+    before = signal.getsignal(number)
     assert main(['replay', str(tmp_path / 'absent'), '--output', str(tmp_path / 'out')]) == 2
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize('body', ['time.sleep(1)', 'stop_by_signal().wait(1) and sys.exit(3)'])
+def test_with_nohup_a_command_outlives_its_terminal(body: str) -> None:
+    probe = start_probe('import time; from djet_ros.cli.graph_options import stop_by_signal; '
+                        f"print('ready', flush=True); {body}", 'nohup')
+    assert probe.stdout is not None
+    assert probe.stdout.readline() == 'ready\n'
+    probe.send_signal(signal.SIGHUP)
+    assert probe.wait(timeout=60) == 0
 
 
 @pytest.mark.parametrize('body', ["print('x' * 1_000_000)", "sys.stdin.read(); print('x')"])

@@ -352,7 +352,7 @@ def test_diagnostics_follow_simulated_time(live, start, peer, bag):
     assert peer.heard['/diagnostics'][-1].header.stamp.sec in (1000, 1001)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_in_mid_stream_ends_all_cleanly_within_a_second(live, start, peer, bag, number):
     one = live(*EVERY, topic=RECTIFIED)
     player = start('play', bag, '--loop', '--rate', '10')

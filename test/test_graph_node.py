@@ -192,7 +192,7 @@ def test_a_reset_forgets_the_map_and_goes_on(
     assert min(stamp_ns(one.header) for one in path.poses) >= START + len(WAYS) * PERIOD
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_it_cleanly(
         driven: NodeProcess, number: signal.Signals) -> None:
     code, seconds = driven.end(number)

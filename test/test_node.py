@@ -794,7 +794,7 @@ def test_what_comes_beyond_the_room_is_dropped_counted_and_complained_of(
         assert any(complaint in message for message in said)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('policy', ['latest', 'every'])
 def test_a_signal_in_mid_stream_ends_it_cleanly_within_a_second(
         node, publisher, subscriber, drive, number, policy):

@@ -831,7 +831,7 @@ def test_stamps_that_stand_still_are_said(goes_on, tmp_path):
 
 
 @pytest.mark.parametrize('sign, code', [
-    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGKILL, -9)])
 def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
     endless = tmp_path / 'sequences' / '01'
     shutil.copytree(folder, endless)

@@ -22,12 +22,14 @@ def add_remappings(parser: argparse.ArgumentParser) -> None:
 
 def stop_by_signal() -> Event:
     """
-    Give an event that SIGINT and SIGTERM set, instead of ending the process.
+    Give an event that SIGINT, SIGTERM and SIGHUP set, instead of ending the process.
 
     Another thread sets it: a signal may come while the main thread holds the event's lock, as it
     does at each look, and a handler that waits for that would wait for itself.
     """
     stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    # With nohup a terminal may close.
+    hangup = [signal.SIGHUP] * (signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM, *hangup):
         signal.signal(number, lambda *_: stop.is_set() or start_new_thread(stop.set, ()))
     return stop

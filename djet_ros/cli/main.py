@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from io import TextIOWrapper
 import os
@@ -62,20 +62,24 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'djet: error: {message} (see {self.prog} --help)\n')
 
 
+# What ends a command beside Ctrl-C; SIGHUP comes where its terminal is closed.
+_ENDS = (signal.SIGTERM, signal.SIGHUP)
+
+
 class _Terminated(KeyboardInterrupt):
-    """What SIGTERM raises, so that a command ends as by Ctrl-C: nothing is left half done."""
+    """What such a signal raises, so that it ends as by Ctrl-C: nothing is left half done."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run a command line; the exit code is 2 for what the user can mend.
 
-    It is 130 for Ctrl-C and 143 for SIGTERM, as a shell would have it.
+    It is 130 for Ctrl-C, 143 for SIGTERM and 129 for SIGHUP, as a shell would have it.
     """
     one_blas_thread()
     sleep_while_waiting()
     _print_anything()
-    with _heeding_sigterm():
+    with _heeding_signals():
         return _main(argv)
 
 
@@ -88,9 +92,11 @@ def _main(argv: Sequence[str] | None) -> int:
         return _fail(str(error))
     except ModuleNotFoundError as error:
         return _fail(_how_to_install(error))
-    except _Terminated:
-        print('djet: terminated', file=sys.stderr)
-        return 143
+    except _Terminated as end:
+        # Of a terminal that was closed nothing is left to print to.
+        with suppress(OSError):
+            print('djet: terminated', file=sys.stderr)
+        return 128 + int(end.args[0])
     except KeyboardInterrupt:
         print('djet: interrupted', file=sys.stderr)
         return 130
@@ -109,22 +115,22 @@ def _print_anything() -> None:
 
 
 @contextmanager
-def _heeding_sigterm() -> Iterator[None]:
-    """Let SIGTERM interrupt, unless the command or who started it has something else in mind."""
-    if current_thread() is not main_thread() \
-            or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, _terminate)
+def _heeding_signals() -> Iterator[None]:
+    """Let signals interrupt, unless the command or who started it has something else in mind."""
+    ours = [number for number in _ENDS if current_thread() is main_thread()
+            and signal.getsignal(number) is signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, _terminate)
     try:
         yield
     finally:
-        if signal.getsignal(signal.SIGTERM) is _terminate:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in ours:
+            if signal.getsignal(number) is _terminate:
+                signal.signal(number, signal.SIG_DFL)
 
 
-def _terminate(*_: object) -> NoReturn:
-    raise _Terminated
+def _terminate(number: int, _: object) -> NoReturn:
+    raise _Terminated(number)
 
 
 def run(argv: Sequence[str]) -> int:

@@ -18,13 +18,13 @@ Topics, parameters and the rest are given as to every ROS node:
 
 
 def vo_node() -> int:
-    """Run the odometry until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
+    """Run the odometry until a signal; 2 where it can't be run, with the reason."""
     return _run('vo_node', 'Visual odometry by D-JET as a ROS 2 node.',
                 without_ros="without ROS, 'djet replay' works on recorded bags")
 
 
 def pose_graph_node() -> int:
-    """Run the pose graph until SIGINT or SIGTERM; 2 where it can't be run, with the reason."""
+    """Run the pose graph until a signal; 2 where it can't be run, with the reason."""
     return _run('pose_graph_node', "Closes the loops of vo_node's odometry, as a ROS 2 node.",
                 without_ros="without ROS, 'djet slam' works on recorded bags",
                 library='gtsam')
@@ -33,7 +33,7 @@ def pose_graph_node() -> int:
 def _run(name: str, description: str, *, without_ros: str,
          library: str = '') -> int:
     """
-    Run a node until SIGINT or SIGTERM; gives the exit code.
+    Run a node until a signal; gives the exit code.
 
     2 means something that the user can mend, said in one line; without_ros: what can be had
     where ROS is missing; library: one that it needs beside ROS.

@@ -135,14 +135,14 @@ class _Pool(ProcessPoolExecutor):
 
 @contextmanager
 def _interrupt_after() -> Iterator[None]:
-    """Let Ctrl-C, and SIGTERM, wait for the end of this block."""
+    """Let Ctrl-C, SIGTERM and SIGHUP wait for the end of this block."""
     if current_thread() is not main_thread():
         # Python interrupts no other.
         yield
         return
     seen: list[int] = []
     before = {number: signal.signal(number, lambda number, _: seen.append(number))
-              for number in (signal.SIGINT, signal.SIGTERM)}
+              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:
