@@ -1,4 +1,4 @@
-"""ORB detection, and matching by rotated descriptors (paper, "Descriptor")."""
+"""ORB detection (paper, "Descriptor"), and matching by the descriptors of any features."""
 
 from __future__ import annotations
 

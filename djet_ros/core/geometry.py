@@ -284,10 +284,10 @@ def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
 
 
 def rotation_angle(Ra: Array, Rb: Array) -> float:
-    """Angle in radians of the rotation between two rotations (Rodrigues' angle, section 5.1)."""
+    """Angle in radians between two rotations (paper, "Evaluation metrics": Rodrigues)."""
     return float(Rotation.from_matrix(Ra.T @ Rb).magnitude())
 
 
 def direction_angle(ta: Array, tb: Array) -> float:
-    """Angle in radians between two directions (translation error, section 5.1)."""
+    """Angle in radians between two directions (there: the error of the translation)."""
     return float(np.arctan2(np.linalg.norm(np.cross(ta, tb)), np.dot(ta, tb)))

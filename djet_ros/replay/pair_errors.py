@@ -1,5 +1,5 @@
 """
-Errors of estimated pairs against ground truth, as in the paper's section 5.1.
+Errors of estimated pairs against ground truth (paper, "Evaluation metrics").
 
 Each pair is held against the true motion between the very two frames that it relates, which are
 neighbours unless a bad frame lies between them. The rules:
