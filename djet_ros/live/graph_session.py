@@ -33,9 +33,8 @@ class GraphSession:
     """
     Works on the odometry's messages in a thread of its own, and on loops while none waits.
 
-    topics: resolved names of 'odometry', 'relative_pose_cov', 'relative_pose_status',
-    'image' and 'camera_info', for
-    people. Everything may be called from any one thread; nothing of it waits.
+    topics: resolved names of 'odometry', 'relative_pose_cov', 'relative_pose_status', 'image' and
+    'camera_info', for people. Everything may be called from any one thread; nothing of it waits.
     """
 
     def __init__(self, slam: LiveSlam, wiring: Wiring, topics: Mapping[str, str]) -> None:

@@ -27,7 +27,7 @@ class Motion:
     What steps, edges and offsets have in common: where one camera is in another's frame.
 
     motion (4, 4), covariance (6, 6): see the module; scale_known: whether the length of the motion
-    is in metres.
+    means anything, in metres or in the one unit of the track.
     """
 
     motion: Array
