@@ -81,6 +81,15 @@ def test_help_comes_where_only_ascii_can_be_shown(command: str,
     assert (answer.returncode, answer.stderr) == (0, '')
 
 
+def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
+    said = ' '.join(djet('lab', 'surfaces', '--help').stdout.split())
+    assert '(default: paper, ' in said
+    for name, value in (('window', 7), ('window-sigma', 0.0), ('max-iterations', 20),
+                        ('step', "'share'"), ('step-share', 0.3)):
+        _, _, meaning = said.rpartition(f' --{name} ')
+        assert f'(default: {value})' == meaning[meaning.index('(default: '):].partition(' --')[0]
+
+
 def test_the_version_is_the_packages() -> None:
     assert djet('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
 

@@ -11,13 +11,14 @@ from djet_ros.config.sections import Config
 
 
 def add_flags(parser: argparse.ArgumentParser | argparse._ArgumentGroup,
-              names: Iterable[str]) -> None:
+              names: Iterable[str], config: Config | None = None) -> None:
     """
     Add a command-line flag for each flat name: ``--max-gap`` for ``odometry.max_gap``.
 
-    ``flag_values`` takes what was given out of the parsed arguments.
+    ``flag_values`` takes what was given out of the parsed arguments; config: what holds where
+    nothing was given, for the help.
     """
-    known = flat(Config())
+    known = flat(config or Config())
     for name in names:
         item = known[name]
         choices = item.description.choices

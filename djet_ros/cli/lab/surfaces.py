@@ -38,9 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--match', type=int, metavar='K',
                         help='number of the match (default: one that agrees and moves far)')
     parser.add_argument('--preset', choices=PRESETS, default='paper',
-                        help='parameters; paper moves in small steps (default: %(default)s)')
+                        help='parameters; paper moves in small steps (default: %(default)s, whose '
+                        'defaults are those below)')
     add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_iterations',
-                       'estimator.step', 'estimator.step_share'))
+                       'estimator.step', 'estimator.step_share'), from_flat({'preset': 'paper'}))
 
 
 def run(args: argparse.Namespace) -> int:
