@@ -12,6 +12,11 @@ from djet_ros.errors import DjetError
 from djet_ros.recordings.outputs import check_file, make_folder, write_whole
 
 
+# What a recording may be, for the help of who opens one.
+RECORDINGS = ('rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, '
+              'EuRoC, TUM-VI or VAROS')
+
+
 def place(text: str) -> Path:
     """Give the place that an --output names; '' is more likely a variable that is not set."""
     if not text.strip():

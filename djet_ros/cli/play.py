@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
-from djet_ros.cli.options import add_topics
+from djet_ros.cli.options import add_topics, RECORDINGS
 from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import BESIDE, open_recording
 
@@ -21,9 +21,7 @@ subscriber that asks for it, the player rather waits than loses an image; Camera
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('source', type=Path, metavar='BAG',
-                        help='rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, '
-                        '7-Scenes, EuRoC or TUM-VI')
+    parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     parser.add_argument('--rate', type=float, default=1.0, metavar='R',
                         help='times the recorded pace (default: %(default)s)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')

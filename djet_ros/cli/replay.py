@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.options import add_output, add_topics
+from djet_ros.cli.options import add_output, add_topics, RECORDINGS
 from djet_ros.cli.terminal import console, new_table, progress_bar, spread, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
@@ -51,9 +51,7 @@ _LENGTHS = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the f
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('source', type=Path, metavar='SOURCE',
-                        help='rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, '
-                        '7-Scenes, EuRoC or TUM-VI')
+    parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     add_output(parser, 'folder of the results')
     add_replay_options(parser, _FLAGS)
 

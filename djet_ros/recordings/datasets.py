@@ -1,4 +1,4 @@
-"""Other public layouts as FrameSequence: TUM RGB-D, EuRoC, TUM-VI, 7-Scenes; which it is."""
+"""TUM RGB-D, EuRoC, TUM-VI and 7-Scenes as FrameSequence; and which layout a folder has."""
 
 from __future__ import annotations
 
