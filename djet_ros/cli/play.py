@@ -13,9 +13,10 @@ from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import BESIDE, open_recording
 
 DESCRIPTION = f"""\
-Publish the images of a recording, their CameraInfo and the ground truth, at the pace of the
-recording. It begins when somebody subscribes to the images. All is offered reliably: for a
-subscriber that asks for it, the player rather waits than loses an image; CameraInfo is latched.
+Publish the images of a recording, their CameraInfo, the ground truth, and what of speeds, IMU,
+other odometry, masks and tf was recorded beside them, at the pace of the recording. It begins when
+somebody subscribes to the images. All is offered reliably: for a subscriber that asks for it, the
+player rather waits than loses an image; CameraInfo is latched.
 {ENVIRONMENT}"""
 
 
