@@ -43,7 +43,6 @@ def test_every_parameter_is_in_one_of_the_shipped_yamls():
 def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
     for name in GENERATED:
         assert load_yaml(CONFIG / name) == Config()
-    assert load_yaml(SHIPPED, from_flat({'preset': 'paper'})).preset == 'best'
     assert '# method: "djet"' in SHIPPED.read_text()
 
 

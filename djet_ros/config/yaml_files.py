@@ -31,13 +31,12 @@ _PRESET_NOTE = """\
 """
 
 
-def load_yaml(path: Path, base: Config | None = None,
-              take: Callable[[Config, Mapping[str, Any]], Config] = with_values,
+def load_yaml(path: Path, take: Callable[[Config, Mapping[str, Any]], Config] = with_values,
               nodes: Sequence[str] = (NODE_NAME,)) -> Config:
     """
-    Read a YAML file over the base configuration (by default all defaults).
+    Read a YAML file over the defaults.
 
-    take: how the configuration takes the values; nodes: for whom it is read, by full names such as
+    take: how these take the values; nodes: for whom it is read, by full names such as
     '/left/vo_node', or without a slash in whichever namespace the file has it. Of the pose graph's
     own parameters slam.* alone are taken.
 
@@ -47,7 +46,7 @@ def load_yaml(path: Path, base: Config | None = None,
     """
     content = read_yaml(path)
     try:
-        return take(base or Config(), dict(_flatten(_ours(content, nodes))))
+        return take(Config(), dict(_flatten(_ours(content, nodes))))
     except DjetError as error:
         raise DjetError(f'{path}: {error}') from None
 

@@ -147,10 +147,9 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     return np.asarray(losses[losses.sum(2).argmin(0), np.arange(len(sketch))])
 
 
-def losses_at(problem: JetProblem, poses: Sequence[Pose], loss: Loss,
-              signs: Sequence[float] = (1.0, -1.0)) -> Array:
+def losses_at(problem: JetProblem, poses: Sequence[Pose], loss: Loss) -> Array:
     """Losses (S, N) as those in front, of poses as they are."""
-    return losses_in_front(problem, refine_all(problem, poses, loss, 0), loss, signs)
+    return losses_in_front(problem, refine_all(problem, poses, loss, 0), loss)
 
 
 def _products(problem: JetProblem) -> Array:

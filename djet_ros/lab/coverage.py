@@ -210,12 +210,11 @@ def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
               for level in LEVELS))
 
 
-def share_with_bounds(hits: int, tries: int, confidence: float = 0.95
-                      ) -> tuple[float, float, float]:
-    """Share of hits, and the bounds that hold the true probability, all NaN without a try."""
+def share_with_bounds(hits: int, tries: int) -> tuple[float, float, float]:
+    """Share of hits, and the bounds of 95 % of the true probability, all NaN without a try."""
     if not tries:
         return (float('nan'),) * 3
-    tail = (1 - confidence) / 2
+    tail = 0.025
     return (hits / tries,
             float(beta.ppf(tail, hits, tries - hits + 1)) if hits else 0.0,
             float(beta.ppf(1 - tail, hits + 1, tries - hits)) if hits < tries else 1.0)

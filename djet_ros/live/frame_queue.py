@@ -82,13 +82,11 @@ class FrameQueue(Generic[Item]):
         with self._changed:
             return self._weight
 
-    def clear(self) -> int:
-        """Throw away what waits, and tell how many items that was."""
+    def clear(self) -> None:
+        """Throw away what waits."""
         with self._changed:
-            count = len(self._items)
             self._items.clear()
             self._weight = 0.0
-            return count
 
     def close(self) -> None:
         """Take no more items and wake up who waits; what waits in the queue can still be got."""

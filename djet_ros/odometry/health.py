@@ -60,7 +60,6 @@ class Health:
         self._most_equal, self._stood_ns = 0, 0
         self._coarse: Coarse | None = None
         self._last: OdometryResult | None = None
-        self._stamp_ns = 0
 
     def configure(self, config: OdometryConfig) -> None:
         """Take another configuration; what was seen of lengths is about the last one."""

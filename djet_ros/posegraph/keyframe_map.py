@@ -128,9 +128,9 @@ class KeyframeMap:
         """Count the edges of a kind."""
         return sum(edge.kind == kind for edge in self.edges)
 
-    def extend(self, step: Step, image: Callable[[int], Frame | None]) -> bool:
+    def extend(self, step: Step, image: Callable[[int], Frame | None]) -> None:
         """
-        Take the next step; tells whether its frame became a keyframe.
+        Take the next step, whose frame may become a keyframe.
 
         image: gives the frame of a stamp, or None where its image has not come. A frame without
         one is no keyframe; the next one may be.
@@ -146,7 +146,7 @@ class KeyframeMap:
             self._due = False
             offset = self._add(step, frame, offset)
         if offset is None:
-            return False
+            return
         reference = self._offsets.get(step.previous_stamp_ns)
         self._offsets = {step.stamp_ns: offset}
         if step.tracked and reference is not None:
@@ -155,7 +155,6 @@ class KeyframeMap:
             self._offsets[step.previous_stamp_ns] = reference if frame is None else \
                 KeyframeOffset(offset.keyframe, np.asarray(np.linalg.inv(step.motion)))
         self.newest, self._newest_step = offset, step
-        return frame is not None
 
     def _is_keyframe(self, step: Step, offset: KeyframeOffset | None) -> bool:
         """Tell whether a step's frame should be a keyframe."""

@@ -38,12 +38,12 @@ class Panel:
 
 
 def fitted(origin: Vector, a: Vector, b: Vector, texture: Texture, *, gain: float = 1.0,
-           layer: int = 0, mirror: bool = False, triangle: bool = False) -> Panel:
+           layer: int = 0, mirror: bool = False) -> Panel:
     """Panel that shows one whole period of the texture, stretched to its size."""
     along = -1.0 if mirror else 1.0
     uv = np.array([[float(mirror), 0.0], [along, 0.0], [0.0, 1.0]])
     return Panel(np.asarray(origin, float), np.asarray(a, float), np.asarray(b, float), texture,
-                 uv, gain, layer, triangle)
+                 uv, gain, layer)
 
 
 def tiled(origin: Vector, a: Vector, b: Vector, texture: Texture, *,

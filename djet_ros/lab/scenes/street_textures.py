@@ -227,11 +227,10 @@ def _pixel(place: tuple[float, float], metres: tuple[float, float],
     return int(place[0] * scale[0]), int((metres[1] - place[1]) * scale[1])
 
 
-def plain(rng: np.random.Generator, tone: float, roughness: float,
-          metres: tuple[float, float] = (4.0, 4.0)) -> Texture:
+def plain(rng: np.random.Generator, tone: float, roughness: float) -> Texture:
     """Surface of one tone with 1/f stains."""
     image = tone + roughness * (fractal(rng, (256, 256), 0.8) + fractal(rng, (256, 256), 1.6))
-    return make_texture(_soft(image), metres)
+    return make_texture(_soft(image), (4.0, 4.0))
 
 
 def car_end(rng: np.random.Generator, paint: float) -> Texture:

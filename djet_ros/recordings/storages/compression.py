@@ -60,11 +60,11 @@ def decompress_message(data: memoryview) -> memoryview:
     return memoryview(unpacked)
 
 
-def decompress_file(path: Path, folder: Path) -> Path:
+def decompress_file(path: Path, folder: Path) -> None:
     """
-    Unpack a .zstd file into a folder, which must be removed later, and give the new path.
+    Unpack a .zstd file into a folder, which must be removed later, under the old name.
 
-    It has the old name. At most half of the free space there is taken. A file that is cut short
+    At most half of the free space there is taken. A file that is cut short
     gives what is there; one that can't be unpacked leaves nothing.
     """
     unpacked = folder / path.name
@@ -85,4 +85,3 @@ def decompress_file(path: Path, folder: Path) -> Path:
         if isinstance(error, zstd.ZstdError):
             raise BrokenFile(f'its zstd data is damaged ({error})') from error
         raise
-    return unpacked
