@@ -11,7 +11,7 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, OdometryConf
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import FIXED, live_choices, with_live_values
+from djet_ros.live.parameters import FIXED, live_choices, why_frames, with_live_values
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -254,6 +254,19 @@ def test_what_poses_are_called_and_along_which_axes_they_are_is_fixed_for_a_node
     assert len(of_poses) == 4
     assert of_poses < set(FIXED)
     assert set(FIXED) < flat(Config()).keys()
+
+
+@pytest.mark.parametrize(('values', 'why'), [
+    ({}, ''),
+    ({'base_frame': 'base_link'}, 'odometry.base_frame is base_link'),
+    ({'imu': True}, 'odometry.imu is true without an odometry.imu_rotation'),
+    ({'imu': True, 'imu_rotation': '0 0 0 1'}, ''),
+    ({'guess': True}, 'odometry.guess is true'),
+    ({'scale': 'guess'}, 'odometry.scale is guess'),
+    ({'guess': True, 'guess_frame': 'odom_of_wheels'}, '')])
+def test_tf_is_asked_where_something_is_mounted_somewhere_and_nobody_has_said_where(values, why):
+    config = from_flat({f'odometry.{name}': value for name, value in values.items()})
+    assert why_frames(config.odometry) == why
 
 
 @pytest.mark.parametrize(('name', 'node', 'meant'), [
