@@ -6,7 +6,7 @@ from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.posegraph.loops import unit_change
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
-from djet_ros.posegraph.units import log_units, with_one_unit
+from djet_ros.posegraph.units import log_units, scaled, with_one_unit
 import numpy as np
 import pytest
 
@@ -68,6 +68,15 @@ def test_without_a_loop_that_tells_nothing_changes():
     same, factors = with_one_unit(graph)
     assert np.array_equal(factors, np.ones(N))
     assert all(one is other for one, other in zip(same.edges, graph.edges))
+
+
+def test_in_another_unit_an_edge_is_longer_and_as_sure_and_turns_as_before():
+    errors, motion = np.random.default_rng(5).normal(size=(6, 20)), circles()[7]
+    edge = scaled(Edge(0, 1, motion, errors @ errors.T / 20), 3.0)
+    assert np.array_equal(edge.motion[:3, :3], motion[:3, :3])
+    assert np.array_equal(edge.motion[:3, 3], 3 * motion[:3, 3])
+    errors[:3] *= 3
+    assert np.allclose(edge.covariance, errors @ errors.T / 20)
 
 
 def test_loops_mend_the_scale_which_poses_alone_cannot():
