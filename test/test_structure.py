@@ -536,7 +536,11 @@ class Ground(ScaleSource):
 
 
 def factors(metres, alike):
-    """Logarithms of the metres of a unit after each of some lengths (N,), and their variances."""
+    """
+    Logarithms of the metres of a unit after each of some lengths (N,), and their variances.
+
+    And the shares of their errors that were in those before.
+    """
     step = Addition(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
     scale = OneScale()
     scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
@@ -547,8 +551,8 @@ def factors(metres, alike):
     ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
     told = []
     for number in range(len(metres)):
-        scale.of_step((number * 10**9, (number + 1) * 10**9), None, ahead)
-        told.append((scale._log, scale._variance))
+        length = scale.of_step((number * 10**9, (number + 1) * 10**9), None, ahead).length
+        told.append((scale._log, scale._variance, length.common.kept[0]))
     return np.array(told).T
 
 
@@ -557,19 +561,29 @@ def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_sa
     for _ in range(60):
         metres = np.exp(np.repeat(rng.normal(0, 0.02, 20), 8))
         for alike, ended in squares.items():
-            logs, variances = factors(metres, alike)
+            logs, variances, _ = factors(metres, alike)
             ended.append(logs[-1]**2 / variances[-1])
     assert 0.5 < np.mean(squares[8]) < 1.5
     # Were each taken for itself, it would be far too sure.
     assert np.mean(squares[0]) > 3
 
 
+def test_of_the_error_of_a_factor_as_much_is_kept_as_measurements_leave_of_it():
+    rng = np.random.default_rng(1)
+    runs = np.array([factors(np.exp(rng.normal(0, 0.02, 4)), alike=0) for _ in range(400)])
+    errors, kept = runs[:, 0], runs[0, 2]
+    assert kept == pytest.approx([0, 1 / 2, 2 / 3, 3 / 4], abs=0.02)
+    for before in range(3):
+        one, next_one = errors[:, before], errors[:, before + 1]
+        assert one @ next_one / (one @ one) == pytest.approx(kept[before + 1], abs=0.12)
+
+
 def test_a_lawn_as_long_as_the_ground_in_sight_does_not_make_another_scale():
     metres = np.ones(160)
     metres[80:95] = 0.8
-    logs, _ = factors(metres, alike=8)
+    logs, *_ = factors(metres, alike=8)
     assert np.abs(logs).max() < 0.01
     # What lasts is believed.
     metres[80:] = 0.8
-    logs, _ = factors(metres, alike=8)
+    logs, *_ = factors(metres, alike=8)
     assert logs[-1] == pytest.approx(np.log(0.8), abs=0.02)
