@@ -9,8 +9,9 @@ import cv2
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
 from djet_ros.core.masks import at
-from djet_ros.core.types import Status
+from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
 from djet_ros.odometry.messages import (
     frame_status,
@@ -734,6 +735,19 @@ def test_a_debug_image_shows_the_last_pair(drive):
     assert 0.01 < coloured < 0.9
     play(one, [np.zeros_like(drive[0])], start=0.2)
     assert one.debug_image() is not None
+
+
+def test_a_debug_image_draws_a_residual_twenty_times_as_long_towards_the_line():
+    x, y = np.array([[30.0, 30], [80, 60]]), np.array([[40.0, 30], [80, 50]])
+    drawn = debug_image(np.full((90, 120), 50, np.uint8), RelativePose(
+        Status.OK, x=x, y=y, y_opt=np.array([[40.0, 31.5], [79, 50]]),
+        inliers=np.ones(2, bool)))
+    yellow = (drawn[:, :, 2] > 150) & (drawn[:, :, 0] < 100) & (drawn[:, :, 1] > 100)
+    rows, columns = np.nonzero(yellow)
+    down, left = columns < 45, columns > 55
+    assert (down | left).all()
+    assert rows[down].min() >= 29 and rows[down].max() == pytest.approx(60, abs=1)
+    assert columns[left].max() <= 81 and columns[left].min() == pytest.approx(60, abs=1)
 
 
 def test_landmarks_are_a_cloud_in_front_of_the_camera(drive):
