@@ -8,7 +8,7 @@ from djet_ros.core.covariance import as_far_as_claimed, by_calibration, pose_cov
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents, unit
-from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise, Residuals
+from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise, moved, Residuals
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.surfaces import DescriptorSurface, ReprojectionSurface, with_minimum
 from djet_ros.core.types import Pose, Status
@@ -230,6 +230,20 @@ def test_what_is_claimed_beyond_where_matches_cease_to_agree_is_less_sure(share,
     # A sum of squares rises as its curvature says, as long as the pose is bent by a little only.
     squares, _ = as_far_as_claimed(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
+
+
+@pytest.mark.parametrize('way', [2, -2])
+def test_a_pose_beside_its_minimum_is_unsure_towards_it_to_whichever_side_that_lies(way):
+    views = two_views(np.random.default_rng(5), count=300)
+    surface = ReprojectionSurface(views.x, views.y)
+    problem = jet_problem(views.K, views.x, surface.around(views.y))
+    residuals = epipolar_residuals(problem, views.R, views.t)
+    claimed = np.linalg.inv(residuals.jacobian @ residuals.jacobian.T) * 0.01**2
+    variances, axes = np.linalg.eigh(claimed)
+    for variance, axis in zip(variances, axes.T):
+        pose = Pose(*moved(views.R, views.t, residuals.tangents, way * np.sqrt(variance) * axis))
+        told, _ = as_far_as_claimed(claimed, problem, pose, Loss())
+        assert axis @ told @ axis > 50 * variance
 
 
 def test_few_errors_tell_a_covariance_whose_bounds_hold_nevertheless():
