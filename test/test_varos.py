@@ -38,6 +38,8 @@ def test_a_varos_folder_is_known_by_what_it_holds(varos, inner):
     assert isinstance(sequence, VarosSequence)
     assert len(sequence) == 3
     assert sequence.size == SIZE
+    # The optical axis goes through the middle of the image, with pixel centres at integers.
+    assert sequence.K[:2, 2].tolist() == [639.5, 359.5]
     assert sequence.stamps_ns.tolist() == [stamp + STAMP_OFFSET_NS for stamp in STAMPS]
     assert sequence.image(1).shape == SIZE[::-1]
     assert 0 < sequence.image(1)[0, 0] < sequence.image(2)[0, 0]
