@@ -527,6 +527,10 @@ def test_frames_that_move_are_chained_between_their_stamps() -> None:
     assert frames.covers('base_link', 'camera', 300) and not frames.covers('map', 'camera', 0)
     frames.forget_before(200)
     assert np.isfinite(frames.poses('odom', 'camera', np.array([200]))).all()
+    # What is mounted stays where it is.
+    frames.reset()
+    assert not frames.covers('odom', 'base_link', 0)
+    assert np.allclose(frames.poses('mast', 'camera', np.array([200])), c)
 
 
 def test_a_circle_of_frames_ends() -> None:
