@@ -566,6 +566,25 @@ def test_ground_truth_is_found_by_its_name(tmp_path):
         assert len(list(source.messages())) == 5
 
 
+def test_messages_within_messages_of_ros_1_are_those_of_jazzy(tmp_path):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+
+    def old(message, **fields):
+        kind, header = message.__msgtype__, message.header
+        stamp = noetic.types['builtin_interfaces/msg/Time'](header.stamp.sec, header.stamp.nanosec)
+        return noetic.types[kind](header=noetic.types['std_msgs/msg/Header'](
+            seq=7, stamp=stamp, frame_id=header.frame_id), **fields)
+
+    path = MAKE.path([MAKE.pose_in(SECOND + i, 'odom', np.eye(4)) for i in range(3)])
+    message = old(path, poses=[old(one, pose=one.pose) for one in path.poses])
+    with Ros1Writer(tmp_path / 'old.bag') as writer:
+        connection = writer.add_connection('/path', message.__msgtype__, typestore=noetic)
+        writer.write(connection, SECOND, noetic.serialize_ros1(message, message.__msgtype__))
+    with Bag(tmp_path / 'old.bag') as bag:
+        read, = bag.messages()
+    assert read.message == path
+
+
 def test_an_empty_ros1_bag_is_empty_and_not_broken(tmp_path):
     assert 'holds no message' in source_error(ros1_bag(tmp_path / 'old.bag', count=0))
 
