@@ -314,6 +314,13 @@ def test_a_wrong_raw_drive_is_named(raw: Path, file: str, old: str, new: str, sa
     assert '\n' not in str(caught.value)
 
 
+def test_a_raw_drive_without_images_is_named(raw: Path) -> None:
+    for path in (raw / 'image_00' / 'data').iterdir():
+        path.unlink()
+    with pytest.raises(DjetError, match=f'^{raw}/image_00/data holds no \\*.png; '):
+        open_sequence(raw)
+
+
 def test_a_raw_drive_asks_for_its_calibration(raw: Path) -> None:
     (raw.parent / 'calib_cam_to_cam.txt').unlink()
     with pytest.raises(DjetError, match='calib_cam_to_cam.txt is missing; copy it there'):
