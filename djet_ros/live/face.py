@@ -63,6 +63,10 @@ class Face:
     # To be made by a subclass, before it listens.
     session: LiveSession
 
+    # To be had by ``listen_to_camera``, before it runs.
+    _info_topic: str
+    _images: Subscription
+
     def __init__(self, middleware: Middleware) -> None:
         self._middleware = middleware
         self._outputs: dict[str, Publisher] = {}
@@ -72,7 +76,6 @@ class Face:
         self._refused: list[Subscription] = []
         # Topics whose quality of service is as our parameters say.
         self._as_configured: set[str] = set()
-        self._images: Subscription | None = None
         self._latched = self._follows_frames = False
         self._remedy = 'ros.qos_reliability to best_effort'
         self._last_tick = -float('inf')
@@ -210,8 +213,7 @@ class Face:
 
     def _tick(self) -> None:
         self.follow_frames_while_wanted()
-        if self._images is not None:
-            self.session.count_lost(self._images.new_losses())
+        self.session.count_lost(self._images.new_losses())
         # Who publishes is known by name a little after it is refused.
         refused = [one for one in self._inputs if one.new_refusals()]
         for subscription in self._refused:
