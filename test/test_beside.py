@@ -13,7 +13,7 @@ import cv2
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle
-from djet_ros.core.masks import blocked
+from djet_ros.core.masks import at, blocked
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
@@ -334,6 +334,13 @@ def test_masked_pixels_give_no_feature_and_no_surface(drive: Drive) -> None:
     assert found.y_opt[found.inliers, 0].min() > 150 + 10
     orb = TwoViewEstimator(from_flat({'estimator.detector': 'orb'}).estimator)
     assert orb.view(drive.images[0], K, left_out=left_out).features.points[:, 0].min() > 150
+
+
+def test_beyond_a_mask_nothing_is_left_out() -> None:
+    points = np.array([[0.0, 0], [3, 2], [3.4, 2.4], [-0.4, -0.4], [3.6, 1], [1, 2.6], [-0.6, 1],
+                       [1, -0.6]])
+    assert at(np.ones((3, 4), bool), points).tolist() == [True] * 4 + [False] * 4
+    assert not at(None, points).any()
 
 
 def test_a_single_pixel_blocks_the_patches_around_it() -> None:
