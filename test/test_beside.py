@@ -113,6 +113,18 @@ def test_without_a_gyro_its_messages_change_nothing(drive: Drive) -> None:
     assert heard[0] == heard[1]
 
 
+def test_a_gyro_whose_clock_is_ahead_is_heard_by_that_of_the_images(drive: Drive) -> None:
+    ahead = drive.imu()
+    for message in ahead:
+        message.header.stamp = MAKE.time(stamp_of(message) + 250_000_000)
+    true, known, unknown = (
+        [serialised(one.message)
+         for one in played(tracker(**IMU, **{'odometry.imu_offset': offset}), drive, messages)
+         if one.topic in POSES]
+        for messages, offset in ((drive.imu(), 0.0), (ahead, 0.25), (ahead, 0.0)))
+    assert true == known != unknown
+
+
 def test_orientation_goes_on_through_darkness() -> None:
     """A camera that has stood for three seconds, drives off, and sees nothing for another two."""
     drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
