@@ -256,6 +256,16 @@ def test_what_poses_are_called_and_along_which_axes_they_are_is_fixed_for_a_node
     assert set(FIXED) < flat(Config()).keys()
 
 
+@pytest.mark.parametrize(('values', 'by'), [
+    ({}, (False, False)), ({'guess_frame': 'odom_of_wheels'}, (False, False)),
+    ({'guess': True}, (True, False)), ({'scale': 'guess'}, (True, False)),
+    ({'guess': True, 'guess_frame': 'odom_of_wheels'}, (False, True)),
+    ({'scale': 'guess', 'guess_frame': 'odom_of_wheels'}, (False, True))])
+def test_another_odometry_is_heard_by_its_topic_or_by_tf_where_it_is_asked_for(values, by):
+    config = from_flat({f'odometry.{name}': value for name, value in values.items()}).odometry
+    assert (config.guess_by_topic, config.guess_by_tf) == by
+
+
 @pytest.mark.parametrize(('values', 'why'), [
     ({}, ''),
     ({'base_frame': 'base_link'}, 'odometry.base_frame is base_link'),
