@@ -29,6 +29,7 @@ class Graph:
         self.offered: dict[str, Profile] = {}
         self.callbacks: dict[str, Callable[[Any], None]] = {}
         self.kinds: dict[str, str] = {}
+        self.heard: list[str] = []
         # Topics that somebody else publishes, whatever the type.
         self.elsewhere: list[str] = []
         self.frames: dict[tuple[str, str], Any] = {}
@@ -55,6 +56,7 @@ class Graph:
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
                ready: Callable[[], bool] | None = None) -> Any:
         self.callbacks[topic], self.kinds[topic] = callback, kind
+        self.heard.append(topic)
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
                                new_refusals=lambda: int(topic in self.offered))
 
@@ -141,6 +143,15 @@ def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node)
     {}, {'odometry.imu': True, 'odometry.imu_rotation': '0 0 0 1'}])
 def test_tf_is_not_heard_where_nothing_is_asked_of_it(node, parameters):
     assert not node(**parameters).graph.hears_tf
+
+
+def test_what_is_asked_for_on_the_way_is_heard_once_however_often_parameters_change(node):
+    one = node(**{'odometry.imu': True})
+    one.change(**{'odometry.scale': 'speed', 'odometry.mask': True, 'odometry.guess': True})
+    one.change(**{'odometry.guess_frame': 'wheels'})
+    one.change(**{'odometry.max_gap': 2.0})
+    assert sorted(one.graph.heard) == ['/camera_info', '/guess', '/image', '/imu', '/mask',
+                                       '/speed', '/speed_odometry', '/tf', '/tf_static']
 
 
 @pytest.mark.parametrize(('topic', 'offered', 'remedy'), [
