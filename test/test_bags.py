@@ -248,12 +248,17 @@ def rename_the_file(folder):
     (folder / 'out.mcap').rename(folder / 'rosbag2_0.mcap')
 
 
+def link_to_the_file(folder):
+    (folder / 'out.mcap').rename(folder.parent / 'kept.mcap')
+    (folder / 'out.mcap').symlink_to(folder.parent / 'kept.mcap')
+
+
 def lose_the_metadata(folder):
     (folder / 'metadata.yaml').unlink()
 
 
 @pytest.mark.parametrize('change', [keep_notes, keep_a_recording, keep_a_folder, rename_the_file,
-                                    lose_the_metadata])
+                                    link_to_the_file, lose_the_metadata])
 def test_a_folder_that_holds_anything_but_a_bag_of_ours_is_never_overwritten(
         small_kitti, tmp_path, change):
     sequence = KittiSequence(small_kitti(frames=2))
