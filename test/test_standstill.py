@@ -52,6 +52,16 @@ def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
     assert not elsewhere.told(behind_a_lorry(40), MOST, at_rest=True)
 
 
+def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_is_known() -> None:
+    for share, told_at_first, told_after in ((0.3, True, True), (0.1, True, False),
+                                             (0.03, False, False)):
+        pair = seen(WORLD, WORLD + np.where(np.arange(400) < 400 * share, 0, 60)[:, None] * RIGHT)
+        standstill = Standstill()
+        assert standstill.told(pair, MOST, at_rest=True) is told_at_first
+        standstill.moved()
+        assert standstill.told(pair, MOST, at_rest=True) is told_after
+
+
 def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> None:
     """A few of those that stood go with the sky, and all others with the camera's motion."""
     y = WORLD + np.random.default_rng(6).uniform(2, 40, (400, 1)) * RIGHT
