@@ -60,11 +60,10 @@ def fused(relative: RelativePose, turn: Turn) -> RelativePose:
     Give the pair with the turn weighed into its rotation, and so into its direction too.
 
     The update of a Kalman filter whose state is the pair's rotation and direction, and which
-    measures the rotation. Errors of the two have to be independent.
+    measures the rotation. Errors of the two have to be independent, and both covariances known, as
+    those of rotations that agree are.
     """
     covariance, t = relative.covariance_5, relative.t
-    if not np.isfinite(covariance).all():
-        return relative
     gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + turn.covariance)
     step = gain @ turn.off(relative.R)
     keep = np.eye(5) - gain @ np.eye(3, 5)
