@@ -95,6 +95,16 @@ def test_loops_mend_the_scale_which_poses_alone_cannot():
     assert mended < bent / 2
 
 
+def test_what_is_not_trusted_is_counted_by_its_kind():
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.posegraph.backend import OptimisedGraph
+    edges = tuple(Edge(0, 1, np.eye(4), np.eye(6), kind)
+                  for kind in ('odometry', 'link', 'loop', 'loop', 'loop'))
+    found = OptimisedGraph(PoseGraph(np.arange(2), circles()[:2], edges),
+                           np.array([1.0, 0.4, 0.4, 0.0, 0.6]), np.ones(2))
+    assert [found.rejected(kind) for kind in ('odometry', 'link', 'loop')] == [0, 1, 2]
+
+
 def pair(points, R, t, K):
     """Exact answer of an estimator for points (N, 3) of the first view."""
     there = points @ R.T + t
