@@ -9,9 +9,9 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.hamming import match_distances
-from djet_ros.core.matching import match_widely
+from djet_ros.core.matching import match_foreseen, match_widely
 from djet_ros.core.starts import Known
-from djet_ros.core.types import Array, View
+from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
 import pytest
 from two_view import some, textured
@@ -98,3 +98,17 @@ def test_no_feature_at_all_is_no_match():
         previous.features, np.zeros(len(previous.features), bool)))
     x, y = match_widely(none, current, None, Known(), 0.15)
     assert x.shape == y.shape == (0, 2)
+
+
+@pytest.mark.parametrize('more', [1, 3])
+def test_as_many_matches_are_enough_as_there_are_features_for_them(more: int) -> None:
+    """The motion before was told by as many features, or by three times as many."""
+    previous, current, _ = turned_views(600)
+    count = len(previous.features)
+    places = np.tile(previous.features.points, (more, 1))
+    before = RelativePose(Status.OK, R=rotation_exp(TURN), x=places, y=places, y_opt=places,
+                          inliers=np.ones(more * count, bool), sought=more * count)
+    assert match_foreseen(previous, current, before, Known(), 0.15) is not None
+    # Had a third as many features told as many, three times as many would be expected.
+    assert match_foreseen(previous, current, replace(before, sought=count // 3), Known(),
+                          0.15) is None
