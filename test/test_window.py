@@ -79,12 +79,13 @@ class Street:
 class NumbersWindow(Window):
     """A window that is told where points are, instead of looking at images."""
 
-    def __init__(self, street: Street) -> None:
+    def __init__(self, street: Street, unit: float = 1.0) -> None:
         super().__init__(EstimatorConfig())
         self._distances: Any = SimpleNamespace(
             describable=lambda points, shape, radius=0: inside(points),
             strengths=lambda seen, points: np.ones(len(points)))
         self._street, self._which = street, dict[tuple[float, ...], int]()
+        self._unit = unit
         self._frame, self.told, self.taken, self.thrown = 0, list[float](), 0, 0
         self.pairs = list[Numbers]()
         self.start(blank())
@@ -95,7 +96,7 @@ class NumbersWindow(Window):
         self._which.update(zip(map(tuple, pair.x.tolist()), which.tolist()))
         self._frame += 1
         self.pairs.append(pair.R)
-        self.added = self.add(blank(), pair, 1.0)
+        self.added = self.add(blank(), pair, self._unit)
         return self.added.length
 
     def straighten(self, newest: Any) -> None:
@@ -170,6 +171,15 @@ def test_noise_does_not_change_the_scale() -> None:
     drifts = np.log(last / first)
     assert abs(drifts.mean()) < 0.01
     assert drifts.std() < 0.01
+
+
+@pytest.mark.parametrize('unit', [0.002, 50.0])
+def test_a_track_is_the_same_in_any_unit(unit: float) -> None:
+    """The first step makes it: one of a vehicle that moves off, or one of metres."""
+    as_they_are, in_units = (
+        [window.go() for _ in range(60)]
+        for window in (NumbersWindow(Street(0, 60, 0.3)), NumbersWindow(Street(0, 60, 0.3), unit)))
+    assert np.array(in_units) / unit == pytest.approx(as_they_are, rel=1e-6)
 
 
 @pytest.mark.parametrize('seed', range(3))

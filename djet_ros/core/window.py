@@ -84,7 +84,7 @@ class WindowTuning:
     known: float = 0.15
     # pixels; chosen: what right matches are off, where surfaces are fitted to them
     off: float = 0.1
-    # chosen: inverse depth, negative, to which noise takes what is infinitely far
+    # rad; chosen: parallax of a step, negative, to which noise takes what is infinitely far
     beyond: float = 0.01
     # chosen: so few landmarks do not tell a length
     few: int = 8
@@ -425,8 +425,10 @@ class Window:
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
+        # Of the newest step, as the unit may be a far longer or shorter one.
+        length = float(np.linalg.norm(self._poses.between[1][-1, -2]))
         self._landmarks = self._landmarks.of(np.asarray(
-            self._landmarks.seen.any(1) & (self._landmarks.rho > -self._tuning.beyond)))
+            self._landmarks.seen.any(1) & (self._landmarks.rho * length > -self._tuning.beyond)))
         return H
 
     def _moved(self, observed: Observed, prior: OfPrior, step: Array, change: Array
