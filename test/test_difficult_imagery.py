@@ -129,6 +129,15 @@ def rolling(i: int, gray: Gray) -> Gray:
         np.uint8)
 
 
+def bonneted(i: int, gray: Gray) -> Gray:
+    """Hide the lower third of the image behind something that moves with the camera."""
+    stuck = cv2.GaussianBlur(np.random.default_rng(3).normal(0, 150, gray.shape), (0, 0), 2)
+    grain = np.random.default_rng([4, i]).normal(0, 1, gray.shape)
+    shown, top = gray.copy(), 2 * len(gray) // 3
+    shown[top:] = np.clip(np.rint(90 + stuck + grain), 0, 255)[top:]
+    return shown
+
+
 def grainy(i: int, gray: Gray) -> Gray:
     return np.clip(np.rint(gray + np.random.default_rng(i).normal(0, 12, gray.shape)),
                    0, 255).astype(np.uint8)
@@ -170,6 +179,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     '1 % of the matches wrong': lambda: wrong_matches(0.01),
     '50 % of the matches wrong': lambda: wrong_matches(0.5),
     'half of the image moves by itself': partial(drive, 'moving_object'),
+    'a third of the image moves with the camera': partial(drive, 'road', bonneted),
 }
 
 

@@ -141,6 +141,42 @@ def test_a_small_body_leaves_no_doubt_about_the_world() -> None:
     assert not result.inliers[400:].any()
 
 
+@pytest.mark.parametrize('stuck', [200, 500])
+@pytest.mark.parametrize('seed', range(3))
+def test_what_keeps_its_pixels_before_a_camera_that_turns_is_not_the_sky(
+        stuck: int, seed: int) -> None:
+    """A bonnet in the lower part of the image, as many matches as the world has or fewer."""
+    rng = np.random.default_rng(seed)
+    seen = two_views(rng, count=400, t=FORWARD, turn=(0.0, 0.012, 0.0))
+    bonnet = rng.uniform((0, 250), SIZE, (stuck, 2))
+    x = np.concatenate([seen.x, bonnet])
+    y = np.concatenate([seen.y, bonnet])
+    y += rng.normal(0, NOISE, y.shape) * np.where(np.arange(len(y)) < 400, 1.0, 0.2)[:, None]
+    # It went straight on before, as the bonnet has it all the time.
+    for before in (None, Pose(np.eye(3), seen.t)):
+        result = estimate(x, y, before)
+        assert result.status is Status.OK
+        assert rotation_angle(result.R, seen.R) < 1e-3
+        assert direction_angle(result.t, seen.t) < 0.02
+        assert squared_error(result, seen) < chi2.ppf(0.9999, 5)
+
+
+def test_a_sky_that_keeps_its_pixels_while_the_camera_drives_straight_on_is_of_the_world() -> None:
+    rng = np.random.default_rng(6)
+    seen = two_views(rng, count=300, t=FORWARD, turn=(0.0, 0.0, 0.0))
+    sky = rng.uniform((0, 0), (SIZE[0], 120), (200, 2))
+    x, y = np.concatenate([seen.x, sky]), np.concatenate([seen.y, sky])
+    result = estimate(x, y + rng.normal(0, NOISE, y.shape))
+    assert result.status is Status.OK
+    assert len(result.x) == 500 and result.inliers[300:].mean() > 0.9
+
+
+def squared_error(result: RelativePose, seen: TwoViews) -> float:
+    """Give the squared error of a pose over its covariance, 5 on average."""
+    return squared_distance(result.covariance_5,
+                            difference(result.R, result.t, Pose(seen.R, seen.t)))
+
+
 def plane_of_two_motions() -> tuple[np.ndarray, np.ndarray]:
     """Give noisy matches on one plane, which move alike under two motions."""
     rng = np.random.default_rng(4)

@@ -163,6 +163,8 @@ class TwoViewEstimator:
         track = self._track(pair, surface, starts)
         if track is None:
             return _failed(Status.TOO_FEW_MATCHES, pair)
+        if track.carried is not None:
+            return self.estimate_pair(pair.without(track.carried))
 
         # What is to be believed of it.
         result = self._verdict(pair, track)

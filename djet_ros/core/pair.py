@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, Pose, View
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -74,3 +75,11 @@ class Pair:
     outliers: int = 0
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)
+
+    def without(self, some: NDArray[np.bool_]) -> Pair:
+        """Give the pair without some (N,) of its matches, to be begun with anew."""
+        x, y, bits, covariances = (None if values is None else values[~some] for values in (
+            self.x, self.y, self.bits, self.covariances))
+        assert x is not None and y is not None
+        return replace(self, x=x, y=y, bits=bits, covariances=covariances, ahead=None,
+                       limits=Limits(), outliers=self.outliers + int(some.sum()))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 from djet_ros.core.cells import summed_by_cell
 from djet_ros.core.geometry import inverse_depths, sides
-from djet_ros.core.jet import JetProblem, Loss, robust_scale
+from djet_ros.core.jet import core_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import around, thinned
 from djet_ros.core.types import Array, Pose
@@ -54,6 +54,10 @@ _ON_PLANE = 1.5
 
 # Shares of a body's points before its far and its near end; chosen: some are not of it.
 _FAR_END, _NEAR_END = 0.1, 0.95
+
+# Near end over far end of what is a world: it reaches from the ground before the camera to the
+# horizon.
+DEEP = 0.25
 
 # chosen: noise of an inverse depth over that of the near end; more would make a plane look deep.
 _BLURRED = 0.1
@@ -169,15 +173,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     least = max(least, round(_SMALL_SHARE * (off < _MEMBER * scale).sum()))
     if len(strays) < least:
         return None
-    alone = problem.subset(strays)
-    starts = around(first, _DIRECTIONS)
-    rough = Loss('geman_mcclure', _STRAY * scale)
-    found = refine_all(alone.subset(thinned(len(strays), _STRAYS)), starts, rough, _STEPS)
-    tight = Loss('geman_mcclure', _MEMBER * scale)
-    seen = refine_all(alone, found.poses(), tight, 1)
-    best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
-    refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
-    pose = _in_front(alone, refined.pose(0), np.abs(refined.r[0]) < _MEMBER * scale)
+    pose = _motion_of(problem.subset(strays), first, scale)
     members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < _MEMBER * scale
     followers = members[strays].sum()
     if followers < least or followers <= len(strays) / 2:
@@ -188,6 +184,49 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
                         _area(places[only_second]) / max(_area(places[only_first]), 1e-9),
                         (_flatness(problem.subset(only_first), first),
                          _flatness(problem.subset(only_second), pose)))
+
+
+def _motion_of(alone: JetProblem, near: Pose, scale: float) -> Pose:
+    """Find the motion that most of some matches agree with, from all round another one."""
+    rough, tight = (Loss('geman_mcclure', share * scale) for share in (_STRAY, _MEMBER))
+    some = alone.subset(thinned(len(alone.blur), _STRAYS))
+    found = refine_all(some, around(near, _DIRECTIONS), rough, _STEPS)
+    seen = refine_all(alone, found.poses(), tight, 1)
+    best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
+    refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
+    return _in_front(alone, refined.pose(0), np.abs(refined.r[0]) < _MEMBER * scale)
+
+
+def carried_along(problem: JetProblem, kept: NDArray[np.bool_], pose: Pose, scale: float,
+                  least: int, before: Pose | None = None) -> Pose | None:
+    """
+    Tell whether matches that keep their pixels are carried along by a camera that moves.
+
+    A bonnet or an arm is where it was in each pair. It agrees with any motion of a camera that
+    does not turn, as the sky does, and bends that of the world until it does not turn. So the
+    motion of all others is asked. It is the camera's where it is that of a world, as that reaches
+    from near to far or goes on as before, and where most of what keeps its pixels strays from it.
+
+    problem: all matches; kept: (N,) bool mask of those; pose: of all, from which it is looked for;
+    scale: robust standard deviation of the residuals of those that agree; least: see
+    ``second_motion``; before: the motion before this one. Gives the motion of the others, or None.
+    """
+    least = max(least, round(_SMALL_SHARE * len(kept)))
+    if min(kept.sum(), (~kept).sum()) < least:
+        return None
+    alone = problem.subset(~kept)
+    world = _motion_of(alone, pose, scale)
+    # What keeps its pixels is seen more exactly than what moves.
+    scale = max(core_scale(refine_all(alone, [world], Loss(), 0).r[0]), scale)
+    tight = refine_all(alone, [world], Loss('geman_mcclure', _MEMBER * scale), _STEPS)
+    world = _in_front(alone, tight.pose(0), np.abs(tight.r[0]) < _MEMBER * scale)
+    off = _distances(problem, refine_all(problem, [world], Loss(), 0))
+    follow = off[~kept] < _MEMBER * scale
+    carried = (off[kept] > _STRAY * scale).sum()
+    if follow.mean() <= 0.5 or carried < least or carried <= kept.sum() / 2:
+        return None
+    deep = _flatness(alone.subset(follow), world) < DEEP
+    return world if deep or (before is not None and goes_on(before, world, pose)) else None
 
 
 def false_alarms(agreeing: int, matches: int, chance: float) -> float:

@@ -46,8 +46,10 @@ from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import as_matched, Placed
 from djet_ros.core.rivals import (
     apart,
+    carried_along,
     change,
     DECIDED,
+    DEEP,
     goes_on,
     lie_on_a_plane,
     preferences,
@@ -75,9 +77,8 @@ class TrackTuning:
     # mistaken for it
     small_body: float = 0.3
     # near end over far end: chosen, a body is about as deep as it is wide, and stands no nearer
-    # than that; the world reaches from the ground before the camera to the horizon
+    # than that
     flat: float = 0.5
-    deep: float = 0.25
     # chosen: steps on all matches to a pose that surfaces are only placed by
     steps_by_places: int = 2
     # chosen: by what matches may be noisier after the first round than in the end, where they are
@@ -104,7 +105,8 @@ class Track:
     (N, 2) the final step onto the epipolar line; losses: (N,) last known surface values; rounds:
     what led there; rivals: other motions that explain the voting matches; beside: other minima in
     the basin of the pose; guess: whether there are rivals because two bodies move, and nothing
-    tells which is the world.
+    tells which is the world; carried: (N,) bool, matches that are carried along by the camera, and
+    which the pose has not been told without yet, None where there are none.
     """
 
     pose: Pose
@@ -121,6 +123,7 @@ class Track:
     rivals: tuple[Rival, ...] = ()
     beside: tuple[Rival, ...] = ()
     guess: bool = False
+    carried: NDArray[np.bool_] | None = None
 
     @property
     def iterations(self) -> int:
@@ -168,6 +171,11 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
             led = _Algorithm(_untold(pair), surface, config, everything).run([rival])
             if led is not None and turn.prefers(led.pose.R, track.pose.R):
                 track = led
+    kept = np.linalg.norm(pair.y - pair.x, axis=1) < TRACK_TUNING.inlier * algorithm.noise
+    world = carried_along(first.problem, kept[first.voting], track.pose, algorithm.noise,
+                          config.min_matches, pair.before)
+    if world is not None and (turn is None or not turn.prefers(track.pose.R, world.R)):
+        return replace(track, carried=kept)
     second = second_motion(first.problem, first.places, track.pose, algorithm.noise,
                            config.min_matches)
     if second is None:
@@ -474,7 +482,7 @@ def _told_apart(second: SecondMotion, prior: Pose | None, turn: Turn | None) -> 
     if second.width < TRACK_TUNING.small_body:
         return 0
     for one, other in orders:
-        if second.flatness[one] < TRACK_TUNING.deep and second.flatness[other] > TRACK_TUNING.flat:
+        if second.flatness[one] < DEEP and second.flatness[other] > TRACK_TUNING.flat:
             return one
     return None
 
