@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 from djet_ros.core.basins import lowest_around
@@ -24,7 +25,7 @@ from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import all_round
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
-from djet_ros.core.verdict import _judged
+from djet_ros.core.verdict import _judged, as_turn
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -193,6 +194,20 @@ def test_where_another_motion_explains_the_matches_as_well_the_pose_says_so() ->
     # Its guess is one of them, and its covariance spans a large part of the way to the other.
     assert result.t.any()
     assert np.sqrt(np.trace(result.covariance_5[3:, 3:])) > 0.1
+
+
+def test_a_pair_without_its_parallax_turns_as_its_matches_do_and_doubts_the_bent_one() -> None:
+    rng = np.random.default_rng(3)
+    x, R = rng.uniform((50, 50), (1190, 330), (300, 2)), Rotation.from_rotvec(TURN).as_matrix()
+    y, _ = project(K, np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T @ R.T)
+    seen = estimate(x, y + rng.normal(0, NOISE, y.shape))
+    wrong = rotation_exp(np.array([0.002, -0.003, 0.001])) @ seen.R
+    bent = replace(seen, status=Status.OK, R=wrong, t=unit(np.asarray(SIDEWAYS)))
+    turn = as_turn(bent, K)
+    assert turn.status is Status.NO_PARALLAX and not turn.t.any()
+    assert rotation_angle(turn.R, R) < 1e-4
+    off = Rotation.from_matrix(wrong @ R.T).as_rotvec()
+    assert unit(off) @ turn.covariance_5[:3, :3] @ unit(off) > 0.9 * off @ off
 
 
 def test_the_motion_before_decides_between_them() -> None:

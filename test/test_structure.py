@@ -336,6 +336,27 @@ def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_
     assert asked > 50 and agree > 0.9 * asked
 
 
+def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
+    """What a blurred turn shows beside it has any size and sign, wherever landmarks are."""
+    ways = [pose(x=0.16, z=0.12)] * 8
+    pair = Drive(cards).go(ways)[-1].relative
+    drive = Drive(cards)
+    drive.go(ways[:-1])
+    scale = drive.odometry._one_scale  # as it was before the last frame
+    assert not scale.sees_no_way(pair)
+    length, error = scale._window.told_length(pair)
+    assert length == pytest.approx(1, rel=0.05) and error < 0.02
+    rng, none = np.random.default_rng(5), 0
+    for _ in range(20):
+        any_way = rng.normal(0, 1, len(pair.x))[:, None]
+        none += scale.sees_no_way(replace(pair, y_opt=pair.x + any_way * (pair.y_opt - pair.x)))
+    assert none >= 19
+    # Without landmarks nobody knows.
+    scale.reset()
+    scale.begin(drive.odometry._view)
+    assert not scale.sees_no_way(pair)
+
+
 def test_another_estimator_goes_on_at_the_last_speed(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12)] * 3)

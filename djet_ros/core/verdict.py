@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from djet_ros.core.covariance import (
     as_far_as_claimed,
     by_calibration,
@@ -101,6 +103,16 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         sought=pair.sought,
         rivals=(*(rival.pose for rival in track.rivals),
                 *([Pose(R, -t)] if other_way and t.any() else [])))
+
+
+def as_turn(relative: RelativePose, K: Array) -> RelativePose:
+    """Give a pair whose parallax is none: a rotation alone, and how far its way had bent that."""
+    agree = relative.inliers
+    R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
+    bent = np.append(rotation_log(R @ relative.R.T), [0.0, 0.0])
+    covariances = spanning(relative.covariance_5, relative.t, bent, 1.0)
+    return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
+                   covariance_5=covariances[0], covariance_6=covariances[1])
 
 
 def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,

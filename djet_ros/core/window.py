@@ -153,6 +153,8 @@ class Window:
         self._told = np.eye(4)
         # The newest pair and its length, where it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
+        # The pair that was last asked for its length, and what landmarks say of it.
+        self._asked: tuple[RelativePose, tuple[Array, Array]] | None = None
         self.settled = np.empty((0, 3))
 
     @property
@@ -175,6 +177,7 @@ class Window:
         # What the pair says, in a length by depths that the window knows.
         first = self.is_new
         length, share = (guess, _EXACT) if first else self._length(relative, guess)
+        self._asked = None
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
         # Landmarks, old and new, are measured in the frame; then all is refined together.
@@ -261,16 +264,45 @@ class Window:
         unknown = guess, self._tuning.guessed
         if not relative.t.any():
             return unknown
-        x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        known, match = self._beside(x, self._landmarks.seen[:, -1])
-        if len(known) < self._tuning.few and self._latest is not None:
-            known, match = self._near(x, *self._depths_of(*self._latest))
-        if len(known) < self._tuning.few:
+        ratios, weights = self._ratios(relative)
+        if len(ratios) < self._tuning.few and self._latest is not None:
+            ratios, weights = self._ratios_by(relative, *self._near(
+                relative.x[relative.inliers], *self._depths_of(*self._latest)))
+        if len(ratios) < self._tuning.few:
             return unknown
-        in_units, sigma = inverse_depths(relative.R, relative.t, self._rays(x[match]),
-                                         self._rays(y[match]))
-        length = _weighted_median(in_units / known, known / sigma)
+        length = _weighted_median(ratios, weights)
         return (length, self._tuning.told) if length > 0 else unknown
+
+    def told_length(self, relative: RelativePose) -> tuple[float, float] | None:
+        """
+        Length of a pair by landmarks, and its standard error by how much these differ.
+
+        None where there are too few. Of a translation that is none, noise in place of depths is
+        left, and the length is nothing to within its error.
+        """
+        ratios, weights = self._ratios(relative)
+        if len(ratios) < self._tuning.few:
+            return None
+        length = _weighted_median(ratios, weights)
+        # Of a median, with as many as these weights are worth.
+        spread = 1.25 * 1.4826 * _weighted_median(np.abs(ratios - length), weights)
+        return length, spread * float(np.sqrt((weights**2).sum()) / weights.sum())
+
+    def _ratios(self, relative: RelativePose) -> tuple[Array, Array]:
+        """Lengths (M,) of a pair by landmarks beside its matches, one by one, and weights."""
+        # Asked twice of a pair: whether it went anywhere, and how far.
+        if self._asked is None or self._asked[0] is not relative:
+            x = relative.x[relative.inliers]
+            self._asked = relative, self._ratios_by(
+                relative, *self._beside(x, self._landmarks.seen[:, -1]))
+        return self._asked[1]
+
+    def _ratios_by(self, relative: RelativePose, rho: Array, match: NDArray[np.int64]
+                   ) -> tuple[Array, Array]:
+        """Tell the same by inverse depths rho (M,) that are known of some inliers (M,)."""
+        x, y = relative.x[relative.inliers][match], relative.y_opt[relative.inliers][match]
+        in_units, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+        return in_units / rho, rho / sigma
 
     def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
         """Pixels (N, 2) of a pair's inliers in its second frame, and inverse depths (N,) there."""

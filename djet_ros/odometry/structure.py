@@ -54,6 +54,9 @@ _TOGETHER = 1.0
 # improbable fewer have to be, and how many landmarks tell nothing.
 _RIGHT, _BY_CHANCE, _FEW = 0.75, 1e-3, 8
 
+# Standard errors, the usual three, within which a length by depths is none.
+_OUT_OF_NOISE = 3.0
+
 
 class Step(NamedTuple):
     """
@@ -248,6 +251,13 @@ class OneScale:
         if asked < _FEW:
             return None
         return bool(bdtr(agree, asked, _RIGHT) >= _BY_CHANCE)
+
+    def sees_no_way(self, relative: RelativePose) -> bool:
+        """Tell of a pair from the newest frame whether its parallax is noise, by all depths."""
+        if not self._carried or self._window.is_new or not relative.t.any():
+            return False
+        told = self._window.told_length(relative)
+        return told is not None and told[0] < _OUT_OF_NOISE * told[1]
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
         """Add a frame to the window; None where no length comes of it, and it begins anew."""

@@ -21,6 +21,7 @@ from djet_ros.core.types import (
     UNDECIDED,
     View,
 )
+from djet_ros.core.verdict import as_turn
 from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.guess import as_start, Guess
 from djet_ros.odometry.inertial import Gyro
@@ -299,6 +300,8 @@ class VisualOdometry:
         agrees = self._one_scale.agrees(Pose(relative.R, relative.t), relative.x, relative.y_opt)
         if relative.status is Status.OK and agrees is False:
             return _refuted(relative)
+        if relative.status is Status.OK and self._one_scale.sees_no_way(relative):
+            return as_turn(relative, self._view.K)
         if relative.status is Status.AMBIGUOUS and agrees and all(
                 self._one_scale.agrees(rival, relative.x, relative.y) is False
                 for rival in relative.rivals):
