@@ -163,7 +163,7 @@ def test_nothing_is_known_of_a_motion_over_a_gap():
     told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     odometry.lose_track()
     step, = told(steps, *odometry.start())
-    assert (step.tracked, step.restarted) == (False, True)
+    assert (step.tracked, step.status) == (False, Status.FIRST_FRAME)
     assert np.array_equal(step.covariance, UNKNOWN_MOTION)
     after, = told(steps, *odometry.move(pose(z=1.0)))
     assert after.previous_stamp_ns == step.stamp_ns

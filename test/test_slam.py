@@ -183,6 +183,18 @@ def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so(keyframes
     assert [one.keyframe for one in offsets] == [0, 0, 1, 1]
 
 
+def test_over_a_gap_the_map_turns_as_far_as_the_odometry_does(keyframes):
+    """A gyro tells it how far; the odometry's frame stays the same, and so does what is there."""
+    before, turned = pose(z=9.0), pose(z=9.0, yaw=np.radians(60))
+    told = steps(np.array([pose(), before, turned, turned @ pose(z=4.0)]))
+    told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, turned)
+    kept, _ = keyframes(told)
+    for _ in range(2):
+        assert np.allclose([one.pose for one in kept.keyframes], [one.pose for one in told])
+        assert np.allclose(kept.correction, np.eye(4))
+        kept.optimise()
+
+
 def test_bad_frames_and_stationary_ones_are_passed_by(keyframes):
     """A step may be told from the frame before the last; it then has its keyframe."""
     told = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))

@@ -165,18 +165,21 @@ class KeyframeMap:
         return step.keyframe
 
     def _offset(self, step: Step) -> KeyframeOffset | None:
-        """Offset of a step's frame; if the odometry restarted, its frame moves in the map."""
+        """Offset of a step's frame; if the odometry began anew, its frame moves in the map."""
         if self.newest is None or self._newest_step is None:
             return None
         reference = self._offsets.get(step.previous_stamp_ns)
         if step.tracked and reference is not None:
             covariance = step.own_covariance(self._uncertainty, self._slam.length_noise)
             return reference.then(step.motion, covariance, step.scale_known)
-        # Where the camera was last is as good a guess as any.
-        guess = np.linalg.inv(self._newest_step.pose) @ step.pose
-        if step.restarted:
-            self.correction = self.correction @ np.linalg.inv(guess)
+        before = self._newest_step.pose
+        if step.in_frame_of(self._newest_step):
+            # Where the odometry goes on: at its last pose, turned as far as something tells.
+            guess = np.linalg.inv(before) @ step.pose
+        else:
+            # Where the camera was last is as good a guess as any.
             guess = np.eye(4)
+            self.correction = self.correction @ before @ np.linalg.inv(step.pose)
         return self.newest.then(guess, UNKNOWN_MOTION, known=False)
 
     def _add(self, step: Step, frame: Frame, offset: KeyframeOffset | None) -> KeyframeOffset:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from djet_ros.core.types import Array, STARTED, Status, TRACKED
+from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
@@ -42,10 +42,9 @@ class Step(Motion):
         """Whether it is known how the camera came here from the previous frame."""
         return self.status in TRACKED and self.previous_stamp_ns is not None
 
-    @property
-    def restarted(self) -> bool:
-        """Whether the odometry restarted, so that its frame may be another than before."""
-        return self.status in STARTED
+    def in_frame_of(self, before: Step) -> bool:
+        """Whether the odometry's frame is that of a step before: over a gap it stays."""
+        return self.status is not Status.FIRST_FRAME and self.stamp_ns >= before.stamp_ns
 
 
 def scale_of(steps: Iterable[Step]) -> Scale:
