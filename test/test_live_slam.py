@@ -67,10 +67,11 @@ class Odometry:
         return (self._make.relative_pose_cov(result), self._make.status(result),
                 self._make.odometry(result))
 
-    def lose_track(self):
-        """Give (status, Odometry) of a bad pair after which the next frame starts from here."""
+    def lose_track(self, *, bridged=False):
+        """Give (status, Odometry) of a bad pair; unless bridged the next starts from here."""
         result = self._result(Status.TOO_FEW_MATCHES, np.eye(4), UNKNOWN_MOTION)
-        self.covariance, self._reference = result.pose_covariance, self.stamp
+        if not bridged:
+            self.covariance, self._reference = result.pose_covariance, self.stamp
         self.stamp += PERIOD
         return self._make.status(result), self._make.odometry(result)
 
@@ -170,15 +171,26 @@ def test_nothing_is_known_of_a_motion_over_a_gap():
 
 
 def test_after_the_odometry_had_lost_track_the_next_motion_is_from_a_frame_without_one():
+    """That frame comes with it, as from results, or one more motion would be lost."""
     odometry, steps = Odometry(), StepMessages('optical')
     known = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
-    assert not told(steps, *odometry.lose_track())
-    step, = told(steps, *odometry.move(pose(z=1.0)))
-    assert step.previous_stamp_ns == step.stamp_ns - PERIOD
+    for _ in range(3):
+        assert not told(steps, *odometry.lose_track())
+    lost, step = told(steps, *odometry.move(pose(z=1.0)))
+    assert (lost.tracked, lost.status) == (False, Status.TOO_FEW_MATCHES)
+    assert step.previous_stamp_ns == lost.stamp_ns == step.stamp_ns - PERIOD
     assert step.previous_stamp_ns not in {one.stamp_ns for one in known}
     after, = told(steps, *odometry.move(pose(z=1.0)))
     assert after.previous_stamp_ns == step.stamp_ns
     assert steps.missing == 0
+
+
+def test_a_bad_frame_that_is_bridged_is_no_step():
+    odometry, steps = Odometry(), StepMessages('optical')
+    *_, before = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    told(steps, *odometry.lose_track(bridged=True))
+    step, = told(steps, *odometry.move(pose(z=1.0)))
+    assert step.previous_stamp_ns == before.stamp_ns
 
 
 @pytest.mark.parametrize('lost', [0, 1, 2])

@@ -7,6 +7,7 @@ how sure that is, and the status of the same stamp from which frame, and whether
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any, NamedTuple
 
 from djet_ros.core.types import Array, STARTED, TRACKED
@@ -59,6 +60,8 @@ class StepMessages:
         self._mounting = self._axes if mounting is None else mounting
         self.missing = 0
         self._parts: dict[int, _Parts] = {}
+        # Bad frames, the newest last, from which the next motion may be told.
+        self._bad: deque[Step] = deque(maxlen=_WAITING)
         self._newest = -1
 
     def goes_back(self, odometry: Any) -> bool:
@@ -68,6 +71,7 @@ class StepMessages:
     def go_back(self, stamp: int) -> None:
         """Begin anew at a stamp; what waits from then on may belong to it."""
         self.missing, self._newest = 0, -1
+        self._bad.clear()
         self._parts = {at: parts for at, parts in self._parts.items()
                        if at == stamp and parts.odometry is None}
 
@@ -103,14 +107,21 @@ class StepMessages:
         return self._step(parts.status, parts)
 
     def _step(self, said: FrameStatus, parts: _Parts) -> list[Step]:
-        """Give the step of a frame; none for a bad pair, which may be bridged."""
+        """
+        Give the step of a frame; none for a bad pair, which may be bridged.
+
+        Where it is not, the step of its frame comes before the one that is told from there.
+        """
         _, pose = pose_of(parts.odometry)
         frame = parts.odometry.header.frame_id
         here = _of_camera(pose, self._mounting)
-        if said.status in STARTED:
-            return [Step(said.stamp_ns, said.status, here, odom_frame=frame,
-                         keyframe=said.keyframe, k1=said.k1)]
         if said.status not in TRACKED:
+            alone = Step(said.stamp_ns, said.status, here, odom_frame=frame,
+                         keyframe=said.keyframe, k1=said.k1)
+            if said.status in STARTED:
+                self._bad.clear()
+                return [alone]
+            self._bad.append(alone)
             return []
         expected = self._base_frame or parts.relative.header.frame_id
         if parts.odometry.child_frame_id != expected:
@@ -127,7 +138,9 @@ class StepMessages:
                     said.keyframe, said.k1)
         if step.tracked:
             step.check(f'odometry edge to {said.stamp_ns} ns')
-        return [step]
+        reference = [bad for bad in self._bad if bad.stamp_ns == step.previous_stamp_ns]
+        self._bad.clear()
+        return [*reference, step]
 
 
 def _of_camera(pose: Array, mounting: Array) -> Array:
