@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
+from djet_ros.odometry.frame import Frame
 from djet_ros.posegraph.loops import unit_change
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
+from djet_ros.posegraph.steps import Step
 from djet_ros.posegraph.units import log_units, scaled, with_one_unit
 import numpy as np
 import pytest
@@ -156,3 +159,60 @@ def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():
     few = RelativePose(Status.OK, x=other.x[:9], y=other.y[:9], y_opt=other.y_opt[:9],
                        inliers=np.ones(9, bool), R=other.R, t=other.t)
     assert unit_change(step, 1.0, loop, 1.0, few, 1.0, K) is None
+
+
+def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypatch):
+    """In a map without an error no edge is off by what is forgotten, though the unit grows."""
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros.posegraph import keyframe_map
+    truth = circles()
+    edges, units = drifting(truth)
+
+    class Told:
+        """Gives the loops that are told."""
+
+        def __init__(self, *_):
+            pass
+
+        def add(self, *_):
+            pass
+
+        def forget(self, first):
+            pass
+
+        def links(self, current):
+            return [replace(edge, kind='link', source=current - 2, motion=scaled(
+                Edge(0, 1, np.linalg.inv(truth[current - 2]) @ truth[current], edge.covariance),
+                np.exp(-units[current - 2])).motion) for edge in edges[:N - 1]
+                if edge.target == current and current % 7 == 3]
+
+        def loops(self, current, units):
+            return [edge for edge in edges[N - 1:] if edge.source == current]
+
+    monkeypatch.setattr(keyframe_map, 'EdgeFinder', Told)
+    graph = keyframe_map.KeyframeMap(Config(), max_keyframes=40)
+    for i, place in enumerate(truth):
+        step = Step(i, Status.OK, place, i - 1, edges[i - 1].motion, edges[i - 1].covariance, True,
+                    metric=False, keyframe=True)
+        graph.extend(step if i else Step(0, Status.FIRST_FRAME, place, keyframe=True),
+                     lambda stamp: Frame(np.zeros((4, 4), np.uint8), np.eye(3), stamp))
+        graph.seek()
+        newest = graph.keyframes[-1]
+        newest.pose, newest.factor = truth[i], float(np.exp(units[i]))
+    assert (graph.first, graph.count('loop'), graph.count('odometry')) == (N - 40, 6, 39)
+    assert graph.count('link') > 3
+    for edge in graph.edges:
+        source, target = (graph.keyframes[end - graph.first] for end in (edge.source, edge.target))
+        assert np.allclose(scaled(edge, source.factor).motion,
+                           np.linalg.inv(source.pose) @ target.pose)
+        if edge.kind == 'loop':
+            assert edge.stretch[0] == pytest.approx(np.log(target.factor / source.factor))
+
+
+def test_the_first_keyframe_that_is_left_keeps_its_unit():
+    edges, units = drifting(circles())
+    graph = PoseGraph(np.arange(N), circles(), tuple(edges))
+    one, ours = with_one_unit(graph), with_one_unit(graph, 1.5)
+    assert ours[1] == pytest.approx(1.5 * one[1])
+    for mine, theirs in zip(ours[0].edges, one[0].edges):
+        assert np.allclose(mine.motion[:3, 3], 1.5 * theirs.motion[:3, 3])

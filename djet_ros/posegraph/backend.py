@@ -26,7 +26,7 @@ class OptimisedGraph:
     """
     The graph with optimised poses; trust: (E,) its edges' final weights, 0 to 1.
 
-    factors: (N,) by which lengths in the unit at each vertex are in that of the first; see units.
+    factors: (N,) by which lengths in the unit at each vertex are in the graph's; see units.
     """
 
     graph: PoseGraph
@@ -39,16 +39,18 @@ class OptimisedGraph:
                    for edge, trust in zip(self.graph.edges, self.trust))
 
 
-def optimise(graph: PoseGraph) -> OptimisedGraph:
+def optimise(graph: PoseGraph, first: float = 1.0) -> OptimisedGraph:
     """
     Find the poses that fit the edges best.
+
+    first: by which lengths in the unit at the first vertex are in the graph's.
 
     Links and loops may be wrong altogether and are under a robust kernel: Geman-McClure by
     graduated non-convexity (Yang et al., RA-L 2020), which does not depend on how far the
     odometry had drifted. DjetError names an edge whose covariance can't be inverted.
     """
     graph.check()
-    graph, factors = with_one_unit(graph)
+    graph, factors = with_one_unit(graph, first)
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setLossType(gtsam.GncLossType.GM)
     # The first factor holds the first pose.

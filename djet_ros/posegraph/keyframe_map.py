@@ -16,7 +16,7 @@ from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 from djet_ros.posegraph.steps import Step
-from djet_ros.posegraph.units import in_unit
+from djet_ros.posegraph.units import in_unit, scaled
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -26,10 +26,16 @@ _WAITING = 20
 
 @dataclass
 class Keyframe:
-    """A keyframe of the map: its stamp and its pose (4, 4) in the map, as it is known now."""
+    """
+    A keyframe of the map: its stamp and its pose (4, 4) in the map, as it is known now.
+
+    factor: by which lengths in the odometry's unit there are in the map's, which is that of the
+    first keyframe that there was.
+    """
 
     stamp_ns: int
     pose: Array
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -187,7 +193,8 @@ class KeyframeMap:
         before = None if offset is None else offset.edge(number)
         if before is not None:
             self._chain.append(before)
-        self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose))
+        factor = self.keyframes[-1].factor if self.keyframes else 1.0
+        self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose, factor))
         self._unsought.append(_Unsought(frame, before, step.k1))
         if self._max_keyframes is not None and len(self.keyframes) > self._max_keyframes:
             self._forget_oldest()
@@ -219,9 +226,10 @@ class KeyframeMap:
             for edge in self.edges)
         optimised = optimise(PoseGraph(
             np.array([one.stamp_ns for one in self.keyframes]),
-            np.array([one.pose for one in self.keyframes]), edges))
-        for keyframe, pose in zip(self.keyframes, optimised.graph.poses):
-            keyframe.pose = pose
+            np.array([one.pose for one in self.keyframes]), edges), self.keyframes[0].factor)
+        for keyframe, pose, factor in zip(self.keyframes, optimised.graph.poses,
+                                          optimised.factors.tolist()):
+            keyframe.pose, keyframe.factor = pose, factor
         self.distrusted = optimised.rejected('loop')
         newest = self.newest.keyframe - self.first
         here = self.keyframes[newest].pose @ in_unit(
@@ -238,21 +246,35 @@ class KeyframeMap:
         forgotten one is known by it from now on.
         """
         oldest, heir = self.first, self.first + 1
-        between = np.linalg.inv(self.keyframes[0].pose) @ self.keyframes[1].pose
-        self.keyframes.popleft()
-        self.first = heir
         self._chain, self._found = (
-            [inherited(edge, oldest, between) if oldest in (edge.source, edge.target) else edge
+            [self._left_to_heir(edge) if oldest in (edge.source, edge.target) else edge
              for edge in edges if {edge.source, edge.target} != {oldest, heir}]
             for edges in (self._chain, self._found))
+        self.keyframes.popleft()
+        self.first = heir
+
+    def _left_to_heir(self, edge: Edge) -> Edge:
+        """Hang an edge of the oldest keyframe on the one after it; an edge has its source's unit."""
+        oldest, heir = self.keyframes[0], self.keyframes[1]
+        change = heir.factor / oldest.factor
+        if edge.source == self.first:
+            edge = scaled(edge, 1 / change)
+        source = self.keyframes[max(edge.source - self.first, 1)]
+        between = np.asarray(np.linalg.inv(oldest.pose) @ heir.pose)
+        return inherited(edge, self.first, in_unit(between, 1 / source.factor), change)
 
 
-def inherited(edge: Edge, oldest: int, between: Array) -> Edge:
+def inherited(edge: Edge, oldest: int, between: Array, change: float = 1.0) -> Edge:
     """
     Hang an edge of a keyframe on the one after it, ``between`` (4, 4) in the former.
 
-    Wherever the edge's other end is, the edge finds it as likely as before.
+    Wherever the edge's other end is, the edge finds it as likely as before. change: the unit of
+    lengths at the one after over that at the keyframe; motions are in that of the edge's source.
     """
+    sign = 1 if edge.target == oldest else -1
+    if edge.stretch is not None:
+        edge = replace(edge, stretch=(edge.stretch[0] + sign * float(np.log(change)),
+                                      edge.stretch[1]))
     if edge.target == oldest:
         return replace(edge, target=oldest + 1, motion=edge.motion @ between,
                        covariance=compose(edge.motion, edge.covariance, between,

@@ -31,13 +31,13 @@ _ROUNDS = 20
 _BEND, _MILD = 3.0, 100.0
 
 
-def with_one_unit(graph: PoseGraph) -> tuple[PoseGraph, Array]:
+def with_one_unit(graph: PoseGraph, first: float = 1.0) -> tuple[PoseGraph, Array]:
     """
-    Bring all edges of a graph to the unit of its first vertex.
+    Bring all edges of a graph to one unit, which is that of its first vertex over ``first``.
 
     Also gives the factors (N,) that make lengths in the unit of a vertex lengths in that one.
     """
-    factors = np.exp(log_units(len(graph.poses), graph.edges))
+    factors = first * np.exp(log_units(len(graph.poses), graph.edges))
     edges = tuple(scaled(edge, float(factors[edge.source])) for edge in graph.edges)
     return replace(graph, edges=edges), factors
 
