@@ -330,6 +330,20 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
         assert np.array_equal(edge.covariance, other.covariance)
 
 
+def test_loops_lead_over_a_step_back_in_time():
+    """A clock that was set back makes none of what was before later than what is now."""
+    cards, finder, found = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
+    poses = [pose(x=0.5 * i) for i in (*range(4), *range(3, -1, -1))]
+    edges = chain(np.array(poses)).edges
+    for i, here in enumerate(poses):
+        stamp = 1000 + 0.1 * i if i < 4 else 5 + 0.1 * i
+        finder.add(cards.frame(stamp, here, noise=i), edges[i - 1] if i else None)
+        found += [(edge.source, edge.target) for edge in finder.loops(i)]
+    assert {(6, 1), (7, 0)} <= set(found)
+    # The step back itself takes no time, and neighbours of it are no loop.
+    assert (4, 3) not in found
+
+
 def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
     """What landmarks have found of it by the end, they did not know at the beginning."""
     cards, k1 = Cards(), 0.06

@@ -52,7 +52,9 @@ class EdgeFinder:
         self._wide = TwoViewEstimator(replace(
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
         self._kept: MutableMapping[int, KeyframeImage] = {} if kept is None else kept
-        self._stamps: list[int] = []
+        # Nanoseconds that have gone by until each keyframe; a step back in time takes none.
+        self._times: list[int] = []
+        self._stamp_ns = self._time = 0
         # The k1 without which each keyframe's features are.
         self._lenses: list[float] = []
         self._places = PlaceIndex()
@@ -64,17 +66,19 @@ class EdgeFinder:
 
     def add(self, frame: Frame, before: Edge | None = None, k1: float = 0.0) -> None:
         """
-        Take the next keyframe, later than all others, and the edge from its neighbour.
+        Take the next keyframe, and the edge from its neighbour.
 
         k1: radial distortion without which the odometry saw it.
         """
-        number = self._first + len(self._stamps)
+        number = self._first + len(self._times)
         gray, left_out = frame.gray, frame.left_out
         if k1:
             gray, left_out = straight_image(gray, frame.K, k1, left_out)
         features = self._near.features(gray, None if left_out is None else blocked(left_out))
         self._kept[number] = KeyframeImage(frame, features)
-        self._stamps.append(frame.stamp_ns)
+        self._time += max(frame.stamp_ns - self._stamp_ns, 0)
+        self._stamp_ns = frame.stamp_ns
+        self._times.append(self._time)
         self._lenses.append(k1)
         self._places.add(features)
         if before is not None and before.kind == 'odometry':
@@ -85,7 +89,7 @@ class EdgeFinder:
         for number in range(self._first, first):
             self._kept.pop(number, None)
             self._before.pop(number, None)
-        del self._stamps[:first - self._first], self._lenses[:first - self._first]
+        del self._times[:first - self._first], self._lenses[:first - self._first]
         self._first = first
         self._places.forget(first)
 
@@ -117,8 +121,8 @@ class EdgeFinder:
         units: whether to compare the units of lengths at both ends, see ``unit_change``.
         """
         config, here = self._config, current - self._first
-        latest = self._stamps[here] - config.loop_gap * 1e9
-        before = self._first + bisect_left(self._stamps, latest, hi=here)
+        latest = self._times[here] - config.loop_gap * 1e9
+        before = self._first + bisect_left(self._times, latest, hi=here)
         votes = self._places.votes(self._kept[current].features, before)
         votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]
@@ -160,7 +164,7 @@ class EdgeFinder:
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
         back = self._near.estimate(self._view(number, k1), self._view(neighbour, k1))
-        if number == self._first + len(self._stamps) - 1:
+        if number == self._first + len(self._times) - 1:
             self._newest = number, back
         return back
 
