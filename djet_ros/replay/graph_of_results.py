@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 import csv
 import io
@@ -26,6 +27,9 @@ import numpy as np
 
 Warn = Callable[[str], None]
 
+# A motion (4, 4) and its covariance (6, 6), along optical axes.
+_Told = tuple[Array, Array]
+
 
 def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
     """
@@ -43,17 +47,23 @@ def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
     rows = rows[:len(stamps)]
     if [row.stamp_ns for row in rows] != stamps[:len(rows)].tolist():
         raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run')
-    motions: dict[int, tuple[Array, Array]] = {}
+    # After a step back in time stamps may come again, and in this order.
+    motions: defaultdict[int, deque[_Told]] = defaultdict(deque)
+    problem = None
     try:
         for stamp, motion in _motions(folder / BAG, load_yaml(folder / 'config.yaml')):
-            motions[stamp] = motion
+            motions[stamp].append(motion)
     except DjetError as error:
         if warn is None or not motions:
             raise
-        whole = _whole(rows, motions)
-        warn(f'{error}; of {len(rows)} frames the first {len(whole)} are taken')
+        problem = error
+    told = [motions[row.stamp_ns].popleft()
+            if row.status in TRACKED and motions[row.stamp_ns] else None for row in rows]
+    if problem is not None and warn is not None:
+        whole = _whole(rows, told)
+        warn(f'{problem}; of {len(rows)} frames the first {len(whole)} are taken')
         rows = whole
-    steps = list(_steps(rows, poses, motions, folder))
+    steps = list(_steps(rows, poses, told, folder))
     if len(steps) < 2:
         raise DjetError(f'{folder}: no motion was estimated between any two frames; there is no '
                         'graph')
@@ -93,8 +103,8 @@ def _rows(path: Path) -> list[_Row]:
     return rows
 
 
-def _motions(bag: Path, config: Config) -> Iterator[tuple[int, tuple[Array, Array]]]:
-    """Stamp of each frame, with motion (4, 4) and covariance (6, 6) along optical axes."""
+def _motions(bag: Path, config: Config) -> Iterator[tuple[int, _Told]]:
+    """Stamp of each frame with a motion, and that."""
     topic = f'/{NODE_NAME}/relative_pose_cov'
     turn = np.eye(4)
     if config.odometry.frame_convention == 'body':
@@ -106,26 +116,35 @@ def _motions(bag: Path, config: Config) -> Iterator[tuple[int, tuple[Array, Arra
             yield stamp, (turn @ motion @ turn.T, rotated(turn[:3, :3], covariance))
 
 
-def _whole(rows: list[_Row], motions: dict[int, tuple[Array, Array]]) -> list[_Row]:
+def _whole(rows: list[_Row], told: list[_Told | None]) -> list[_Row]:
     """Rows up to the first whose motion the bag has lost."""
-    lost = (i for i, row in enumerate(rows)
-            if row.status in TRACKED and row.stamp_ns not in motions)
+    lost = (i for i, (row, motion) in enumerate(zip(rows, told))
+            if row.status in TRACKED and motion is None)
     return rows[:next(lost, len(rows))]
 
 
-def _steps(rows: list[_Row], poses: Array, motions: dict[int, tuple[Array, Array]],
+def _steps(rows: list[_Row], poses: Array, told: list[_Told | None],
            folder: Path) -> Iterator[Step]:
-    references = {row.previous_stamp_ns for row in rows if row.status in TRACKED}
-    come: set[int | None] = set()
-    for row, pose in zip(rows, poses):
-        come.add(row.stamp_ns)
+    references = _references(rows)
+    used = {*references}
+    for i, (row, pose, motion) in enumerate(zip(rows, poses, told)):
         if row.status in TRACKED:
-            if row.stamp_ns not in motions or row.previous_stamp_ns not in come:
+            if motion is None or references[i] is None:
                 raise DjetError(f'{folder}: the motion to the frame of {row.stamp_ns} ns is '
                                 'missing from the bag; replay the recording once more')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       *motions[row.stamp_ns], row.scale is not Scale.UNKNOWN,
+                       *motion, row.scale is not Scale.UNKNOWN,
                        metric=row.scale is Scale.METRIC, keyframe=row.keyframe, k1=row.k1)
-        elif row.status in STARTED or row.stamp_ns in references:
+        elif row.status in STARTED or i in used:
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
                        keyframe=row.keyframe, k1=row.k1)
+
+
+def _references(rows: list[_Row]) -> list[int | None]:
+    """Give for each row the one, up to itself, from which its motion is told, or None."""
+    newest: dict[int | None, int] = {}
+    references = []
+    for i, row in enumerate(rows):
+        newest[row.stamp_ns] = i
+        references.append(newest.get(row.previous_stamp_ns) if row.status in TRACKED else None)
+    return references
