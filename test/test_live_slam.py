@@ -185,6 +185,14 @@ def test_after_the_odometry_had_lost_track_the_next_motion_is_from_a_frame_witho
     assert steps.missing == 0
 
 
+@pytest.mark.parametrize('convention', ['optical', 'body'])
+def test_a_step_says_how_sure_the_rotation_of_its_pose_is(convention):
+    odometry, steps = Odometry(convention), StepMessages(convention)
+    told(steps, *odometry.start())
+    step, = told(steps, *odometry.move(pose(z=1.0), np.diag(np.arange(1.0, 7)**2) * 1e-6))
+    assert np.allclose(step.turn, odometry.covariance[3:, 3:], atol=2e-9)
+
+
 def test_a_bad_frame_that_is_bridged_is_no_step():
     odometry, steps = Odometry(), StepMessages('optical')
     *_, before = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))

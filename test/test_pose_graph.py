@@ -162,6 +162,7 @@ def test_stamps_that_come_again_after_a_reset_are_of_the_motions_of_their_time(t
     runs = Drive(gaps=[4]), Drive(black=[2], gaps=[4], step=np.linalg.inv(STEP))
 
     class Both(Drive):
+
         def messages(self, topics=None):
             for run in runs:
                 yield from run.messages(topics)

@@ -20,12 +20,12 @@ from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
-from djet_ros.odometry.uncertainty import compose
+from djet_ros.odometry.uncertainty import compose, in_a_chain, UNKNOWN_MOTION
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder, transferred_length
 from djet_ros.posegraph.places import PlaceIndex
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
-from djet_ros.posegraph.steps import Step
+from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
@@ -193,6 +193,28 @@ def test_over_a_gap_the_map_turns_as_far_as_the_odometry_does(keyframes):
         assert np.allclose([one.pose for one in kept.keyframes], [one.pose for one in told])
         assert np.allclose(kept.correction, np.eye(4))
         kept.optimise()
+
+
+def test_where_no_way_is_known_a_turn_is_known_as_well_as_the_odometry_knows_it(keyframes):
+    before, turned = pose(z=9.0, yaw=0.4), pose(z=9.0, yaw=1.4)
+    told, known, own = steps(np.array([pose(), before, turned])), np.eye(3) * 0.5, np.diag(
+        [1e-8, 4e-8, 9e-8])
+    told[1] = replace(told[1], turn=known)
+
+    def covariance(turn, status=Status.AMBIGUOUS):
+        edges = [edges[1].covariance for edges in (
+            keyframes([*told[:2], Step(told[2].stamp_ns, status, turned, turn=turn)])[0].edges,
+            graph_of([*told[:2], Step(told[2].stamp_ns, status, turned, turn=turn)]).edges)]
+        assert np.allclose(*edges)
+        return edges[1]
+
+    # Along the axes of the camera before, and as unsure as independent edges are.
+    grown = covariance(known + before[:3, :3] @ own @ before[:3, :3].T)
+    assert np.allclose(grown[3:, 3:], in_a_chain(own), rtol=1e-6)
+    assert np.array_equal(grown[:3], UNKNOWN_MOTION[:3])
+    for turn, *status in ((None,), (known,), (known - own,), (known + 4 * np.eye(3),),
+                          (known + own, Status.FIRST_FRAME)):
+        assert np.array_equal(covariance(turn, *status), UNKNOWN_MOTION)
 
 
 def test_bad_frames_and_stationary_ones_are_passed_by(keyframes):

@@ -210,7 +210,7 @@ def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypa
 
 
 def test_the_first_keyframe_that_is_left_keeps_its_unit():
-    edges, units = drifting(circles())
+    edges, _ = drifting(circles())
     graph = PoseGraph(np.arange(N), circles(), tuple(edges))
     one, ours = with_one_unit(graph), with_one_unit(graph, 1.5)
     assert ours[1] == pytest.approx(1.5 * one[1])

@@ -10,12 +10,12 @@ from typing import NamedTuple
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.uncertainty import compose, rotated, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import compose, rotated
 from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
-from djet_ros.posegraph.steps import Step
+from djet_ros.posegraph.steps import between, Step
 from djet_ros.posegraph.units import in_unit, scaled
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -178,15 +178,13 @@ class KeyframeMap:
         if step.tracked and reference is not None:
             covariance = step.own_covariance(self._uncertainty, self._slam.length_noise)
             return reference.then(step.motion, covariance, step.scale_known)
-        before = self._newest_step.pose
-        if step.in_frame_of(self._newest_step):
-            # Where the odometry goes on: at its last pose, turned as far as something tells.
-            guess = np.linalg.inv(before) @ step.pose
-        else:
+        guess, covariance = between(self._newest_step, step)
+        if not step.in_frame_of(self._newest_step):
             # Where the camera was last is as good a guess as any.
+            self.correction = (self.correction @ self._newest_step.pose
+                               @ np.linalg.inv(step.pose))
             guess = np.eye(4)
-            self.correction = self.correction @ before @ np.linalg.inv(step.pose)
-        return self.newest.then(guess, UNKNOWN_MOTION, known=False)
+        return self.newest.then(guess, covariance, known=False)
 
     def _add(self, step: Step, frame: Frame, offset: KeyframeOffset | None) -> KeyframeOffset:
         number = self.first + len(self.keyframes)
@@ -254,7 +252,7 @@ class KeyframeMap:
         self.first = heir
 
     def _left_to_heir(self, edge: Edge) -> Edge:
-        """Hang an edge of the oldest keyframe on the one after it; an edge has its source's unit."""
+        """Hang an edge, which has the unit of its source, on the keyframe after the oldest."""
         oldest, heir = self.keyframes[0], self.keyframes[1]
         change = heir.factor / oldest.factor
         if edge.source == self.first:

@@ -114,10 +114,12 @@ class StepMessages:
         """
         _, pose = pose_of(parts.odometry)
         frame = parts.odometry.header.frame_id
-        here = _of_camera(pose, self._mounting)
+        here, turn = _of_camera(pose, self._mounting), None
+        if not self._base_frame:
+            turn = turn_of(parts.odometry, self._axes[:3, :3])
         if said.status not in TRACKED:
             alone = Step(said.stamp_ns, said.status, here, odom_frame=frame,
-                         keyframe=said.keyframe, k1=said.k1)
+                         keyframe=said.keyframe, k1=said.k1, turn=turn)
             if said.status in STARTED:
                 self._bad.clear()
                 return [alone]
@@ -135,12 +137,22 @@ class StepMessages:
         step = Step(said.stamp_ns, said.status, here, said.reference_ns,
                     _of_camera(motion, self._axes), rotated(self._axes[:3, :3].T, covariance),
                     said.scale is not Scale.UNKNOWN, frame, said.scale is Scale.METRIC,
-                    said.keyframe, said.k1)
+                    said.keyframe, said.k1, turn)
         if step.tracked:
             step.check(f'odometry edge to {said.stamp_ns} ns')
         reference = [bad for bad in self._bad if bad.stamp_ns == step.previous_stamp_ns]
         self._bad.clear()
         return [*reference, step]
+
+
+def turn_of(odometry: Any, axes: Array) -> Array | None:
+    """
+    Covariance (3, 3) of the rotation of an Odometry's pose, along the axes of the optical frame.
+
+    axes: (3, 3) the optical frame in that of the messages; None where the message has none.
+    """
+    covariance = np.asarray(odometry.pose.covariance, np.float64).reshape(6, 6)[3:, 3:]
+    return axes.T @ covariance @ axes if np.isfinite(covariance).all() else None
 
 
 def _of_camera(pose: Array, mounting: Array) -> Array:

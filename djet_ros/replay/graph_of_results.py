@@ -18,6 +18,7 @@ from djet_ros.odometry.messages import IS_KEYFRAME, k1_of, OPTICAL_TO_BODY, pose
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.posegraph.pose_graph import PoseGraph
+from djet_ros.posegraph.step_messages import turn_of
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.trajectories import read_tum
@@ -49,10 +50,14 @@ def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
         raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run')
     # After a step back in time stamps may come again, and in this order.
     motions: defaultdict[int, deque[_Told]] = defaultdict(deque)
+    turns: defaultdict[int, deque[Array | None]] = defaultdict(deque)
     problem = None
     try:
-        for stamp, motion in _motions(folder / BAG, load_yaml(folder / 'config.yaml')):
-            motions[stamp].append(motion)
+        for stamp, motion, turn in _motions(folder / BAG, load_yaml(folder / 'config.yaml')):
+            if motion is None:
+                turns[stamp].append(turn)
+            else:
+                motions[stamp].append(motion)
     except DjetError as error:
         if warn is None or not motions:
             raise
@@ -63,7 +68,8 @@ def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
         whole = _whole(rows, told)
         warn(f'{problem}; of {len(rows)} frames the first {len(whole)} are taken')
         rows = whole
-    steps = list(_steps(rows, poses, told, folder))
+    unsure = [turns[row.stamp_ns].popleft() if turns[row.stamp_ns] else None for row in rows]
+    steps = list(_steps(rows, poses, told, unsure, folder))
     if len(steps) < 2:
         raise DjetError(f'{folder}: no motion was estimated between any two frames; there is no '
                         'graph')
@@ -103,17 +109,26 @@ def _rows(path: Path) -> list[_Row]:
     return rows
 
 
-def _motions(bag: Path, config: Config) -> Iterator[tuple[int, _Told]]:
-    """Stamp of each frame with a motion, and that."""
-    topic = f'/{NODE_NAME}/relative_pose_cov'
+def _motions(bag: Path, config: Config
+             ) -> Iterator[tuple[int, _Told | None, Array | None]]:
+    """
+    Stamps of frames, each with its motion or how sure the rotation of its pose is.
+
+    The latter of the camera alone: where a base frame is on it the bag does not tell.
+    """
+    relative, integrated = (f'/{NODE_NAME}/{name}' for name in ('relative_pose_cov', 'odometry'))
+    topics = {relative} if config.odometry.base_frame else {relative, integrated}
     turn = np.eye(4)
     if config.odometry.frame_convention == 'body':
         turn[:3, :3] = OPTICAL_TO_BODY.T
     with Bag(bag) as opened:
-        for _, _, message in opened.messages({topic}):
+        for topic, _, message in opened.messages(topics):
             stamp, motion = pose_of(message)
+            if topic == integrated:
+                yield stamp, None, turn_of(message, turn[:3, :3].T)
+                continue
             covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
-            yield stamp, (turn @ motion @ turn.T, rotated(turn[:3, :3], covariance))
+            yield stamp, (turn @ motion @ turn.T, rotated(turn[:3, :3], covariance)), None
 
 
 def _whole(rows: list[_Row], told: list[_Told | None]) -> list[_Row]:
@@ -124,20 +139,21 @@ def _whole(rows: list[_Row], told: list[_Told | None]) -> list[_Row]:
 
 
 def _steps(rows: list[_Row], poses: Array, told: list[_Told | None],
-           folder: Path) -> Iterator[Step]:
+           turns: list[Array | None], folder: Path) -> Iterator[Step]:
     references = _references(rows)
     used = {*references}
-    for i, (row, pose, motion) in enumerate(zip(rows, poses, told)):
+    for i, (row, pose, motion, turn) in enumerate(zip(rows, poses, told, turns)):
         if row.status in TRACKED:
             if motion is None or references[i] is None:
                 raise DjetError(f'{folder}: the motion to the frame of {row.stamp_ns} ns is '
                                 'missing from the bag; replay the recording once more')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
                        *motion, row.scale is not Scale.UNKNOWN,
-                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe, k1=row.k1)
+                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe, k1=row.k1,
+                       turn=turn)
         elif row.status in STARTED or i in used:
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       keyframe=row.keyframe, k1=row.k1)
+                       keyframe=row.keyframe, k1=row.k1, turn=turn)
 
 
 def _references(rows: list[_Row]) -> list[int | None]:
