@@ -266,6 +266,22 @@ def test_a_slow_pan_is_not_taken_for_the_bias_of_a_gyro(cards):
     assert abs(gyro.bias[1]) < 0.1 * rate
 
 
+def gyro_of(rate):
+    """Give a gyro that feels nearly the same rate (3,) all along, within its range."""
+    gyro = Gyro(GyroNoise(2e-4, 2e-5))
+    gyro.mount(np.eye(3))
+    for i in range(-5, 50 * 20):
+        gyro.add(i * 5_000_000, np.asarray(rate) * (1 + 1e-3 * (-1) ** i))
+    return gyro
+
+
+def test_what_a_gyro_tells_against_all_images_is_not_said_to_be_known(cards):
+    results = drive(VisualOdometry(ESTIMATOR, gyro=gyro_of([0, 1.0, 0])), cards, [STEP] * 3)
+    for result in results[1:]:
+        assert result.status is Status.DEGENERATE
+        assert np.trace(result.motion_covariance[3:, 3:]) > 1
+
+
 def test_a_step_back_in_time_begins_everything_anew(cards):
     vo = odometry()
     drive(vo, cards, [np.eye(4), STEP], start=100.0)

@@ -187,6 +187,11 @@ class Gyro:
         """Whether most of the newest turns were those that the images told."""
         return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
 
+    @property
+    def bears_alone(self) -> bool:
+        """Whether a turn may be told by it alone: the images were not mostly against it so far."""
+        return self.fits and 2 * sum(self._verdicts) >= len(self._verdicts)
+
     def _unlearn(self) -> None:
         """Know no more of the bias than of any gyro's."""
         self.bias, self.bias_covariance = np.zeros(3), np.eye(3) * _BIAS_AT_FIRST**2

@@ -396,7 +396,8 @@ class VisualOdometry:
         its covariance spans the turns of all motions that it may be.
         """
         motion, covariance = np.eye(4), UNKNOWN_MOTION.copy()
-        if self._gyro is not None and self._gyro.fits and (turn := self._turn(frame)) is not None:
+        if (self._gyro is not None and self._gyro.bears_alone
+                and (turn := self._turn(frame)) is not None):
             motion[:3, :3] = turn.R.T
             # An error of the bias is the same all along: n steps err n times as much as one.
             before = max(self._since_ns - self._known_ns, 0) / (frame.stamp_ns - self._since_ns)
