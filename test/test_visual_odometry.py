@@ -275,6 +275,14 @@ def gyro_of(rate):
     return gyro
 
 
+def test_a_gyro_in_degrees_is_found_out_though_no_match_is_found_by_it(cards):
+    gyro = gyro_of(np.degrees([0, 0.1, 0]))
+    results = drive(VisualOdometry(ESTIMATOR, gyro=gyro), cards, [STEP] * 36)
+    assert not gyro.fits
+    assert results[1].status is not Status.OK
+    assert results[-1].status is Status.OK
+
+
 def test_what_a_gyro_tells_against_all_images_is_not_said_to_be_known(cards):
     results = drive(VisualOdometry(ESTIMATOR, gyro=gyro_of([0, 1.0, 0])), cards, [STEP] * 3)
     for result in results[1:]:

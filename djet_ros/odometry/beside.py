@@ -208,5 +208,6 @@ class Beside:
             return None
         return Complaint('gyro does not fit', 'WARN', (
             'most of the newest turns are others than the images tell, and the gyro is not gone '
-            'by; check how the IMU is mounted (odometry.imu_rotation or tf) and odometry.'
-            'imu_offset, both of which djet lab imu-offset finds from a recording'))
+            'by; check whether its rates are in rad/s, how the IMU is mounted (odometry.'
+            'imu_rotation or tf) and odometry.imu_offset; the latter two djet lab imu-offset '
+            'finds from a recording'))

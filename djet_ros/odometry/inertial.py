@@ -188,6 +188,11 @@ class Gyro:
         return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
 
     @property
+    def ever_fitted(self) -> bool:
+        """Whether any of the newest turns was the one that the images told."""
+        return any(self._verdicts)
+
+    @property
     def bears_alone(self) -> bool:
         """Whether a turn may be told by it alone: the images were not mostly against it so far."""
         return self.fits and 2 * sum(self._verdicts) >= len(self._verdicts)

@@ -228,6 +228,7 @@ class VisualOdometry:
         self._scale.observe(*span, self._view, view, relative)
         if self._stands_still(frame, relative):
             return self._stay(frame, relative, self._one_scale.of_rest(span))
+        self._try_gyro(view, relative, known)
         relative = self._weighed(frame, self._by_depths(relative), known.turn)
         relative = self._doubted_at_rest(frame, relative)
         if relative.status not in TRACKED:
@@ -336,6 +337,19 @@ class VisualOdometry:
         # What turned otherwise was not the camera, but something that fills the image.
         return fused(relative, turn) if agreed else replace(
             relative, status=Status.DEGENERATE, t=np.zeros(3))
+
+    def _try_gyro(self, view: View, relative: RelativePose, known: Known) -> None:
+        """
+        Judge a gyro that has never fitted by the images alone, where none were matched by it.
+
+        Rates in degrees, or those of another robot, lead all matches astray.
+        """
+        if (self._gyro is None or known.turn is None or self._gyro.ever_fitted
+                or relative.status in TRACKED):
+            return
+        alone = self._estimator.estimate(self._view, view, self._prior, replace(known, turn=None))
+        if alone.status in TRACKED:
+            self._gyro.judge(agrees(known.turn, alone))
 
     def _learn(self, gyro: Gyro, frame: Frame, R: Array, covariance: Array) -> None:
         """Learn the bias from how a frame has turned, since another of the same reference."""
