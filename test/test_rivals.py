@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 from djet_ros.core.basins import lowest_around
@@ -18,6 +19,7 @@ from djet_ros.core.rivals import (
     false_alarms,
     goes_on,
     lie_on_a_plane,
+    other_of_a_plane,
     preferences,
     Rival,
 )
@@ -36,6 +38,7 @@ from two_view import (
     K,
     moved_pose,
     pictures_of_a_plane,
+    pictures_towards_a_wall,
     project,
     SIDEWAYS,
     SIZE,
@@ -229,6 +232,32 @@ def test_no_picture_of_a_plane_alone_is_sure_of_the_wrong_one_of_its_motions(see
         sure += result.status is Status.OK and np.linalg.norm(off) < 0.02
     # The other motion has some of what is seen behind it, often.
     assert sure >= 2
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_who_drives_towards_a_wall_is_not_sure_of_the_wrong_one_of_its_motions(seed: int) -> None:
+    """Both are in one basin, and what goes on before may lead all starts to the same."""
+    t = -0.06 * Rotation.from_euler('y', 10, degrees=True).as_matrix()[:, 2]
+    estimator, before = TwoViewEstimator(), None
+    views = [estimator.view(gray, CLOSE_UP)
+             for gray in pictures_towards_a_wall(np.random.default_rng([seed, 11]), t, 14)]
+    for pair in pairwise(views):
+        before = estimator.estimate(*pair, before)
+        off = difference(before.R, before.t, Pose(np.eye(3), unit(t)))
+        assert squared_distance(before.covariance_5, off) < chi2.ppf(1 - 1e-5, 5)
+
+
+def test_each_motion_of_a_plane_is_the_other_one_of_the_other() -> None:
+    x, y = plane_of_two_motions()
+    one = Pose(Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix(), unit([0.2, 0.1, -0.3]))
+    other = other_of_a_plane(one, K, x, y, NOISE)
+    assert other is not None
+    assert apart(one, other.pose) > 0.1
+    back = other_of_a_plane(other.pose, K, x, y, NOISE)
+    assert back is not None
+    assert apart(one, back.pose) < 0.01
+    y[:30] += 2.0
+    assert other_of_a_plane(one, K, x, y, NOISE) is None
 
 
 def test_what_stands_out_of_a_plane_tells_its_motions_apart() -> None:

@@ -97,15 +97,26 @@ CLOSE_UP, SMALL = np.array([[268.0, 0, 319.5], [0, 268.0, 170], [0, 0, 1]]), (64
 def pictures_of_a_plane(rng: np.random.Generator
                         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Give R (3, 3), t (3,) and both pictures (H, W) of one textured plane, on some motion."""
-    texture = 128 + 28 * sum(cv2.resize(rng.normal(size=(2048 // side, 2048 // side)),
-                                        (2048, 2048), interpolation=cv2.INTER_CUBIC)
-                             for side in (8, 16, 64))
+    texture = _texture(rng)
     turned = Rotation.from_euler('xy', rng.uniform(-40, 40, 2), degrees=True).as_matrix()
     R = Rotation.from_euler('xyz', rng.normal(0, 2, 3), degrees=True).as_matrix()
     t = rng.choice([0.1, 0.4]) * unit(rng.normal(size=3))
     one, other = (_view_of_a_plane(rng, texture, turned, *motion)
                   for motion in ((np.eye(3), np.zeros(3)), (R, t)))
     return R, t, one, other
+
+
+def pictures_towards_a_wall(rng: np.random.Generator, t: np.ndarray, count: int
+                            ) -> list[np.ndarray]:
+    """Give pictures (H, W) of a wall that a camera faces, each a step t (3,) after another."""
+    texture = _texture(rng)
+    return [_view_of_a_plane(rng, texture, np.eye(3), np.eye(3), i * t) for i in range(count)]
+
+
+def _texture(rng: np.random.Generator) -> np.ndarray:
+    return 128 + 28 * sum(cv2.resize(rng.normal(size=(2048 // side, 2048 // side)),
+                                     (2048, 2048), interpolation=cv2.INTER_CUBIC)
+                          for side in (8, 16, 64))
 
 
 def _view_of_a_plane(rng: np.random.Generator, texture: np.ndarray, turned: np.ndarray,

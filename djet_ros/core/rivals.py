@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 from djet_ros.core.cells import summed_by_cell
-from djet_ros.core.geometry import inverse_depths, sides
+from djet_ros.core.geometry import inverse_depths, rays, sides, unit
 from djet_ros.core.jet import core_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import around, thinned
@@ -144,12 +144,48 @@ def lie_on_a_plane(x: Array, y: Array, noise: float) -> bool:
     """
     some = thinned(len(x), _REFINED_ON)
     H, _ = cv2.findHomography(x[some], y[some], cv2.USAC_MAGSAC, _MEMBER * noise)
-    if H is None or not np.isfinite(H).all():
+    return H is not None and _as_of_a_plane(np.asarray(H, np.float64), x, y, noise)
+
+
+def _as_of_a_plane(H: Array, x: Array, y: Array, noise: float) -> bool:
+    """Tell whether a plane's homography (3, 3) brings x to y, both (N, 2), as noise lets it."""
+    if not np.isfinite(H).all():
         return False
     off = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
     # Of normal errors in both directions the median is 1.18 standard deviations.
     return bool(np.median(off) < _ON_PLANE * 1.18 * noise
                 and (off > _STRAY * noise).mean() < _OFF_PLANE)
+
+
+def other_of_a_plane(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival | None:
+    """
+    Give the other motion by which matches x, y (N, 2) are seen as those of one plane are.
+
+    With n the plane's normal over its distance, H = R + t n' is also that of a second motion,
+    whose t is about along n (Longuet-Higgins, Proc. R. Soc. B 1986). Chirality alone decides
+    between the two. noise: as for ``lie_on_a_plane``; None where all is not one plane, or the
+    other motion is the same.
+    """
+    some = thinned(len(x), _REFINED_ON)
+    x, y = x[some], y[some]
+    rays_x = rays(K, x)
+    inverse, sigma = inverse_depths(pose.R, pose.t, rays_x, rays(K, y))
+    if not (np.isfinite(inverse) & np.isfinite(sigma) & (sigma > 0)).all():
+        return None
+    n = np.linalg.lstsq(rays_x / sigma[:, None], inverse / sigma, rcond=None)[0]
+    H = pose.R + np.outer(pose.t, n)
+    if not _as_of_a_plane(K @ H @ np.linalg.inv(K), x, y, noise):
+        return None
+    _, turns, ways, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    others = [Pose(np.asarray(R, np.float64), unit(np.asarray(t, np.float64).ravel()))
+              for R, t in zip(turns, ways) if t.any()]
+    if len(others) < len(turns):
+        return None
+    farthest = int(np.argmax([apart(pose, other) for other in others]))
+    ahead = rays_x @ normals[farthest].ravel() > 0
+    behind = ahead != (ahead.mean() > 0.5)
+    losses = np.stack([np.zeros(len(x)), behind])
+    return Rival(others[farthest], float(preferences(losses, x, 0)[1]))
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,

@@ -52,6 +52,7 @@ from djet_ros.core.rivals import (
     DEEP,
     goes_on,
     lie_on_a_plane,
+    other_of_a_plane,
     preferences,
     refined_rivals,
     Rival,
@@ -166,6 +167,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     rivals = _of_one_plane(track, first, surface.x)
     if rivals is not track.rivals:
         track = replace(track, rivals=rivals)
+    track = _with_other_of_a_plane(track, pair)
     if turn is not None and not turn.may_be(track.pose.R):
         for rival in first.rivals:
             led = _Algorithm(_untold(pair), surface, config, everything).run([rival])
@@ -248,6 +250,22 @@ def _of_one_plane(track: Track, first: _Optimised, x: Array) -> tuple[Rival, ...
     return tuple(replace(rival, preference=min(
         rival.preference, float(preferred[first.nearest(rival.pose)])))
         for rival in track.rivals)
+
+
+def _with_other_of_a_plane(track: Track, pair: Pair) -> Track:
+    """
+    Hold the other motion of a plane against a pose, where the starts led to none that is near it.
+
+    Where the camera goes nearly towards the plane both are in one basin, and all starts may end at
+    the same one.
+    """
+    agree = track.inliers()
+    other = other_of_a_plane(track.pose, pair.current.K, pair.x[agree],
+                             track.placed.places[agree], track.scale) if agree.any() else None
+    if other is None or any(apart(rival.pose, other.pose) < apart(track.pose, other.pose) / 2
+                            for rival in (*track.rivals, *track.beside)):
+        return track
+    return replace(track, beside=(*track.beside, other))
 
 
 @dataclass(frozen=True)
