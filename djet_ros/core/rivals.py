@@ -28,8 +28,9 @@ DECIDED = 2.33
 # rad; chosen: as much as a camera's motion may change from one pair to the next.
 _LIKE_BEFORE = 0.1
 
-# Matches on which rivals are refined before they are compared on all.
-_REFINED_ON = 400
+# Matches on which rivals are refined before they are compared on all; and so few of a world that
+# is no plane tell that it is none.
+_REFINED_ON, _SCREENED = 400, 60
 _STEPS = 6
 
 # Robust standard deviations: strays disagree with a motion for sure, and members agree with it.
@@ -166,16 +167,15 @@ def other_of_a_plane(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> 
     between the two. noise: as for ``lie_on_a_plane``; None where all is not one plane, or the
     other motion is the same.
     """
-    some = thinned(len(x), _REFINED_ON)
+    few, some = (thinned(len(x), count) for count in (_SCREENED, _REFINED_ON))
+    # Few tell already of most worlds that they are none.
+    if _homography(pose, K, x[few], y[few], noise) is None:
+        return None
     x, y = x[some], y[some]
+    H = _homography(pose, K, x, y, noise)
+    if H is None:
+        return None
     rays_x = rays(K, x)
-    inverse, sigma = inverse_depths(pose.R, pose.t, rays_x, rays(K, y))
-    if not (np.isfinite(inverse) & np.isfinite(sigma) & (sigma > 0)).all():
-        return None
-    n = np.linalg.lstsq(rays_x / sigma[:, None], inverse / sigma, rcond=None)[0]
-    H = pose.R + np.outer(pose.t, n)
-    if not _as_of_a_plane(K @ H @ np.linalg.inv(K), x, y, noise):
-        return None
     _, turns, ways, normals = cv2.decomposeHomographyMat(H, np.eye(3))
     others = [Pose(np.asarray(R, np.float64), unit(np.asarray(t, np.float64).ravel()))
               for R, t in zip(turns, ways) if t.any()]
@@ -186,6 +186,17 @@ def other_of_a_plane(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> 
     behind = ahead != (ahead.mean() > 0.5)
     losses = np.stack([np.zeros(len(x)), behind])
     return Rival(others[farthest], float(preferences(losses, x, 0)[1]))
+
+
+def _homography(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Array | None:
+    """Give H = R + t n' (3, 3) of matches, see above, by the n that fits their inverse depths."""
+    rays_x = rays(K, x)
+    inverse, sigma = inverse_depths(pose.R, pose.t, rays_x, rays(K, y))
+    if not (np.isfinite(inverse) & np.isfinite(sigma) & (sigma > 0)).all():
+        return None
+    n = np.linalg.lstsq(rays_x / sigma[:, None], inverse / sigma, rcond=None)[0]
+    H = np.asarray(pose.R + np.outer(pose.t, n))
+    return H if _as_of_a_plane(K @ H @ np.linalg.inv(K), x, y, noise) else None
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
