@@ -28,8 +28,10 @@ def stop_by_signal() -> Event:
     does at each look, and a handler that waits for that would wait for itself.
     """
     stop = Event()
+    numbers = [signal.SIGINT, signal.SIGTERM]
     # With nohup a terminal may close.
-    hangup = [signal.SIGHUP] * (signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN)
-    for number in (signal.SIGINT, signal.SIGTERM, *hangup):
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
         signal.signal(number, lambda *_: stop.is_set() or start_new_thread(stop.set, ()))
     return stop

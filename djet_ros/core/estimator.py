@@ -164,7 +164,7 @@ class TwoViewEstimator:
         if track is None:
             return _failed(Status.TOO_FEW_MATCHES, pair)
         if track.carried is not None:
-            return self.estimate_pair(pair.without(track.carried))
+            return self.estimate_pair(replace(pair.without(track.carried), limits=Limits()))
 
         # What is to be believed of it.
         result = self._verdict(pair, track)
@@ -191,8 +191,7 @@ class TwoViewEstimator:
             if found is None:
                 return None
             start, agree = found
-            pair = replace(pair, x=pair.x[agree], y=pair.y[agree], ahead=None, bits=None,
-                           covariances=_of(pair.covariances, agree), outliers=int((~agree).sum()))
+            pair = pair.without(~agree)
             return pair, [start], self._sampled(pair)
         if pair.ahead is not None:
             with _timed(pair.timings, 'jet'):
@@ -248,10 +247,6 @@ def _require_one_camera(previous: View, current: View) -> None:
     if not of_one_camera(previous, current):
         raise ValueError(f'views of {previous.gray.shape} and {current.gray.shape} pixels, or '
                          'their camera matrices, differ; a pair is of one camera')
-
-
-def _of(values: Array | None, chosen: NDArray[np.bool_]) -> Array | None:
-    return None if values is None else values[chosen]
 
 
 def _failed(status: Status, pair: Pair) -> RelativePose:

@@ -77,9 +77,10 @@ class Pair:
     timings: dict[str, float] = field(default_factory=dict)
 
     def without(self, some: NDArray[np.bool_]) -> Pair:
-        """Give the pair without some (N,) of its matches, to be begun with anew."""
-        x, y, bits, covariances = (None if values is None else values[~some] for values in (
-            self.x, self.y, self.bits, self.covariances))
-        assert x is not None and y is not None
-        return replace(self, x=x, y=y, bits=bits, covariances=covariances, ahead=None,
-                       limits=Limits(), outliers=self.outliers + int(some.sum()))
+        """Give the pair without some (N,) of its matches, as outliers; its start is open."""
+        def left(values: Array | None) -> Array | None:
+            return None if values is None else values[~some]
+
+        return replace(self, x=self.x[~some], y=self.y[~some], bits=left(self.bits),
+                       covariances=left(self.covariances), ahead=None,
+                       outliers=self.outliers + int(some.sum()))

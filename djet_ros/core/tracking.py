@@ -167,7 +167,6 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     rivals = _of_one_plane(track, first, surface.x)
     if rivals is not track.rivals:
         track = replace(track, rivals=rivals)
-    track = _with_other_of_a_plane(track, pair)
     if turn is not None and not turn.may_be(track.pose.R):
         for rival in first.rivals:
             led = _Algorithm(_untold(pair), surface, config, everything).run([rival])
@@ -178,6 +177,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
                           config.min_matches, pair.before)
     if world is not None and (turn is None or not turn.prefers(track.pose.R, world.R)):
         return replace(track, carried=kept)
+    track = _with_other_of_a_plane(track, pair)
     second = second_motion(first.problem, first.places, track.pose, algorithm.noise,
                            config.min_matches)
     if second is None:

@@ -83,8 +83,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         if parallax < max(config.min_parallax, noise):
             if parallax >= noise:
                 # What is out of noise is a way, which the turn by itself makes up for.
-                bent = np.append(rotation_log(R_alone @ R.T), [0.0, 0.0])
-                covariances = spanning(covariances[0], t, bent, 1.0)
+                covariances = _bent(covariances[0], Pose(R, t), R_alone)
             status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
             status, covariances = _judged(Pose(R, t), covariances, track, voting, pair.before,
@@ -109,10 +108,14 @@ def as_turn(relative: RelativePose, K: Array) -> RelativePose:
     """Give a pair whose parallax is none: a rotation alone, and how far its way had bent that."""
     agree = relative.inliers
     R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
-    bent = np.append(rotation_log(R @ relative.R.T), [0.0, 0.0])
-    covariances = spanning(relative.covariance_5, relative.t, bent, 1.0)
+    covariances = _bent(relative.covariance_5, Pose(relative.R, relative.t), R)
     return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
                    covariance_5=covariances[0], covariance_6=covariances[1])
+
+
+def _bent(covariance: Array, pose: Pose, R: Array) -> tuple[Array, Array]:
+    """Widen a pose's covariance (5, 5) by how far it is turned from a rotation alone (3, 3)."""
+    return spanning(covariance, pose.t, np.append(rotation_log(R @ pose.R.T), [0.0, 0.0]), 1.0)
 
 
 def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,

@@ -139,7 +139,7 @@ class Face:
     def _loss_remedy(self, topic: str, offers: Sequence[Offer]) -> str:
         """Say what helps images that do not come whole, of which middlewares tell nothing."""
         images = self._images
-        if images is None or topic != images.topic or images.profile.reliable:
+        if topic != images.topic or images.profile.reliable:
             return ''
         reliable = all(offer.profile.reliable for offer in offers)
         return (', or its images are too large to come whole by best effort: '

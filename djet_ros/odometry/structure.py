@@ -254,7 +254,7 @@ class OneScale:
 
     def sees_no_way(self, relative: RelativePose) -> bool:
         """Tell of a pair from the newest frame whether its parallax is noise, by all depths."""
-        if not self._carried or self._window.is_new or not relative.t.any():
+        if not self._carried or self._window.is_new:
             return False
         told = self._window.told_length(relative)
         return told is not None and told[0] < _OUT_OF_NOISE * told[1]

@@ -299,11 +299,12 @@ class VisualOdometry:
         if relative.status not in (Status.OK, Status.AMBIGUOUS):
             return relative
         agrees = self._one_scale.agrees(Pose(relative.R, relative.t), relative.x, relative.y_opt)
-        if relative.status is Status.OK and agrees is False:
-            return _refuted(relative)
-        if relative.status is Status.OK and self._one_scale.sees_no_way(relative):
-            return as_turn(relative, self._view.K)
-        if relative.status is Status.AMBIGUOUS and agrees and all(
+        if relative.status is Status.OK:
+            if agrees is False:
+                return _refuted(relative)
+            no_way = self._one_scale.sees_no_way(relative)
+            return as_turn(relative, self._view.K) if no_way else relative
+        if agrees and all(
                 self._one_scale.agrees(rival, relative.x, relative.y) is False
                 for rival in relative.rivals):
             return replace(relative, status=Status.OK)
@@ -388,7 +389,7 @@ class VisualOdometry:
             self._begin()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
-            motion, covariance = self._carried(frame)
+            motion, covariance = self._carried(frame, (np.eye(4), UNKNOWN_MOTION))
             self._path = self._path.moved(self._pose, motion, covariance)
             self._pose = self._pose @ motion
         if backwards or status is Status.FIRST_FRAME:
@@ -401,25 +402,16 @@ class VisualOdometry:
             UNKNOWN_MOTION, self._path.pose, 0.0, False, keyframe=self._one_scale.keyframe,
             k1=self._estimator.k1)
 
-    def _carried(self, frame: Frame, relative: RelativePose | None = None,
-                 length: Length | None = None) -> tuple[Array, Array]:
-        """
-        Motion (4, 4) and covariance (6, 6) where the images tell none: a turn at most.
-
-        That is the gyro's, or else the one of a pair whose direction of translation is in doubt:
-        its covariance spans the turns of all motions that it may be.
-        """
+    def _carried(self, frame: Frame, guess: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Motion (4, 4) and covariance (6, 6) by the gyro's turn, or else a guess of both."""
+        turn = self._turn(frame)
+        if self._gyro is None or turn is None or not self._gyro.bears_alone:
+            return guess
         motion, covariance = np.eye(4), UNKNOWN_MOTION.copy()
-        if (self._gyro is not None and self._gyro.bears_alone
-                and (turn := self._turn(frame)) is not None):
-            motion[:3, :3] = turn.R.T
-            # An error of the bias is the same all along: n steps err n times as much as one.
-            before = max(self._since_ns - self._known_ns, 0) / (frame.stamp_ns - self._since_ns)
-            covariance[3:, 3:] = (1 + 2 * before) * turn.R.T @ turn.covariance @ turn.R
-        elif relative is not None and length is not None \
-                and relative.status is Status.AMBIGUOUS:
-            turned = replace(relative, t=np.zeros(3))
-            return camera_motion(turned), motion_covariance(turned, length)
+        motion[:3, :3] = turn.R.T
+        # An error of the bias is the same all along: n steps err n times as much as one.
+        before = max(self._since_ns - self._known_ns, 0) / (frame.stamp_ns - self._since_ns)
+        covariance[3:, 3:] = (1 + 2 * before) * turn.R.T @ turn.covariance @ turn.R
         return motion, covariance
 
     def _stay(self, frame: Frame, relative: RelativePose, length: Length) -> OdometryResult:
@@ -448,7 +440,7 @@ class VisualOdometry:
         """Take a bad pair: hold the pose, and give up the reference after too many of them."""
         self._bad_pairs += 1
         given_up = self._bad_pairs >= self._config.max_lost
-        motion, covariance = self._carried(frame, relative, length)
+        motion, covariance = self._carried(frame, _turn_at_most(relative, length))
         path = self._path.moved(self._pose, motion, covariance)
         result = self._result(frame, relative.status, relative, length, motion, covariance,
                               self._pose @ motion, path)
@@ -489,8 +481,21 @@ class VisualOdometry:
             keyframe, self._estimator.k1)
 
 
+def _turn_at_most(relative: RelativePose, length: Length) -> tuple[Array, Array]:
+    """
+    Motion (4, 4) and covariance (6, 6) of a bad pair.
+
+    One whose direction is in doubt tells a turn: its covariance spans those of all motions that it
+    may be.
+    """
+    if relative.status is not Status.AMBIGUOUS:
+        return np.eye(4), UNKNOWN_MOTION
+    turned = replace(relative, t=np.zeros(3))
+    return camera_motion(turned), motion_covariance(turned, length)
+
+
 def _refuted(relative: RelativePose) -> RelativePose:
-    """Give a pair that something else than its images speaks against: nothing of it is told."""
+    """Give a pair that something else than its images speaks against: nobody knows how sure."""
     return replace(relative, status=Status.AMBIGUOUS, covariance_5=UNKNOWN[0],
                    covariance_6=UNKNOWN[1])
 

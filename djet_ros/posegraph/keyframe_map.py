@@ -15,7 +15,7 @@ from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
-from djet_ros.posegraph.steps import between, Step
+from djet_ros.posegraph.steps import Step, untold_motion
 from djet_ros.posegraph.units import in_unit, scaled
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -178,7 +178,7 @@ class KeyframeMap:
         if step.tracked and reference is not None:
             covariance = step.own_covariance(self._uncertainty, self._slam.length_noise)
             return reference.then(step.motion, covariance, step.scale_known)
-        guess, covariance = between(self._newest_step, step)
+        guess, covariance = untold_motion(self._newest_step, step)
         if not step.in_frame_of(self._newest_step):
             # Where the camera was last is as good a guess as any.
             self.correction = (self.correction @ self._newest_step.pose

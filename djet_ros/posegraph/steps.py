@@ -61,7 +61,7 @@ def scale_of(steps: Iterable[Step]) -> Scale:
     return Scale.METRIC if all(step.metric for step in steps) else Scale.RELATIVE
 
 
-def between(before: Step, step: Step) -> tuple[Array, Array]:
+def untold_motion(before: Step, step: Step) -> tuple[Array, Array]:
     """
     Motion (4, 4) and covariance (6, 6) from one step to the next that is not told from it.
 
@@ -93,7 +93,7 @@ def graph_of(steps: Sequence[Step]) -> PoseGraph:
             edges.append(Edge(vertex[step.previous_stamp_ns], i, step.motion, step.covariance,
                               scale_known=step.scale_known))
         elif i:
-            edges.append(Edge(i - 1, i, *between(steps[i - 1], step), 'unknown', False))
+            edges.append(Edge(i - 1, i, *untold_motion(steps[i - 1], step), 'unknown', False))
         vertex[step.stamp_ns] = i
     return PoseGraph(np.array([step.stamp_ns for step in steps], np.int64),
                      np.array([step.pose for step in steps]).reshape(-1, 4, 4), tuple(edges))
