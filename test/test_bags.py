@@ -67,9 +67,9 @@ def record(path, messages, storage='mcap', mode=CompressionMode.NONE, store=None
     with writer:
         for topic, message, stamp in messages:
             kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic], stamp, store.serialize_cdr(message, kind))
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic, kind], stamp, store.serialize_cdr(message, kind))
     return path
 
 
@@ -592,6 +592,15 @@ def test_messages_within_messages_of_ros_1_are_those_of_jazzy(tmp_path):
 
 def test_an_empty_ros1_bag_is_empty_and_not_broken(tmp_path):
     assert 'holds no message' in source_error(ros1_bag(tmp_path / 'old.bag', count=0))
+
+
+def test_a_topic_of_two_types_is_refused_by_name(tmp_path):
+    path = record(tmp_path / 'bag', [
+        *camera_messages(2), ('/other/info', info(1), 1), ('/other/info', pose(1), 2)])
+    with BagRecording(path) as source:
+        assert len(list(source.messages())) == 4
+    said = source_error(path, info_topic='/other/info')
+    assert "several types on '/other/info': geometry_msgs/msg/PoseStamped, sensor_msgs" in said
 
 
 def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):

@@ -186,6 +186,7 @@ class BagRecording(Recording):
             self.ground_truth_topic = (self._ground_truth_topic() if poses is None
                                        else GROUND_TRUTH_TOPIC)
             self.beside = dict(self._beside(beside or {}, strict))
+            self._require_one_type()
             self.ground_truth_file = poses
             self._poses = None if poses is None else _read_truth(poses, self._count)
         except BaseException:
@@ -253,6 +254,16 @@ class BagRecording(Recording):
                                 f'with --{what}-topic from: {", ".join(fitting) or "none"}')
         if wanted and any(topic.name == STATIC_FRAMES_TOPIC for topic in self._topics):
             yield 'frames', STATIC_FRAMES_TOPIC
+
+    def _require_one_type(self) -> None:
+        """Raise DjetError if a chosen topic was recorded with several types."""
+        for name in (self.image_topic, self.info_topic, self.ground_truth_topic,
+                     *self.beside.values()):
+            types = sorted(topic.msgtype for topic in self._topics if topic.name == name)
+            if len(types) > 1:
+                raise DjetError(one_line(
+                    f"{self.bag.path} has messages of several types on '{name}': "
+                    f'{", ".join(types)}; record them on topics of their own'))
 
     def _fitting(self, types: Collection[str]) -> list[Topic]:
         return [topic for topic in self._topics if topic.msgtype in types]
