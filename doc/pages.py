@@ -1,8 +1,8 @@
 """
-Fills what stands between ``generated`` marks in README.md and doc/*.md, from the data beside it.
+Generates the blocks between ``generated`` marks in README.md and doc/*.md from the data in doc/.
 
-    python doc/pages.py           # write
-    python doc/pages.py --check   # say which blocks are not what the data give; exit code 1
+    python doc/pages.py           # write the pages
+    python doc/pages.py --check   # name the pages that are out of date; exit code 1
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ RESULTS = DOC / 'results.json'
 PRINTED_HAMMING = ('djet', 'rpe', 'five_point')
 STEPPED = 'tartanair indoor'
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
-# The README's columns, where they were measured.
+# Columns of the table in the README.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
 DATA_SETS = {'kitti': 'KITTI', 'tum': 'TUM', 'tartanair': 'TartanAir'}
 DIGITS = {'rotation': 4, 'direction': 3}
-# Columns of a replayed drive, and how it is replayed where nothing tells metres.
-OF_REPLAY = ('positions off, rmse in m', 'scale, end over start', 't_rel, %', 'r_rel, ° per 100 m')
+# Columns for a replayed drive; name of the replay without a source of metric scale.
+OF_REPLAY = ('ATE rmse, m', 'scale, end over start', 't_rel, %', 'r_rel, ° per 100 m')
 ALONE = 'images alone'
-# Errors below this, in degrees, are as good as none.
+# Degrees; no ratio is given of two errors below this.
 EQUAL = 0.001
-# A ratio beyond this says no more than that.
+# Ratios beyond this are given as "> MOST".
 MOST = 100
-# Of fewer triangles one in twenty is the largest.
+# Triplets needed for a 95th percentile; of fewer it is the maximum.
 ENOUGH = 20
-# Scenes in which the camera does not move from its place have no direction to compare.
-NO_WAY = {name for name, entry in SCENES.items() if not entry.parallax}
+# Scenes without translation, which have no direction to compare.
+WITHOUT_TRANSLATION = {name for name, entry in SCENES.items() if not entry.parallax}
 
 
 def main(check: bool) -> int:
@@ -63,7 +63,7 @@ def main(check: bool) -> int:
             if not check:
                 page.write_text(filled, 'utf-8')
     if check and stale:
-        print(f'not what the data give, run make pages: {", ".join(stale)}', file=sys.stderr)
+        print(f'out of date, run make pages: {", ".join(stale)}', file=sys.stderr)
         return 1
     return 0
 
@@ -81,7 +81,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
 
 
-# What was recorded, listed and promised
+# Tables from the YAML files
 
 
 def recorded(name: str) -> Callable[[Any], str]:
@@ -93,12 +93,12 @@ def recorded(name: str) -> Callable[[Any], str]:
 
 
 def reports(_: Any) -> str:
-    return table(('report', 'answer', 'held by'), (
+    return table(('report', 'behaviour', 'tests'), (
         (one['report'], one['answer'], tests(one['tests'])) for one in data('reports')))
 
 
 def promises(_: Any) -> str:
-    return table(('promise', 'held by'), (
+    return table(('guarantee', 'tests'), (
         (one['promise'], ' '.join(filter(None, (tests(one['tests']), one.get('also')))))
         for one in data('promises')))
 
@@ -123,7 +123,7 @@ def hard_outcome(one: dict[str, Any]) -> str:
 
 def covariance_bound(_: Any) -> str:
     bound = data('bounds')['normalised_squared_error']
-    return (f'* A test holds its mean over such pairs between {bound["least"]:g} and '
+    return (f'* A test requires its mean over these scenes to lie between {bound["least"]:g} and '
             f'{bound["most"]:g}.\n')
 
 
@@ -140,7 +140,7 @@ def short_dependencies(_: Any) -> str:
 
 
 def complaints(_: Any) -> str:
-    return table(('summary has', 'level', 'seen'), (
+    return table(('summary', 'level', 'cause'), (
         (f'`{one["name"]}`', one['level'], one['seen']) for one in data('complaints')))
 
 
@@ -171,12 +171,12 @@ def rooms(_: Any) -> str:
 
 
 def summary(results: Any) -> str:
-    """Lay out the README's one table: mean errors and failures over all pairs."""
+    """Return the table of the README: mean errors and failures over all pairs."""
     shown = [name for name in SHOWN if name in methods_of(results)]
     rows = [(name, str(pairs(part)), *(cell(part, method, 'mean') for method in shown))
-            for name, part in sequences(results) if name not in NO_WAY]
-    return (paragraph('Mean errors in degrees, rotation / direction of translation, of the pairs '
-                      'that a method told, and failed pairs in brackets. '
+            for name, part in sequences(results) if name not in WITHOUT_TRANSLATION]
+    return (paragraph('Mean errors in degrees, rotation / translation direction, over the pairs '
+                      'with an estimate; failed pairs in brackets. '
                       f'{conditions(results)}')
             + table(('', 'pairs', *(TITLES[name] for name in shown)), rows))
 
@@ -184,8 +184,9 @@ def summary(results: Any) -> str:
 def conditions(results: Any) -> str:
     settings = results['settings']
     seeds = len(settings['seeds'])
-    return (f'Rendered scenes have exact ground truth: the first {settings["frames"]} frames of '
-            f'{seeds} {"seed" if seeds == 1 else "seeds"}. Each pair is estimated by itself.')
+    return (f'Rendered scenes: the first {settings["frames"]} frames of {seeds} '
+            f'{"seed" if seeds == 1 else "seeds"}, exact ground truth. Each pair is estimated '
+            'independently.')
 
 
 def measured_with(results: Any) -> str:
@@ -198,8 +199,8 @@ def measured_with(results: Any) -> str:
     real = settings['real_frames']
     state = '' if results['complete'] else '**This run is not complete.** '
     return f'```sh\n{" ".join(words)}\n```\n\n' + paragraph(
-        f'{state}{conditions(results)} Real sequences are taken '
-        f'{f"to frame {real}" if real else "as far as they are there"}. '
+        f'{state}{conditions(results)} Real sequences: '
+        f'{f"up to {real} frames" if real else "all frames available"}. '
         f'Measured on {results["cores"]} cores with {versions}.')
 
 
@@ -208,11 +209,11 @@ def compared(results: Any) -> str:
 
 
 def comparison(part: Any) -> str:
-    """Lay out one sequence by method."""
+    """Return the table of one sequence by method."""
     seeds = len(part['seeds'])
     head = f'{pairs(part)} pairs' + (f' of {seeds} seeds' if seeds > 1 else '')
     worst = ('worst seed',) if seeds > 1 else ()
-    header = ('method', 'preset', 'told', 'rotation: mean', 'median', '95 %', *worst,
+    header = ('method', 'preset', 'estimated', 'rotation: mean', 'median', '95 %', *worst,
               'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'ms')
     rows = []
     for one in part['methods']:
@@ -222,13 +223,13 @@ def comparison(part: Any) -> str:
             values += [worst_seed(one, what)] if worst else []
             figures += [number(value, digits) for value in values]
         rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
-                     told(one), *figures, str(one['failed']), str(one['sure']),
+                     estimated(one), *figures, str(one['failed']), str(one['sure']),
                      f'{one["ms"]:.0f}'))
     return f'{head}.\n\n{table(header, rows)}'
 
 
-def told(one: Any) -> str:
-    """Say how many pairs the means of rotation and direction are over."""
+def estimated(one: Any) -> str:
+    """Return the numbers of pairs with an estimated rotation and with an estimated direction."""
     return ' / '.join(number(one[what].get('told'), 0) for what in DIGITS)
 
 
@@ -237,18 +238,18 @@ def worst_seed(one: Any, what: str) -> float | None:
 
 
 def against(other: str, presets: Sequence[str]) -> Callable[[Any], str]:
-    """Say, sequence by sequence, how D-JET does against another method of ours."""
+    """Return the block that compares D-JET with another method of ours, by sequence."""
     def block(results: Any) -> str:
         rows = [compared_row(name, part, other, preset)
                 for preset in presets for name, part in sequences(results)]
         behind = [f'{row[0]} (`{row[1]}`)' for row in rows if '**' in ''.join(row)]
         known = all('against' in part for _, part in sequences(results))
         return paragraph(
-            f'D-JET over {TITLES[other]} on the same matches, each with the preset that is named, '
-            'on the pairs that both told: below 1 D-JET is better, above it, in bold, worse. '
-            + (f'It is behind in at least one figure on: {", ".join(behind)}.' if behind
-               else 'It is behind in none.' if known else '')
-        ) + table(('', 'preset', 'both told', 'rotation: mean', 'median', 'direction: mean',
+            f'Error ratios D-JET / {TITLES[other]} on the same matches, over the pairs that both '
+            'estimated; below 1 D-JET is better, above 1 (bold) worse. '
+            + (f'D-JET is worse in at least one figure on: {", ".join(behind)}.' if behind
+               else 'D-JET is worse in none.' if known else '')
+        ) + table(('', 'preset', 'both estimated', 'rotation: mean', 'median', 'direction: mean',
                    'median', f'failed, D-JET / {TITLES[other]}'), rows)
     return block
 
@@ -257,7 +258,7 @@ def compared_row(name: str, part: Any, other: str, preset: str) -> tuple[str, ..
     both = next((one for one in part.get('against', ())
                  if (one['other'], one['preset']) == (other, preset)), None)
     figures = ['–'] * 5 if both is None else [
-        told(both), *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
+        estimated(both), *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
     return (name, preset, *figures,
             failures(find(part, 'djet', preset), find(part, other, preset)))
 
@@ -268,16 +269,16 @@ def failures(ours: Any, theirs: Any) -> str:
 
 
 def ratio(ours: float | None, theirs: float | None) -> str:
-    """Divide two errors in degrees, unless there is none or both are as good as none."""
+    """Return the ratio of two errors in degrees; none where both are below EQUAL."""
     if ours is None or theirs is None or max(ours, theirs) < EQUAL:
         return '–'
-    # Who says of a camera that stands that it does errs by nothing, to which nothing compares.
+    # A method that reports a standstill as identity has no error at all: the ratio is unbounded.
     text = f'{ours / theirs:.2f}' if ours < MOST * theirs else f'> {MOST}'
     return f'**{text}**' if ours > theirs and text != '1.00' else text
 
 
 def table_1(results: Any) -> str:
-    """Lay out the paper's Table 1 beside what its parameters give here."""
+    """Return the paper's Table 1 next to the results of the preset `paper`."""
     rows, starts = [], []
     for name, part in sequences(results):
         if name not in TABLE_1:
@@ -295,10 +296,10 @@ def table_1(results: Any) -> str:
             starts.append(f'{pair_of(here["five_point"], "mean")} here and '
                           f'{printed["five_point"].rotation_deg:.3f} / '
                           f'{printed["five_point"].translation_deg:.3f} there on {name}')
-    said = ("The paper's Table 1, of whole sequences in what it calls degrees, beside the preset "
-            '`paper` here, of their first pairs: mean errors, and mean Hamming distances in bits.')
+    said = ("The paper's Table 1 (whole sequences, units as printed: degrees) next to the preset "
+            '`paper` on their first pairs: mean errors, and mean Hamming distances in bits.')
     if starts:
-        said += f' The start of all, 5-P, already differs: {", ".join(starts)}.'
+        said += f' Already the initial pose, 5-P, differs: {", ".join(starts)}.'
     titles = [TITLES[method] for method in OURS]
     return paragraph(said) + table(
         ('', '', f'rotation: {titles[0]}', *titles[1:], f'translation: {titles[0]}', *titles[1:],
@@ -306,19 +307,20 @@ def table_1(results: Any) -> str:
 
 
 def peer_settings(_: Any) -> str:
-    """Say what the peers are set to, where the code says it."""
+    """Return the settings of the methods compared with, as the code has them."""
     chains = ''.join(paragraph(
         f'{TITLES[name]}: {first_line(chain.detect)} {first_line(chain.match)}')
         for name, chain in CHAINS.items())
     return (paragraph(
-        'The peers are set to what serves them best. PL is PoseLib. Thresholds of their searches '
-        f'are {EstimatorConfig.ransac_threshold:g} px, as for our start. RANSAC and MAGSAC++ are '
-        f'`findEssentialMat` with a confidence of {peers.CONFIDENCE:g}, and `recoverPose` with '
-        f'`distanceThresh={peers.FARTHEST:g}`: by default points beyond 50 baselines have no '
-        'vote, and after a step of a hand-held camera none is nearer. PoseLib is its LO-RANSAC '
-        f'and refinement with a Cauchy loss that bends at {peers.LOSS_SCALE:g} px instead of its '
-        'default, half the threshold, which leaves larger errors; that holds alone and with '
-        'SIFT and KLT. `djet_ros/lab/chains.py` tells what was tried.')
+        'Settings of the other methods are those that gave them the smallest errors. PL is '
+        f'PoseLib. RANSAC thresholds are {EstimatorConfig.ransac_threshold:g} px, as for our '
+        'initial pose. RANSAC and MAGSAC++ are `findEssentialMat` with a confidence of '
+        f'{peers.CONFIDENCE:g} and `recoverPose` with `distanceThresh={peers.FARTHEST:g}`: its '
+        'default ignores points beyond 50 baselines in the chirality check, which after a small '
+        'step of a hand-held camera is all of them. PoseLib is its LO-RANSAC and refinement with '
+        f'a Cauchy loss of scale {peers.LOSS_SCALE:g} px; its default, half the threshold, leaves '
+        'larger errors. The same holds with SIFT and KLT. `djet_ros/lab/chains.py` says what was '
+        'tried.')
         + chains)
 
 
@@ -327,30 +329,30 @@ def first_line(function: Callable[..., Any]) -> str:
 
 
 def beyond(results: Any) -> str:
-    """Say of how many poses of stepped edges the covariance is too small."""
+    """Return how many pairs of STEPPED exceed the 99.9 % bound of their covariance."""
     part = results['parts'].get(STEPPED)
     if part is None:
         return ''
     one = part['odometry']['surprise']
-    return (f'  Beyond the bound of 99.9 % lie {one["beyond"]} of {one["pairs"]} pairs of '
-            f'{known_as(STEPPED)}.\n')
+    return (f'  There, on {known_as(STEPPED)}, {one["beyond"]} of {one["pairs"]} pairs exceed the '
+            '99.9 % bound.\n')
 
 
 def odometry(results: Any) -> str:
     rows = []
     for name, part in sequences(results):
         one = part['odometry']
-        rows.append((name, str(one['pairs']), told(one),
+        rows.append((name, str(one['pairs']), estimated(one),
                      *(number(one[what][kind], DIGITS[what])
                        for what in ('rotation', 'direction')
                        for kind in ('mean', 'median', 'max')),
                      str(one['failed']), str(one['sure'])))
-    return table(('', 'pairs', 'told', 'rotation: mean', 'median', 'largest', 'direction: mean',
-                  'median', 'largest', 'failed', 'of these `OK`'), rows)
+    return table(('', 'pairs', 'estimated', 'rotation: mean', 'median', 'max', 'direction: mean',
+                  'median', 'max', 'failed', 'of these `OK`'), rows)
 
 
 def drift(results: Any) -> str:
-    """Lay out whole drives: chains of pairs by method, and replays with lengths of their own."""
+    """Return the tables of whole drives: chained pairs by method, and replays."""
     drives = [(known_as(name.removeprefix('drive ')), part)
               for name, part in results['parts'].items() if name.startswith('drive ')]
     if not drives:
@@ -360,20 +362,20 @@ def drift(results: Any) -> str:
         for name, part in drives for one in part['chained']]
     replays = [(f'{name}, {how}', *replay(one)) for name, part in drives
                for how, one in [*part['replays'].items(), *(
-                   (f'{how}, lens undone', one)
+                   (f'{how}, distortion corrected', one)
                    for how, one in part.get('lens', {'replays': {}})['replays'].items())]]
     whole = ', '.join(f'{name} ({part["frames"]} frames, {part["length"]:.0f} m)'
                       for name, part in drives)
-    return (paragraph(f'Of {whole}. Pairs chained, each by itself, with the lengths of the ground '
-                      'truth:')
+    return (paragraph(f'{whole}. Independent pairs chained, with the translation lengths of the '
+                      'ground truth:')
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
-            + paragraph('As `djet replay` has them, with lengths of its own; positions after '
-                        'alignment with one scale:')
+            + paragraph('`djet replay`, with its own translation lengths. ATE after alignment; the '
+                        'scale is aligned too, unless it is metric:')
             + table(('', *OF_REPLAY), replays))
 
 
 def lens(results: Any) -> str:
-    """Lay out drives as they are replayed with more and less distortion than was found."""
+    """Return the tables of drives replayed with more and less distortion than was found."""
     text = ''
     for name, part in results['parts'].items():
         if 'lens' not in part:
@@ -386,13 +388,12 @@ def lens(results: Any) -> str:
                            f'{ALONE}; `djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
                  + table(('k1', *OF_REPLAY), ((f'{value:.4f}', *replay(runs[value]))
                                               for value in sorted(runs))))
-    return text or 'No drive tells a distortion that is worth correcting.\n'
+    return text or 'No drive shows a distortion that is worth correcting.\n'
 
 
 def replay(one: Any) -> tuple[str, ...]:
-    """Figures of a replay, as OF_REPLAY names them."""
+    """Return the figures of a replay in the order of OF_REPLAY."""
     return (number(one['positions']['rmse_m'], 2), number(one['positions']['scale_change']),
-            # Without metres t_rel says nothing.
             number(one['drift']['translation_percent'], 2),
             number(one['drift']['rotation_deg_per_100m']))
 
@@ -405,7 +406,7 @@ def surprise(results: Any) -> str:
             digits = 1 if max(one['mean'], one['median']) < 100 else 0
             rows.append((name, str(one['pairs']), number(one['mean'], digits),
                          number(one['median'], digits), str(one['beyond'])))
-    return table(('', 'pairs', 'mean (5 if true)', 'median (4.4 if true)',
+    return table(('', 'pairs', 'NEES: mean (5 expected)', 'median (4.4 expected)',
                   'beyond the 99.9 % bound'), rows)
 
 
@@ -421,8 +422,8 @@ def closure(results: Any) -> str:
                          number(one['normalised_square_mean'], 1),
                          number(one['error_median_deg']),
                          f'{one["triangles"]:.0f} of {one["triangles"] + one["without"]:.0f}'))
-    return table(('', 'method', 'left, median', '95 %', 'claimed', 'square (3 if true)',
-                  'error against the truth, median', 'triangles'), rows)
+    return table(('', 'method', 'closure error, median', '95 %', 'predicted',
+                  'NEES (3 expected)', 'error against ground truth, median', 'triplets'), rows)
 
 
 def ablation(results: Any) -> str:
@@ -430,9 +431,9 @@ def ablation(results: Any) -> str:
     if part is None:
         return 'Not measured yet.\n'
     return (paragraph(f'Over {part["variants"][0]["pairs"]} pairs: the first {part["frames"]} '
-                      f'frames of {", ".join(part["of"])}, with {len(part["seeds"])} seeds each. '
-                      'Ratios are on pairs that both tell, with the 95 % interval of a paired '
-                      'bootstrap over pairs.')
+                      f'frames of {", ".join(part["of"])}, {len(part["seeds"])} seeds each. '
+                      'Ratios are over pairs that both estimated, with the 95 % interval of a '
+                      'paired bootstrap over pairs.')
             + table(VARIANTS, map(variant, part['variants'])) + '\n' + paragraph(verdict(part)))
 
 
@@ -441,7 +442,7 @@ VARIANTS = ('method', 'change', 'mean (failed)', 'median', 'rotation over `best`
 
 
 def variant(one: Any) -> tuple[str, ...]:
-    """Lay out a row of the ablation."""
+    """Return a row of the ablation."""
     return (TITLES[one['method']], one['change'] or '`best`', cell_of(one, 'mean'),
             pair_of(one, 'median'), *(interval(one, what, kind) for what in DIGITS
                                       for kind in ('mean', 'median')))
@@ -453,25 +454,25 @@ def interval(one: Any, what: str, kind: str) -> str:
 
 
 def verdict(part: Any) -> str:
-    """Say which changes of D-JET the pairs tell from it by their means, and which they do not."""
+    """Return which changes of D-JET make a significant difference of the means."""
     changed = [one for one in part['variants'] if one['method'] == 'djet' and one['change']]
     if not all('ratio' in one for one in changed):
-        return 'Which of these differences the pairs tell from chance was not measured yet.'
+        return 'Significance of these differences was not measured yet.'
     said: dict[str, list[str]] = {}
     for one in changed:
         said.setdefault(judged(one['ratio']), []).append(one['change'])
-    return 'By means. ' + ' '.join(f'{word}: {"; ".join(said[word])}.'
+    return 'By the means: ' + ' '.join(f'{word}: {"; ".join(said[word])}.'
                                    for word in JUDGED if word in said)
 
 
 JUDGED = (
-    'Worse in both', 'Worse in one, and not told apart in the other', 'Better in both',
-    'Better in one, and not told apart in the other', 'Better in one, worse in the other',
-    'Not told from `best`, whose intervals hold 1')
+    'Worse in both', 'Worse in one, not significant in the other', 'Better in both',
+    'Better in one, not significant in the other', 'Better in one, worse in the other',
+    'Not significant (both intervals contain 1)')
 
 
 def judged(ratio: Any) -> str:
-    """Tell by the intervals of both ratios which of JUDGED holds."""
+    """Return which of JUDGED holds, by the intervals of both ratios."""
     known = [by_kind['mean'] for by_kind in ratio.values() if None not in by_kind['mean']]
     worse, better = (sum(least > 1 for _, least, _ in known),
                      sum(most < 1 for _, _, most in known))
@@ -483,15 +484,15 @@ def judged(ratio: Any) -> str:
 
 
 def joined(results: Any) -> str:
-    """Hold surfaces and gray levels together against each of them alone."""
+    """Return the comparison of surfaces and photometric alignment, together and alone."""
     part = results['parts'].get('ablation')
     ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', WEIGHED),
             ('rpe', ''))
     found = {(one['method'], one['change']): one for one in part['variants']} if part else {}
     if ('rpe', WEIGHED) not in found:
-        return 'Surfaces and gray levels were not yet measured each by itself.\n'
-    return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, see "What makes the '
-                      'difference":') + table(VARIANTS, (variant(found[way]) for way in ways)))
+        return 'Surfaces and photometric alignment alone were not measured yet.\n'
+    return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, those of the "Ablation" '
+                      'below:') + table(VARIANTS, (variant(found[way]) for way in ways)))
 
 
 def speed(results: Any) -> str:
@@ -499,7 +500,7 @@ def speed(results: Any) -> str:
     if part is None:
         return 'Not measured yet.\n'
     both = (part, part['all_cores'])
-    rows = [("time over OpenCV's chain", *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
+    rows = [("time relative to OpenCV's pipeline", *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
             ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in both)),
             ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in both)),
             ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in both)),
@@ -508,21 +509,21 @@ def speed(results: Any) -> str:
     growth = [(f'{name} {key}', f'{value:.1f}')
               for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))
               for key, value in part[by].items()]
-    return (paragraph(f'Of {known_as(part["of"])}, {part["pairs"]} pairs, from file to pose.')
+    return (paragraph(f'{known_as(part["of"])}, {part["pairs"]} pairs, from file to pose.')
             + table(('', 'one thread', 'all cores'), rows) + '\n'
-            + paragraph('The D-JET stage, surfaces and optimisation, in ms. '
-                        f'{kernel(part)}A frame that is kept takes '
+            + paragraph('The D-JET stage (surfaces and optimisation), in ms, by number of matches '
+                        f'and by window side. {kernel(part)}A frame in memory takes '
                         f'{part["bytes_per_frame"] / 1e6:.1f} MB.')
             + table(('', 'ms'), growth))
 
 
 def kernel(part: Any) -> str:
-    """Tell what a pixel of a surface costs, where it is known how many tests it takes."""
+    """Return the cost of a surface sample, if the number of its tests was measured."""
     if 'kernel_tests' not in part:
         return ''
-    return (f'A pixel of a surface, of {part["kernel_tests"]} tests, costs '
-            f'1/{part["kernel_speedup_over_cv2"]:.0f} of a descriptor of 256 by '
-            '`cv2.ORB.compute`, whose keypoints are listed before. ')
+    return (f'A surface sample ({part["kernel_tests"]} tests) costs '
+            f'1/{part["kernel_speedup_over_cv2"]:.0f} of a descriptor (256 tests) by '
+            '`cv2.ORB.compute`, not counting the creation of its keypoints. ')
 
 
 def sequences(results: Any) -> list[tuple[str, Any]]:
@@ -531,7 +532,7 @@ def sequences(results: Any) -> list[tuple[str, Any]]:
 
 
 def known_as(name: str) -> str:
-    """Name of a sequence as people know it."""
+    """Return the usual name of a sequence."""
     data_set, _, sequence = name.partition(' ')
     return f'{DATA_SETS.get(data_set, data_set)} {sequence.removeprefix("rgbd_dataset_")}'.strip()
 

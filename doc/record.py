@@ -57,8 +57,8 @@ import yaml
 
 OUTPUT = Path(__file__).with_name('recorded.yaml')
 HEAD = """\
-# Figures that `make results` cannot make: they need a ROS graph, a pose graph or hours. Each table
-# says with which version of the package it was measured, and how; doc/record.py measures most.
+# Figures that `make results` does not measure, because they need a ROS graph, a pose graph or hours.
+# Each table has the version of the package and the method of measurement; see doc/record.py.
 
 """
 DJET = (sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())')
@@ -196,10 +196,9 @@ def loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
             f"{1e3 * before['evo_rpe_m']:.1f} → {1e3 * after['evo_rpe_m']:.1f} mm, "
             f"{before['evo_rpe_deg']:.3f} → {after['evo_rpe_deg']:.3f}°"])
     return {'how': '`djet lab render loop DIR --frames 427 --seed S --size WxH` (362 m) and '
-                   '`djet slam DIR/sequences/02 --scale SCALE`; a ratio is APE before over APE '
-                   'after. Lengths by structure alone have no metres: APE after alignment with '
-                   'scale.',
-            'header': ['images', 'lengths by', 'loops (not trusted)', 'APE before', 'APE after',
+                   '`djet slam DIR/sequences/02 --scale SCALE`; ratio is APE before / APE after. '
+                   'Scale `structure` is not metric: APE after alignment with scale.',
+            'header': ['images', 'scale from', 'loops (rejected)', 'APE before', 'APE after',
                        'ratio', 'RPE before → after'], 'rows': rows}
 
 
@@ -229,8 +228,8 @@ def outvoted(place: Path, args: argparse.Namespace) -> dict[str, Any]:
                         *graph.edges[number + 1:])) for number in chosen]
         rows.append([f'{square:.0f}', f'{min(after):.3f} to {max(after):.3f} m'])
     return {'how': f'One of {len(chain)} odometry edges of the loop (620×188, seed 0; ground '
-                   'truth, 1 %) off by a given χ², in a direction drawn at random, at eight '
-                   f'places round the block. APE of keyframes after; {error(graph.edges):.3f} m '
+                   'truth, 1 %) perturbed by a given χ² in a random direction, at eight places '
+                   f'along the loop. APE of keyframes afterwards; {error(graph.edges):.3f} m '
                    'without a wrong edge.',
             'header': ['χ² of the wrong edge', 'APE after'], 'rows': rows}
 
@@ -275,8 +274,8 @@ def soak(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     tracked = sum(statuses.get(name, 0) for name in ('OK', 'NO_PARALLAX'))
     jumps = statuses.get('TIME_JUMP', 0)
     other = found['frames'] - tracked - jumps - statuses.get('FIRST_FRAME', 0)
-    return {'how': f"`djet lab soak`, {found['frames']:,} frames of 416×128, {other:,} of them "
-                   f'that could not be tracked, {jumps} time jumps.',
+    return {'how': f"`djet lab soak`, {found['frames']:,} frames of 416×128, of which "
+                   f'{other:,} could not be tracked; {jumps} time jumps.',
             'header': [f"resident memory at {stretches[0]['frames']:,} frames",
                        f"at {found['frames']:,} frames"],
             'rows': [[f"{stretches[0]['memory_mb']:.1f} MB", f"{found['memory_mb']:.1f} MB"]]}
@@ -295,8 +294,8 @@ def camera_height(place: Path, args: argparse.Namespace) -> dict[str, Any]:
         rows.append(row_of(f'rendered `{scene}`, {frames} frames', lengths(folder, frames)))
     return {'how': 'Steps of `djet replay SEQUENCE --scale camera_height --camera-height 1.65`.',
             'header': ['sequence', 'pairs',
-                       'length / truth of a pair: median (spread, 1.48 MAD), extremes',
-                       'of the path', 'normalised error, rms'], 'rows': rows}
+                       'length / ground truth per pair: median (1.48 MAD), range',
+                       'whole path', 'normalised error, rms'], 'rows': rows}
 
 
 def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -305,7 +304,7 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     for name, folder in kitti(args, '00').items():
         bag = place / 'later'
         djet('kitti-to-bag', folder, bag, '--start', 15)
-        sources[f'{name.replace("0–", "15–")}, a sequence of its own'] = bag
+        sources[name.replace('0–', '15–')] = bag
     sources |= {f'TUM {folder.name.removeprefix("rgbd_dataset_")}': folder
                 for folder in sorted(args.data.glob('tum/*/'))}
     for seed in range(3):
@@ -318,7 +317,7 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
         rows.append([name, f"{found['way_m']:.3g} m", known(found['scale_change'], '.3f'),
                      f"{1e3 * found['rmse_m']:.3g} mm"])
     return {'how': '`djet replay SEQUENCE`, images alone.',
-            'header': ['', 'way', 'scale, end over start', 'positions off (rmse)'], 'rows': rows}
+            'header': ['', 'path length', 'scale, end over start', 'ATE rmse'], 'rows': rows}
 
 
 def lengths(folder: Path, frames: int | None) -> Array:
@@ -360,14 +359,14 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
          place / 'rendered')
     rows = covered(place / 'rendered')
     for real in args.data.glob('tartanair/sequences/*'):
-        for sigma, told in (('0', ''), (CALIBRATED, f', calibrated to {CALIBRATED} pixels')):
+        for sigma, told in (('0', ''), (CALIBRATED, f', calibration σ {CALIBRATED} px')):
             djet('lab', 'coverage', real, '--calibration-sigma', sigma, '--output',
                  place / f'{real.name}-{sigma}')
             rows += covered(place / f'{real.name}-{sigma}', f'TartanAir {real.name}{told}')
     return {'how': f'`djet lab coverage --scenes all --seeds 0-9 --frames {COVERED}`, and on real '
-                   'frames; each pair by itself / in a row, from the motion before.',
-            'header': ['', 'pairs', 'poses', 'wrong and sure', 'moved, but untold',
-                       'given up (right)', 'NEES over its expectation, median', 'inside 95 %',
+                   'frames; independent pairs / in sequence, with the previous motion.',
+            'header': ['', 'pairs', 'poses', 'overconfident failures', 'missed motion',
+                       'rejected (correct)', 'NEES / expected, median', 'inside 95 %',
                        'beyond 99.9 %'],
             'rows': rows}
 
@@ -402,7 +401,7 @@ def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     with Graph(GRAPH) as graph:
         rows = at_pace(args, args.node, graph) + many_frames(place, args.node, graph)
     return {'how': 'ROS 2 Jazzy, Cyclone DDS on loopback, 2 cores; `djet play`, `vo_node` and a '
-                   'listener as processes of their own.', 'header': ['', ''], 'rows': rows}
+                   'subscriber as separate processes.', 'header': ['', ''], 'rows': rows}
 
 
 def dds(place: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -426,11 +425,11 @@ def at_pace(args: argparse.Namespace, command: str, graph: Graph) -> list[list[s
         ['KITTI 06 (1226×370) at its 10 Hz, `queue_policy: latest`',
          f"{said['frames processed']} of {sent} images processed, {said['frames dropped']} "
          'dropped'],
-        ['from receipt to publication, by its diagnostics',
+        ['latency from receipt to publication, from the diagnostics',
          f"median {said['latency, median (ms)']} ms, 95 % {said['latency, 95 % (ms)']} ms"],
-        ['CPU time an image, with all that is published', f'{spent:.0f} ms'],
+        ['CPU time per image, publishing included', f'{spent:.0f} ms'],
         ['resident memory', f'{memory:.0f} MB'],
-        ['SIGINT to the end of the process', f'{took:.1f} s']]
+        ['from SIGINT to exit', f'{took:.1f} s']]
 
 
 def many_frames(place: Path, command: str, graph: Graph) -> list[list[str]]:
@@ -457,15 +456,15 @@ def live_loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
             source = block(place, size, 0)
             found, memory = mapped_live(source, rate, graph, heard)
             row, share = live_row(source, heard, found)
-            rows.append([f"{size.replace('x', '×')}, {rate} a second", *row, f'{memory:.0f} MB'])
+            rows.append([f"{size.replace('x', '×')}, {rate} per second", *row, f'{memory:.0f} MB'])
             kept.append(f"{share}, {found['relative poses missing']} relative poses missing, "
                         f"{found['keyframes without image']} keyframes without image")
-    return {'how': '`djet play`, `djet live`, the pose graph on Cyclone DDS, parameters as they '
-                   'stand, and a listener as processes on two cores; the block driven twice, 427 '
-                   'images. Lengths by structure alone: APE after alignment with scale. Frames '
+    return {'how': '`djet play`, `djet live`, the pose graph on Cyclone DDS and a subscriber as '
+                   'processes on two cores, default parameters; the loop driven twice, 427 '
+                   'images. Scale `structure`: APE after alignment with scale. Frames '
                    f"with `map` → `odom`: {'; '.join(kept)}.",
-            'header': ['images', 'loops (not trusted)', 'APE of the keyframes before → after',
-                       'of all frames as published on the way', 'memory of the pose graph'],
+            'header': ['images', 'loops (rejected)', 'APE of keyframes before → after',
+                       'APE of all frames as published', 'memory of the pose graph'],
             'rows': rows}
 
 
