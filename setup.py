@@ -11,8 +11,8 @@ package_name = 'djet_ros'
 
 setup(
     name=package_name,
-    description='Visual odometry by D-JET: pose optimisation on descriptor surfaces',
-    # Where colcon links the sources, this file leads to them.
+    description='Monocular visual odometry by D-JET: pose optimisation in descriptor space',
+    # With colcon's --symlink-install this file is a link into the sources.
     long_description=Path(__file__).resolve().with_name('README.md').read_text('utf-8'),
     long_description_content_type='text/markdown',
     classifiers=[
@@ -36,8 +36,8 @@ setup(
         (f'share/{package_name}/config', glob('config/*')),
         (f'share/{package_name}/launch', glob('launch/*')),
     ],
-    # Inner loops: without a C compiler those in NumPy do, and a frame takes half as long again.
-    # No index of theirs overflows, which Python's own -fwrapv would have loops check for.
+    # Inner loops, optional: without a C compiler those in NumPy run, and a frame takes 1.5 times
+    # as long. -fno-wrapv: no index overflows, and Python's own -fwrapv prevents optimisations.
     ext_modules=[Extension(
         f'{package_name}.compiled._loops', sorted(glob(f'{package_name}/compiled/*.c')),
         depends=glob(f'{package_name}/compiled/*.h'), optional=True,
@@ -45,8 +45,8 @@ setup(
                             '-fno-wrapv', '-Wno-psabi'])],
     zip_safe=False,
     python_requires='>=3.11',
-    # The lower bounds are what Ubuntu 24.04 (ROS Jazzy) ships, where the registry has it for
-    # Python 3.12; `make lowest` runs the tests on them.
+    # Lower bounds: the versions of Ubuntu 24.04 (ROS Jazzy), if the registry has them for Python
+    # 3.12; `make lowest` tests them.
     install_requires=[
         'backports.zstd>=1.0,<2; python_version < "3.14"',
         'lz4>=4.3.2,<5',
@@ -75,7 +75,7 @@ setup(
         'fuzz': [
             'atheris>=3.0,<4',
         ],
-        # what `djet lab evaluate` compares with
+        # methods compared with in `djet lab evaluate`
         'peers': [
             'evo>=1.38,<2',
             'poselib>=2.0.5,<3',
@@ -87,8 +87,8 @@ setup(
         'test': [
             'colcon-common-extensions>=0.3,<0.4',
             'cyclonedds>=11.0.1,<12',
-            # newer than 'slam' allows: it needs a pytest that Jazzy does not have, and comes
-            # with NumPy 2, which 4.2 refuses
+            # newer than 'slam' allows: 4.3 needs a pytest that Jazzy does not have; 4.2 refuses
+            # NumPy 2
             'gtsam>=4.2.1,<5',
             'hypothesis>=6.98,<7',
             'pytest>=7.4,<10',
