@@ -1,9 +1,9 @@
 """
-Measures what doc/results.md and the README's table show, and writes it as JSON.
+Measures the figures of doc/results.md and of the README, and writes them as JSON.
 
-Rendered scenes are taken with several seeds; real frames are those of $DJET_DATA, if it is set. A
-run that was broken off is taken up where it ended; one of other settings, code or libraries begins
-anew. With --only what is there already stays, and is refused where it is of others.
+Rendered scenes use several seeds; real frames are those of $DJET_DATA, if it is set. An
+interrupted run is resumed; with other settings, code or libraries the measurement starts again.
+With --only, parts are added to existing results, which must have the same settings.
 
     python doc/measure.py --frames 21 --seeds 0,1,2,3,4 --workers 2
 """
@@ -62,27 +62,29 @@ LIBRARIES = ('numpy', 'scipy', 'opencv-python-headless', 'poselib')
 
 # The columns of the paper's Table 1.
 PAPER_METHODS = ('djet', 'rpe', 'pjet', 'five_point')
-# Whom D-JET is held against on the pairs that both told, with which preset.
+# Methods compared with D-JET on the pairs that both estimated, and the preset.
 AGAINST = (('rpe', 'best'), ('rpe', 'paper'), ('pjet', 'best'))
 CLOSED = ('djet', 'pjet', 'rpe')
 CLOSURE_FRAMES = 150
 ABLATED = ('road', 'indoor', 'handheld', 'forest')
 ABLATED_FRAMES, ABLATED_SEEDS = 7, 3
 ABLATED_WINDOWS = (3, 5, 7, 15)
-# What pairs are chained of over whole drives.
+# Methods whose pairs are chained over whole drives.
 CHAINED = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
-# Metres; a drive that is shorter has no drift by KITTI's measure.
+# Metres; shorter drives have no drift by KITTI's definition.
 DRIVE = 100.0
-# How drives are replayed; the camera's height over the road is KITTI's own word.
+# How drives are replayed; the camera height is KITTI's published one.
 ALONE = 'images alone'
 REPLAYED = {ALONE: {},
             '`camera_height`': {'odometry.scale': 'camera_height', 'odometry.camera_height': 1.65}}
-# What undoes the distortion that is found, and standard errors beside it by which it is taken too.
+# Parameter that corrects the estimated distortion, and offsets from the estimate that are replayed
+# too, in standard errors.
 RESIDUAL = 'odometry.residual_k1'
 BESIDE = (-2, -1, 1, 2)
 BENCH_PAIRS = 40
-# An error that a true covariance of five degrees of freedom allows in one pair of a thousand.
-SURPRISING = float(chi2.ppf(0.999, 5))
+# Bound of the NEES that a consistent covariance of five degrees of freedom exceeds in one pair of
+# a thousand.
+BOUND_999 = float(chi2.ppf(0.999, 5))
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,9 @@ class Job:
     """
     Sequences that are measured together.
 
-    name: what pages call them; seeds: those of a rendered scene, or none; folder: of real frames;
-    frames: how many are used (None: all); cost: a guess of the work, to begin with the longest.
+    name: as in results.json; seeds: of a rendered scene, else empty; folder: of real frames, else
+    None; frames: how many are used (None: all); cost: estimate of the work, to start the longest
+    first.
     """
 
     name: str
@@ -104,10 +107,10 @@ class Job:
 @dataclass(frozen=True)
 class Outcome:
     """
-    What was made of a pair.
+    The result of a pair.
 
-    sequence: its name; errors in degrees, NaN where there is none; failed: as djet lab evaluate
-    counts; surprise: squared error over its covariance, NaN where that is not told.
+    sequence: its name; rotation, direction: errors in degrees, NaN if there is none; failed: as
+    counted by djet lab evaluate; surprise: NEES, NaN if there is no direction.
     """
 
     sequence: str
@@ -123,13 +126,13 @@ def main() -> int:
     settings = {'frames': args.frames, 'seeds': list(args.seeds), 'real_frames': args.real_frames,
                 'code': digest_of_the_code([Path(__file__)])}
     try:
-        results = begun(args.output, settings, keep=bool(args.only))
+        results = previous_results(args.output, settings, keep=bool(args.only))
     except DjetError as error:
         print(f'measure.py: {error}', file=sys.stderr)
         return 2
     failed = False
     with local_workers(args.workers) as pool:
-        running = {pool.submit(work): name for name, work in missing(results, args)}
+        running = {pool.submit(work): name for name, work in pending_parts(results, args)}
         for future in as_completed(running):
             name = running[future]
             try:
@@ -143,7 +146,7 @@ def main() -> int:
     if failed or args.only:
         return int(failed)
     if 'speed' not in results['parts']:
-        # Alone on the machine, as far as that is in our hands.
+        # After all other parts, so that nothing of ours runs at the same time.
         results['parts']['speed'] = speed(args.data)
     results['complete'] = True
     write(args.output, results)
@@ -170,11 +173,13 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def begun(output: Path, settings: dict[str, Any], *, keep: bool = False) -> dict[str, Any]:
+def previous_results(output: Path, settings: dict[str, Any], *, keep: bool = False
+                     ) -> dict[str, Any]:
     """
-    Give the unfinished results of an earlier run with these settings, or empty ones.
+    Return the unfinished results of an earlier run with these settings, or empty ones.
 
-    keep: give finished ones too; DjetError, so that nothing is lost, where they are of others.
+    keep: return finished ones too, and raise DjetError if the existing ones have other settings,
+    so that nothing is lost.
     """
     libraries = versions()
     new = {'complete': False, 'settings': settings, 'versions': libraries,
@@ -197,13 +202,13 @@ def versions() -> dict[str, str]:
 
 
 def write(output: Path, results: dict[str, Any]) -> None:
-    """Write all that is known so far, whole or not at all."""
-    ordered = {**results, 'parts': dict(sorted(results['parts'].items(), key=place))}
+    """Write the results so far, atomically."""
+    ordered = {**results, 'parts': dict(sorted(results['parts'].items(), key=sort_key))}
     write_whole(output, json.dumps(ordered, indent=1, ensure_ascii=False) + '\n')
 
 
-def place(item: tuple[str, Any]) -> tuple[bool, int, str]:
-    """Say where a part stands: scenes in the order of the catalogue, then the rest."""
+def sort_key(item: tuple[str, Any]) -> tuple[bool, int, str]:
+    """Return the sort key of a part: scenes in the order of the catalogue, then the rest."""
     names = list(SCENES)
     known = item[0] in names
     return not known, names.index(item[0]) if known else 0, item[0]
@@ -212,9 +217,9 @@ def place(item: tuple[str, Any]) -> tuple[bool, int, str]:
 # What is measured
 
 
-def missing(results: dict[str, Any], args: argparse.Namespace
-            ) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-    """Give the parts that are wanted and not measured yet, the longest first."""
+def pending_parts(results: dict[str, Any], args: argparse.Namespace
+                  ) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Yield the parts that are requested and not measured yet, the longest first."""
     jobs = [Job(name, args.seeds, None, args.frames, args.frames * len(args.seeds))
             for name in SCENES]
     for folder in real_sequences(args.data):
@@ -232,7 +237,7 @@ def missing(results: dict[str, Any], args: argparse.Namespace
 
 
 def real_sequences(data: Path | None) -> list[Path]:
-    """Folders in the layouts of KITTI and TUM below the folder of real data."""
+    """Return the folders in the layouts of KITTI and TUM below the folder of real data."""
     if data is None:
         return []
     return sorted([*(path.parent for path in data.glob('*/sequences/*/calib.txt')),
@@ -240,13 +245,13 @@ def real_sequences(data: Path | None) -> list[Path]:
 
 
 def title(folder: Path) -> str:
-    """Name of a real sequence: its data set and its own."""
+    """Return the name of a real sequence, with its dataset."""
     data_set = folder.parent.parent if folder.parent.name == 'sequences' else folder.parent
     return f'{data_set.name} {folder.name}'
 
 
 def measured(job: Job) -> dict[str, Any]:
-    """Measure one job with every method, as an odometry, and by its triangles."""
+    """Measure one job: every method, the odometry, and rotation closure."""
     started = perf_counter()
     with TemporaryDirectory() as name:
         datasets = opened_for(job, Path(name))
@@ -256,7 +261,7 @@ def measured(job: Job) -> dict[str, Any]:
         records = estimated(datasets, methods)
         found = {'seeds': list(job.seeds), 'methods': by_method(datasets, methods, records),
                  'against': [against(records, *other) for other in AGAINST],
-                 'odometry': odometry(datasets), 'closure': closed(datasets)}
+                 'odometry': odometry(datasets), 'closure': closure_figures(datasets)}
     return {'seconds': rounded(perf_counter() - started), **found}
 
 
@@ -268,14 +273,14 @@ def opened_for(job: Job, place: Path) -> list[Dataset]:
 
 
 def ratios(records: Sequence[PairRecord], base: Sequence[PairRecord]) -> dict[str, Any]:
-    """Give errors over those of others on the same pairs, each with its interval."""
+    """Return the ratios of errors to those of `base` on the same pairs, with intervals."""
     return {'ratio': {what: {kind: [rounded(value) for value in astuple(one)]
                              for kind, one in by_kind.items()}
                       for what, by_kind in ratios_to_base(records, base).items()}}
 
 
 def estimated(datasets: Sequence[Dataset], methods: Sequence[Method]) -> list[PairRecord]:
-    """Estimate all pairs, each by itself."""
+    """Estimate all pairs, independently."""
     return [record for dataset in datasets
             for record in evaluate_chunk(PairChunk(dataset, 0, dataset.pairs), methods)]
 
@@ -283,9 +288,9 @@ def estimated(datasets: Sequence[Dataset], methods: Sequence[Method]) -> list[Pa
 def by_method(datasets: Sequence[Dataset], methods: Sequence[Method],
               records: Sequence[PairRecord], *, compared: bool = False) -> list[dict[str, Any]]:
     """
-    Sum up the records of all pairs by method; hamming: in bits, over the inliers of pairs.
+    Summarise the records of all pairs by method; hamming: in bits, over the inliers of pairs.
 
-    compared: with the first method, too.
+    compared: add the ratios to the first method.
     """
     found: list[dict[str, Any]] = []
     base: list[PairRecord] = []
@@ -296,8 +301,8 @@ def by_method(datasets: Sequence[Dataset], methods: Sequence[Method],
         outcomes = [Outcome(record.sequence, record.status, record.rotation_error_deg,
                             record.translation_error_deg, record.failed) for record in own]
         found.append({'method': method.name, 'preset': method.preset, 'change': method.change,
-                      **summed(outcomes),
-                      'hamming': spread([record.hamming_mean for record in own])['mean'],
+                      **summarised(outcomes),
+                      'hamming': statistics([record.hamming_mean for record in own])['mean'],
                       'ms': rounded(np.median([record.milliseconds for record in own])),
                       **drifts(datasets, own), **(ratios(own, base) if compared else {})})
     return found
@@ -305,7 +310,7 @@ def by_method(datasets: Sequence[Dataset], methods: Sequence[Method],
 
 def against(records: Sequence[PairRecord], other: str, preset: str) -> dict[str, Any]:
     """
-    Hold D-JET against another method on the pairs that both told: who gives up a pair gains none.
+    Compare D-JET with another method on the pairs that both estimated.
 
     Figures are [D-JET's, the other's].
     """
@@ -313,24 +318,24 @@ def against(records: Sequence[PairRecord], other: str, preset: str) -> dict[str,
                     for method in ('djet', other))
     found: dict[str, Any] = {'other': other, 'preset': preset}
     for what, errors in common_errors(ours, theirs).items():
-        both = [spread(column) for column in errors.T]
+        both = [statistics(column) for column in errors.T]
         found[what] = {kind: [one[kind] for one in both] for kind in ('mean', 'median')}
         found[what]['told'] = both[0]['told']
     return found
 
 
-def closed(datasets: Sequence[Dataset]) -> dict[str, Any]:
-    """Sum up the triangles of the first frames of all sequences by method."""
+def closure_figures(datasets: Sequence[Dataset]) -> dict[str, Any]:
+    """Summarise the rotation closure of the first frames of all sequences by method."""
     triangles: dict[str, list[Triangle | None]] = {method: [] for method in CLOSED}
     for dataset in datasets:
         frames = min(dataset.pairs + 1, CLOSURE_FRAMES)
         for method, some in closures(opened(dataset), CLOSED, frames).items():
             triangles[method] += some
-    return {method: known_figures(summary(some)) for method, some in triangles.items()}
+    return {method: rounded_figures(summary(some)) for method, some in triangles.items()}
 
 
 def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[str, Any]:
-    """Give the mean drift of the ways that pairs of one method make, if one is long enough."""
+    """Return the mean drift of the chained pairs of one method, if a path is long enough."""
     found = []
     for dataset in datasets:
         own = [record for record in records if record.sequence == dataset.name]
@@ -348,18 +353,18 @@ def drifts(datasets: Iterable[Dataset], records: Sequence[PairRecord]) -> dict[s
 
 
 def odometry(datasets: Iterable[Dataset]) -> dict[str, Any]:
-    """Sum up frames in their order, each pair with the motion before it as a start."""
-    outcomes = [outcome for dataset in datasets for outcome in tracked(dataset)]
+    """Summarise the odometry: frames in sequence, with the previous motion as initial pose."""
+    outcomes = [outcome for dataset in datasets for outcome in odometry_outcomes(dataset)]
     surprises = np.array([outcome.surprise for outcome in outcomes])
     surprises = surprises[np.isfinite(surprises)]
-    return {**summed(outcomes), 'surprise': {
-        'pairs': len(surprises), 'beyond': int((surprises > SURPRISING).sum()),
+    return {**summarised(outcomes), 'surprise': {
+        'pairs': len(surprises), 'beyond': int((surprises > BOUND_999).sum()),
         **{name: rounded(value(surprises)) if len(surprises) else None
            for name, value in (('mean', np.mean), ('median', np.median))}}}
 
 
-def tracked(dataset: Dataset) -> Iterator[Outcome]:
-    """Give the outcome of each pair that the odometry makes of a sequence."""
+def odometry_outcomes(dataset: Dataset) -> Iterator[Outcome]:
+    """Yield the outcome of each pair of the odometry on a sequence."""
     sequence, tracker = opened(dataset), VisualOdometry(preset('best'))
     assert sequence.poses is not None  # datasets without poses are refused
     stamps = sequence.stamps_ns
@@ -380,7 +385,7 @@ def tracked(dataset: Dataset) -> Iterator[Outcome]:
 
 
 def drive(folder: Path) -> dict[str, Any]:
-    """Measure all of a drive: its pairs in a chain, method by method, and as it is replayed."""
+    """Measure a whole drive: chained pairs by method, and replays."""
     started = perf_counter()
     with TemporaryDirectory() as name:
         datasets = open_datasets([folder], Selection(), Path(name))
@@ -393,12 +398,12 @@ def drive(folder: Path) -> dict[str, Any]:
 
 
 def lens(folder: Path) -> dict[str, Any]:
-    """Replay a drive without the distortion that it tells itself, if it is worth correcting."""
+    """Replay a drive with its estimated distortion corrected, if that is worthwhile."""
     with closing(open_recording(folder)) as recording:
         try:
             report = examine(recording, Config(), lambda: None)
         except DjetError:
-            # Straight ahead tells nothing.
+            # Too few informative pairs, as on straight roads.
             return {}
     if not report.worth_correcting:
         return {}
@@ -412,7 +417,7 @@ def lens(folder: Path) -> dict[str, Any]:
 
 
 def replayed(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Replay a sequence with some parameters; gives what its summary tells of the whole way."""
+    """Replay a sequence with some parameters; returns drift and position errors."""
     config = from_flat(values)
     with TemporaryDirectory() as name, closing(open_recording(folder)) as recording, \
             ResultsFolder(Path(name) / 'results', config) as results:
@@ -422,14 +427,14 @@ def replayed(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def length(folder: Path) -> float:
-    """Metres of a KITTI sequence's true way; 0 where that is not known."""
+    """Return the length of a KITTI sequence's true path in metres; 0 if unknown."""
     poses = KittiSequence(folder).poses
     return 0.0 if poses is None else float(
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
 def ablation(seeds: tuple[int, ...]) -> dict[str, Any]:
-    """Measure variants of D-JET on rendered scenes, whose truth is exact enough to tell them."""
+    """Measure variants of D-JET on rendered scenes, whose ground truth is exact."""
     started = perf_counter()
     with TemporaryDirectory() as name:
         datasets = [dataset for scene in ABLATED for dataset in opened_for(
@@ -442,7 +447,7 @@ def ablation(seeds: tuple[int, ...]) -> dict[str, Any]:
 
 
 def speed(data: Path | None) -> dict[str, Any]:
-    """Measure the time of a pair against OpenCV's plain chain."""
+    """Measure the time per pair relative to OpenCV's pipeline."""
     started = perf_counter()
     with TemporaryDirectory() as name:
         real = kitti(data)
@@ -452,35 +457,35 @@ def speed(data: Path | None) -> dict[str, Any]:
 
 
 def kitti(data: Path | None) -> list[Path]:
-    """Folders of KITTI's sequences."""
+    """Return the folders of KITTI's sequences."""
     return [folder for folder in real_sequences(data) if title(folder).startswith('kitti')]
 
 
-# How it is summed up
+# Summaries
 
 
-def summed(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def summarised(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """
-    Sum up the outcomes of pairs.
+    Summarise the outcomes of pairs.
 
-    sure: how many of the failed ones called themselves OK; by_seed: mean errors and failures of
-    each sequence.
+    sure: how many of the failed pairs have status OK; by_seed: mean errors and failures of each
+    sequence.
     """
     sequences: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         sequences.setdefault(outcome.sequence, []).append(outcome)
     return {'pairs': len(outcomes), 'failed': sum(one.failed for one in outcomes),
             'sure': sum(one.failed and one.status == Status.OK.value for one in outcomes),
-            'rotation': spread([one.rotation for one in outcomes]),
-            'direction': spread([one.direction for one in outcomes]),
-            'by_seed': [{'rotation': spread([one.rotation for one in some])['mean'],
-                         'direction': spread([one.direction for one in some])['mean'],
+            'rotation': statistics([one.rotation for one in outcomes]),
+            'direction': statistics([one.direction for one in outcomes]),
+            'by_seed': [{'rotation': statistics([one.rotation for one in some])['mean'],
+                         'direction': statistics([one.direction for one in some])['mean'],
                          'failed': sum(one.failed for one in some)}
                         for some in sequences.values()]}
 
 
-def spread(values: Iterable[float]) -> dict[str, Any]:
-    """Mean, median, 95th percentile and maximum of the values that are known: so many are told."""
+def statistics(values: Iterable[float]) -> dict[str, Any]:
+    """Return mean, median, 95th percentile, maximum and number (told) of the finite values."""
     known = np.array([value for value in values if np.isfinite(value)])
     if not len(known):
         return {'told': 0, **dict.fromkeys(('mean', 'median', 'p95', 'max'))}
@@ -488,12 +493,12 @@ def spread(values: Iterable[float]) -> dict[str, Any]:
             'p95': rounded(np.percentile(known, 95)), 'max': rounded(known.max())}
 
 
-def known_figures(figures: dict[str, Any]) -> dict[str, float | None]:
+def rounded_figures(figures: dict[str, Any]) -> dict[str, float | None]:
     return {name: rounded(value) for name, value in figures.items()}
 
 
 def rounded(value: Any) -> float | None:
-    """Four digits that mean something; None for what is not known."""
+    """Round to four significant digits; None if not finite."""
     return float(f'{value:.4g}') if np.isfinite(value) else None
 
 

@@ -258,7 +258,8 @@ def compared_row(name: str, part: Any, other: str, preset: str) -> tuple[str, ..
     both = next((one for one in part.get('against', ())
                  if (one['other'], one['preset']) == (other, preset)), None)
     figures = ['–'] * 5 if both is None else [
-        estimated(both), *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
+        estimated(both),
+        *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
     return (name, preset, *figures,
             failures(find(part, 'djet', preset), find(part, other, preset)))
 
@@ -369,8 +370,8 @@ def drift(results: Any) -> str:
     return (paragraph(f'{whole}. Independent pairs chained, with the translation lengths of the '
                       'ground truth:')
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
-            + paragraph('`djet replay`, with its own translation lengths. ATE after alignment; the '
-                        'scale is aligned too, unless it is metric:')
+            + paragraph('`djet replay`, with its own translation lengths. ATE after alignment, with '
+                        'scale unless it is metric:')
             + table(('', *OF_REPLAY), replays))
 
 
@@ -462,7 +463,7 @@ def verdict(part: Any) -> str:
     for one in changed:
         said.setdefault(judged(one['ratio']), []).append(one['change'])
     return 'By the means: ' + ' '.join(f'{word}: {"; ".join(said[word])}.'
-                                   for word in JUDGED if word in said)
+                                       for word in JUDGED if word in said)
 
 
 JUDGED = (
@@ -500,7 +501,8 @@ def speed(results: Any) -> str:
     if part is None:
         return 'Not measured yet.\n'
     both = (part, part['all_cores'])
-    rows = [("time relative to OpenCV's pipeline", *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
+    rows = [("time relative to OpenCV's pipeline",
+             *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
             ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in both)),
             ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in both)),
             ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in both)),

@@ -1,10 +1,10 @@
 """
-Measures figures of doc/recorded.yaml: what takes minutes, a pose graph or processes of its own.
+Measures doc/recorded.yaml: figures that take minutes, a pose graph or separate processes.
 
-Real frames are those of $DJET_DATA. What a node does is told by processes on a ROS graph: one
-plays a recording, one is the node, and this one listens; it needs djet_ros[dds,slam]. The node may
-be any command, such as one that brings its own ROS along. A table that can't be measured is said
-in a line and left as it was; the exit status is 1 then.
+Real frames are those of $DJET_DATA. Nodes are measured by processes on a ROS graph: one plays a
+recording, one is the node, and this one subscribes; needs djet_ros[dds,slam]. The node may be any
+command, for instance one that sources ROS first. A table that can't be measured is reported in one
+line and left as it was; the exit status is 1 then.
 
     python doc/record.py links outvoted soak loops dds coverage
     python doc/record.py 'camera height' 'short ways' 'live loops'
@@ -57,48 +57,48 @@ import yaml
 
 OUTPUT = Path(__file__).with_name('recorded.yaml')
 HEAD = """\
-# Figures that `make results` does not measure, because they need a ROS graph, a pose graph or hours.
-# Each table has the version of the package and the method of measurement; see doc/record.py.
+# Figures that `make results` does not measure: they need a ROS graph, a pose graph or hours. Each
+# table has the version of the package and the method of measurement; see doc/record.py.
 
 """
 DJET = (sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())')
 POSE_GRAPH = (sys.executable, '-c', f'import sys; sys.path.insert(0, {str(OUTPUT.parent)!r}); '
               'from record import run_pose_graph; raise SystemExit(run_pose_graph())')
 
-# Not the graph of a robot that happens to be near.
+# A domain of its own, on this machine only.
 GRAPH = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'OMP_NUM_THREADS': '1',
          'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 
-# Seconds after which what does not go on, or does not end, is given up.
+# Seconds without progress after which a measurement is given up.
 PATIENCE = 60.0
 
-# As which djet play publishes what a KITTI folder holds.
+# Topic on which djet play publishes the images of a KITTI folder.
 IMAGE = '/camera/image_rect'
 
 HEIGHT = 1.65
 LINKS = (1, 2, 3)
 WRONG, PLACES = (360.0, 2000.0), 8
-# Frames of each scene and seed whose poses are held against their covariances.
+# Frames of each scene and seed in the table of coverage.
 COVERED = 12
-# Pixels to which a real camera is taken to be calibrated, beside exactly: the standard deviation
-# where it is not known whether pixel centres are at whole numbers or at halves.
+# Second value of estimator.calibration_sigma for real cameras, in pixels: the standard deviation
+# if it is unknown whether pixel centres are at integers or at halves.
 CALIBRATED = '0.25'
-# The path of the node is full before the first of them.
+# Numbers of images at which memory is read; the node's path is full before the first.
 MARKS = (6_000, 10_000)
 
-# Of the live loops: size of the images, and how many come a second.
+# Live loops: size of the images, and images per second.
 LIVE = (('1241x376', 5), ('620x188', 10))
 ODOMETRY, PATH, TF = '/vo_node/odometry', '/pose_graph_node/path', '/tf'
 LIVE_TYPES = {ODOMETRY: 'nav_msgs/msg/Odometry', PATH: 'nav_msgs/msg/Path',
               TF: 'tf2_msgs/msg/TFMessage'}
 
-# Seconds after which a pose graph has settled, and what it says anew although nothing came of it.
+# Seconds without a change after which a pose graph has settled; diagnostics that always change.
 SETTLED = 5.0
 LATENCIES = {'latency, median (ms)': '', 'latency, 95 % (ms)': ''}
 
 
 class Unmeasured(Exception):
-    """Why a table can't be measured, in one line."""
+    """Reason why a table can't be measured, in one line."""
 
 
 def main() -> int:
@@ -136,7 +136,7 @@ def arguments() -> argparse.Namespace:
 
 
 def djet(*words: Any) -> None:
-    """Run a djet command to its end; Unmeasured by the last line that it said."""
+    """Run a djet command; raises Unmeasured with the last line of its stderr if it fails."""
     done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True)
     if done.returncode:
         raise Unmeasured(f'djet {" ".join(map(str, words))}: {last_line(done.stderr)}')
@@ -147,7 +147,7 @@ def last_line(said: str) -> str:
 
 
 def kitti(args: argparse.Namespace, *names: str) -> dict[str, Path]:
-    """Folders of KITTI's sequences, by what tables call them."""
+    """Return the folders of KITTI's sequences by their names in tables."""
     found = {}
     for name in names:
         folder = args.data / 'kitti' / 'sequences' / name
@@ -160,7 +160,7 @@ def kitti(args: argparse.Namespace, *names: str) -> dict[str, Path]:
 
 
 def links(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Link each keyframe to more of those before it, on real frames."""
+    """Measure pose graphs with more links between keyframes, on real frames."""
     sources = kitti(args, '00', '03', '06')
     rows = []
     for number in LINKS:
@@ -176,7 +176,7 @@ def links(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Drive round a block twice, in several sizes of images."""
+    """Measure loop closure on a block driven twice, in several image sizes."""
     images = (('1241x376', 0), ('1241x376', 1), ('620x188', 0), ('620x188', 1), ('416x128', 0))
     runs: list[tuple[str, int, tuple[Any, ...]]] = [
         *((*one, ()) for one in images),
@@ -203,7 +203,7 @@ def loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def outvoted(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Put one odometry edge wrong, which no robust kernel covers, and optimise."""
+    """Perturb one odometry edge, which has no robust kernel, and optimise."""
     source, results = block(place, '620x188', 0), place / 'slam' / 'replay'
     slam(place, source, *exact_lengths(0.01))
     recording = open_recording(source)
@@ -224,7 +224,7 @@ def outvoted(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     chosen = [chain[i] for i in np.linspace(0, len(chain) - 1, PLACES + 2).astype(int)[1:-1]]
     random, rows = np.random.default_rng(0), []
     for square in WRONG:
-        after = [error((*graph.edges[:number], put_wrong(graph.edges[number], square, random),
+        after = [error((*graph.edges[:number], perturbed(graph.edges[number], square, random),
                         *graph.edges[number + 1:])) for number in chosen]
         rows.append([f'{square:.0f}', f'{min(after):.3f} to {max(after):.3f} m'])
     return {'how': f'One of {len(chain)} odometry edges of the loop (620×188, seed 0; ground '
@@ -234,8 +234,8 @@ def outvoted(place: Path, args: argparse.Namespace) -> dict[str, Any]:
             'header': ['χ² of the wrong edge', 'APE after'], 'rows': rows}
 
 
-def put_wrong(edge: Edge, square: float, random: np.random.Generator) -> Edge:
-    """Put an edge off by a squared Mahalanobis distance, in a direction drawn at random."""
+def perturbed(edge: Edge, square: float, random: np.random.Generator) -> Edge:
+    """Perturb an edge by a squared Mahalanobis distance, in a random direction."""
     direction = random.normal(size=6)
     direction *= np.sqrt(square / (direction @ direction))
     off = np.linalg.cholesky(edge.covariance_in_target()) @ direction
@@ -249,7 +249,7 @@ def exact_lengths(share: float) -> tuple[str | float, ...]:
 
 
 def block(place: Path, size: str, seed: int) -> Path:
-    """Render the drive round a block, once."""
+    """Render the drive around a block, once."""
     folder = place / f'{size}-{seed}'
     if not folder.exists():
         djet('lab', 'render', 'loop', folder, '--frames', 427, '--seed', seed, '--size', size)
@@ -257,7 +257,7 @@ def block(place: Path, size: str, seed: int) -> Path:
 
 
 def slam(place: Path, source: Path, *words: Any) -> dict[str, Any]:
-    """Give the summary of ``djet slam``."""
+    """Run ``djet slam``; returns its summary."""
     djet('slam', source, '--output', place / 'slam', '--overwrite', *words)
     summary: dict[str, Any] = json.loads((place / 'slam' / 'slam.json').read_text('utf-8'))
     return summary
@@ -267,7 +267,7 @@ def slam(place: Path, source: Path, *words: Any) -> dict[str, Any]:
 
 
 def soak(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Run many frames through the odometry."""
+    """Measure memory over many frames of the odometry."""
     djet('lab', 'soak', '--output', place / 'soak.json')
     found = json.loads((place / 'soak.json').read_text('utf-8'))
     statuses, stretches = found['status'], found['stretches']
@@ -282,7 +282,7 @@ def soak(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def camera_height(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Hold lengths by the camera's height against the truth."""
+    """Compare lengths from the camera's height with ground truth."""
     rows = []
     for name, folder in kitti(args, '00', '03', '06').items():
         found = lengths(folder, None)
@@ -299,7 +299,7 @@ def camera_height(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Replay ways that are too short for a drift, by images alone."""
+    """Replay paths that are too short for KITTI's drift, by images alone."""
     sources = kitti(args, '06')
     for name, folder in kitti(args, '00').items():
         bag = place / 'later'
@@ -314,14 +314,14 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
     for name, source in sources.items():
         djet('replay', source, '--output', place / 'replay', '--overwrite')
         found = json.loads((place / 'replay' / 'summary.json').read_text('utf-8'))['positions']
-        rows.append([name, f"{found['way_m']:.3g} m", known(found['scale_change'], '.3f'),
+        rows.append([name, f"{found['way_m']:.3g} m", formatted(found['scale_change'], '.3f'),
                      f"{1e3 * found['rmse_m']:.3g} mm"])
     return {'how': '`djet replay SEQUENCE`, images alone.',
             'header': ['', 'path length', 'scale, end over start', 'ATE rmse'], 'rows': rows}
 
 
 def lengths(folder: Path, frames: int | None) -> Array:
-    """Length, true length and standard deviation (N, 3) of each step whose length is known."""
+    """Return length, true length and standard deviation (N, 3) of the steps of known length."""
     dataset, = open_datasets([folder], Selection(end=frames), folder.parent)
     sequence, rows = opened(dataset), []
     assert sequence.poses is not None
@@ -354,12 +354,12 @@ def row_of(name: str, found: Array) -> list[str]:
 
 
 def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Tell how many poses lie within their own ellipsoids."""
+    """Measure the share of poses inside their own ellipsoids."""
     djet('lab', 'coverage', '--scenes', 'all', '--seeds', '0-9', '--frames', COVERED, '--output',
          place / 'rendered')
     rows = covered(place / 'rendered')
     for real in args.data.glob('tartanair/sequences/*'):
-        for sigma, told in (('0', ''), (CALIBRATED, f', calibration σ {CALIBRATED} px')):
+        for sigma, told in (('0', ''), (CALIBRATED, f', calibration sigma {CALIBRATED} px')):
             djet('lab', 'coverage', real, '--calibration-sigma', sigma, '--output',
                  place / f'{real.name}-{sigma}')
             rows += covered(place / f'{real.name}-{sigma}', f'TartanAir {real.name}{told}')
@@ -372,7 +372,7 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def covered(folder: Path, name: str = '') -> list[list[str]]:
-    """Rows of a run of coverage, both of a scene's in one; without those that tell no pose."""
+    """Return the rows of a run of coverage, one per scene; scenes without poses are left out."""
     found = json.loads((folder / 'coverage.json').read_text('utf-8'))
     at = [found['levels'].index(level) for level in (0.95, 0.999)]
     by_scene: dict[str, list[dict[str, Any]]] = {}
@@ -383,13 +383,14 @@ def covered(folder: Path, name: str = '') -> list[list[str]]:
         within, beyond = row['inside'][at[0]][0], 1 - row['inside'][at[1]][0]
         return [str(row['pairs']), str(row['told']), str(row['wrong_and_sure']),
                 str(row.get('untold', '–')), f"{row['given_up']} ({row['needlessly']})",
-                known(row['median'], '.2f'), known(within, '.1%'), known(beyond, '.1%')]
+                formatted(row['median'], '.2f'), formatted(within, '.1%'),
+                formatted(beyond, '.1%')]
 
     return [[scene, *map(' / '.join, zip(*map(cells, rows)))] for scene, rows in by_scene.items()
             if any(row['told'] or row.get('untold') for row in rows)]
 
 
-def known(value: float | None, form: str) -> str:
+def formatted(value: float | None, form: str) -> str:
     return f'{value:{form}}' if value is not None and np.isfinite(value) else '–'
 
 
@@ -397,7 +398,7 @@ def known(value: float | None, form: str) -> str:
 
 
 def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Measure a node of ROS."""
+    """Measure the ROS node."""
     with Graph(GRAPH) as graph:
         rows = at_pace(args, args.node, graph) + many_frames(place, args.node, graph)
     return {'how': 'ROS 2 Jazzy, Cyclone DDS on loopback, 2 cores; `djet play`, `vo_node` and a '
@@ -405,7 +406,7 @@ def node(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def dds(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Measure the node that needs no ROS."""
+    """Measure ``djet live``."""
     command = 'exec ' + shlex.join([*DJET, 'live'])
     with Graph(GRAPH) as graph:
         rows = at_pace(args, command, graph)
@@ -414,12 +415,12 @@ def dds(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def at_pace(args: argparse.Namespace, command: str, graph: Graph) -> list[list[str]]:
-    """Play KITTI 06 at its own pace."""
+    """Measure KITTI 06 at its recorded rate."""
     source = args.data / 'kitti' / 'sequences' / '06'
     sent = len([*source.glob('image_0/*')])
     with started(command, 'latest', graph) as node, playing(source):
         node.wait_for(sent, 'processed', 'dropped', 'lost on the way')
-        said, spent = node.said, node.cpu_ms_an_image()
+        said, spent = node.said, node.cpu_ms_per_image()
         memory, took = node.memory_mb(), node.end()
     return [
         ['KITTI 06 (1226×370) at its 10 Hz, `queue_policy: latest`',
@@ -433,7 +434,7 @@ def at_pace(args: argparse.Namespace, command: str, graph: Graph) -> list[list[s
 
 
 def many_frames(place: Path, command: str, graph: Graph) -> list[list[str]]:
-    """Play small images without end, hardly faster than they can be worked on."""
+    """Measure memory over many small images, at a rate that can just be processed."""
     source = render_sequence('road', place, 200, size=(320, 240))
     memory = []
     with started(command, 'latest', graph) as node, playing(source, '--loop', '--rate', 4):
@@ -446,7 +447,7 @@ def many_frames(place: Path, command: str, graph: Graph) -> list[list[str]]:
 
 
 def live_loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Drive round a block twice before an odometry and a pose graph that work meanwhile."""
+    """Measure live odometry and pose graph on a block driven twice."""
     rows, kept = [], []
     with Graph(GRAPH) as graph:
         heard: dict[str, list[Any]] = {topic: [] for topic in LIVE_TYPES}
@@ -470,7 +471,7 @@ def live_loops(place: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def mapped_live(source: Path, rate: float, graph: Graph, heard: dict[str, list[Any]]
                 ) -> tuple[dict[str, str], float]:
-    """Play to both nodes and hear them; gives what the pose graph says at last, and its MB."""
+    """Play to both nodes; returns the last diagnostics of the pose graph, and its memory in MB."""
     sent = len([*source.glob('image_0/*')])
     for messages in heard.values():
         messages.clear()
@@ -479,7 +480,7 @@ def mapped_live(source: Path, rate: float, graph: Graph, heard: dict[str, list[A
     with running(f'exec {slam}', graph, 'pose_graph_node: pose graph') as mapping, \
             running(f'exec {odometry}', graph) as node:
         for one in (mapping, node):
-            one.wait_for_word()
+            one.wait_for_diagnostics()
         with playing(source, '--rate', rate / 10):
             node.wait_for(sent, 'processed', 'dropped', 'lost on the way')
         mapping.wait_until_settled()
@@ -488,7 +489,7 @@ def mapped_live(source: Path, rate: float, graph: Graph, heard: dict[str, list[A
 
 def live_row(source: Path, heard: dict[str, list[Any]], said: dict[str, str]
              ) -> tuple[list[str], str]:
-    """Hold what was published against the truth; gives columns, and how many frames had all."""
+    """Compare published poses with ground truth; returns columns and the share of whole frames."""
     with open_recording(source) as recording:
         truth = GroundTruth.of(recording)
     told = dict(pose_of(message) for message in heard[ODOMETRY])
@@ -508,7 +509,7 @@ def live_row(source: Path, heard: dict[str, list[Any]], said: dict[str, str]
 
 
 def run_pose_graph() -> int:
-    """Be the pose graph on the graph of the environment; words are remappings."""
+    """Run the pose graph on Cyclone DDS; arguments are remappings."""
     stop = stop_by_signal()
     names = Names('pose_graph_node', [word for word in sys.argv[1:] if word != '-r'])
     with Graph() as graph:
@@ -517,7 +518,7 @@ def run_pose_graph() -> int:
 
 
 class Node:
-    """A node in processes of its own, and what its diagnostics say by their name."""
+    """A node in separate processes, and the values of its diagnostics by key."""
 
     def __init__(self, command: str, graph: Graph, name: str, log: IO[str]) -> None:
         self._process = subprocess.Popen(
@@ -538,19 +539,19 @@ class Node:
             self._spent.append((processed, self._cpu_ms()))
 
     def wait_for(self, images: int, *fates: str) -> None:
-        """Wait until so many met one of the fates; not for ever on images that are lost."""
+        """Wait until so many images met one of the fates; Unmeasured if they stop coming."""
         def met() -> int:
             return sum(int(self.said.get(f'frames {fate}', 0)) for fate in fates)
 
         self._wait_while(lambda: met() < images, met,
                          lambda: f'{met()} of {images} images came to anything')
 
-    def wait_for_word(self) -> None:
-        """Wait until it says how it does."""
+    def wait_for_diagnostics(self) -> None:
+        """Wait for its first diagnostics."""
         self._wait_while(lambda: not self.said, lambda: 0, lambda: 'no diagnostics came')
 
     def wait_until_settled(self) -> None:
-        """Wait until a pose graph has sought all loops, and says the same for some seconds."""
+        """Wait until a pose graph has searched all loops, and is unchanged for SETTLED."""
         since, before = monotonic(), {**self.said, **LATENCIES}
 
         def unsettled() -> bool:
@@ -564,7 +565,7 @@ class Node:
 
     def _wait_while(self, condition: Callable[[], bool], progress: Callable[[], Any],
                     lacking: Callable[[], str]) -> None:
-        """Wait while a condition holds; Unmeasured if for PATIENCE nothing changes meanwhile."""
+        """Wait while a condition holds; raises Unmeasured after PATIENCE without progress."""
         before, since = progress(), monotonic()
         while condition():
             self._graph.spin(0.2)
@@ -578,19 +579,19 @@ class Node:
                 raise Unmeasured(f'{lacking()}, and nothing more for {PATIENCE:.0f} s; are '
                                  'messages lost on the way?')
 
-    def cpu_ms_an_image(self) -> float:
-        """Slope of CPU time over images, from the first diagnostics after some were done."""
+    def cpu_ms_per_image(self) -> float:
+        """Return the CPU time per image, from the first diagnostics with processed images on."""
         (first, before), *_, (last, after) = self._spent
         return (after - before) / (last - first)
 
     def memory_mb(self) -> float:
-        """Resident memory of the largest of its processes."""
+        """Return the resident memory of the largest of its processes."""
         pages = max(int((process / 'statm').read_text('utf-8').split()[1])
                     for process in self._processes())
         return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
     def end(self) -> float:
-        """Interrupt it; gives the seconds until it has ended."""
+        """Interrupt it; returns the seconds until it has ended."""
         began = monotonic()
         os.killpg(self._process.pid, signal.SIGINT)
         try:
@@ -614,19 +615,19 @@ class Node:
 
     def _processes(self) -> Iterator[Path]:
         for process in Path('/proc').glob('[0-9]*'):
-            with suppress(ProcessLookupError):  # one that has ended meanwhile
+            with suppress(ProcessLookupError):  # the process has ended
                 if os.getpgid(int(process.name)) == self._process.pid:
                     yield process
 
 
 def started(command: str, policy: str, graph: Graph) -> AbstractContextManager[Node]:
-    """Start an odometry with a queue policy, and listen to it; end it."""
+    """Run an odometry with a queue policy as a context."""
     return running(f'{command} -r image:={IMAGE} -p ros.queue_policy:={policy}', graph)
 
 
 @contextmanager
 def running(command: str, graph: Graph, name: str = 'vo_node: visual odometry') -> Iterator[Node]:
-    """Start a node, and listen to its diagnostics, which have this name; end it."""
+    """Run a node as a context; name: of its diagnostics."""
     with TemporaryFile('w+') as log:
         node = Node(command, graph, name, log)
         try:
@@ -637,7 +638,7 @@ def running(command: str, graph: Graph, name: str = 'vo_node: visual odometry') 
 
 @contextmanager
 def playing(source: Path, *words: Any) -> Iterator[None]:
-    """Play a recording while it lasts."""
+    """Play a recording as a context."""
     process = subprocess.Popen([*DJET, 'play', str(source), *map(str, words)], env=GRAPH,
                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

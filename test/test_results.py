@@ -95,16 +95,17 @@ def test_what_was_measured_is_taken_over_and_not_mixed_with_other_settings(outpu
 def test_one_part_is_added_to_all_that_is_measured_and_all_anew_begins_empty(tmp_path):
     module, path = script('measure'), tmp_path / 'results.json'
     settings = {'frames': 7, 'seeds': [0], 'real_frames': None, 'code': 'abc'}
-    whole = {**module.begun(path, settings), 'complete': True, 'parts': {'road': {}, 'loop': {}}}
+    whole = {**module.previous_results(path, settings), 'complete': True,
+             'parts': {'road': {}, 'loop': {}}}
     path.write_text(json.dumps(whole))
-    assert module.begun(path, settings, keep=True) == whole
-    assert module.begun(path, settings)['parts'] == {}
+    assert module.previous_results(path, settings, keep=True) == whole
+    assert module.previous_results(path, settings)['parts'] == {}
     with pytest.raises(DjetError, match=r'other settings \(code\)') as said:
-        module.begun(path, {**settings, 'code': 'of yesterday'}, keep=True)
+        module.previous_results(path, {**settings, 'code': 'of yesterday'}, keep=True)
     assert '\n' not in str(said.value)
     path.write_text(json.dumps({**whole, 'complete': False}))
-    assert list(module.begun(path, settings)['parts']) == ['road', 'loop']
-    assert module.begun(path, {**settings, 'frames': 8})['parts'] == {}
+    assert list(module.previous_results(path, settings)['parts']) == ['road', 'loop']
+    assert module.previous_results(path, {**settings, 'frames': 8})['parts'] == {}
 
 
 def test_errors_in_common_are_of_pairs_that_both_told_in_the_order_of_the_first():
@@ -171,7 +172,7 @@ def test_few_triangles_have_no_95_percent():
 def test_triangles_are_of_all_seeds(tmp_path):
     datasets = open_datasets([render_sequence('road', tmp_path / str(seed), 3, seed, (480, 160))
                               for seed in (0, 1)], Selection(), tmp_path)
-    for one in script('measure').closed(datasets).values():
+    for one in script('measure').closure_figures(datasets).values():
         assert one['triangles'] + one['without'] == 2
 
 
@@ -212,7 +213,7 @@ def test_the_page_holds_the_distortion_that_was_found_against_others():
     rows = [line for line in script('pages').lens(results).splitlines() if figures in line]
     assert rows == [f'| {k1} | {off} | {figures}' for k1, off in (
         ('0.0000', '2.50'), ('0.0100', '1.50'), ('0.0200', '0.50'), ('0.0250', '0.75'))]
-    assert f'| KITTI 07, images alone, lens undone | 0.50 | {figures}' in script(
+    assert f'| KITTI 07, images alone, distortion corrected | 0.50 | {figures}' in script(
         'pages').drift(results)
 
 
