@@ -370,8 +370,8 @@ def drift(results: Any) -> str:
     return (paragraph(f'{whole}. Independent pairs chained, with the translation lengths of the '
                       'ground truth:')
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
-            + paragraph('`djet replay`, with its own translation lengths. ATE after alignment, with '
-                        'scale unless it is metric:')
+            + paragraph('`djet replay`, with its own translation lengths. ATE after alignment, '
+                        'with scale unless it is metric:')
             + table(('', *OF_REPLAY), replays))
 
 

@@ -1,4 +1,4 @@
-"""What doc/extending.md shows works: a method and a scene of one's own take part."""
+"""The examples of doc/extending.md work: the new method and scene take part."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAGE = Path(__file__).parents[1] / 'doc' / 'extending.md'
 
 @pytest.fixture
 def extended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the examples of the page on dictionaries that are thrown away."""
+    """Run the examples of the page, and restore the dictionaries afterwards."""
     for table in (peers.ESTIMATORS, methods.PEERS, methods.TITLES, SCENES):
         for name in ('least_median', 'dusk'):
             monkeypatch.setitem(table, name, None)
@@ -32,7 +32,7 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures('extended')
-def test_a_method_and_a_scene_of_ones_own_are_measured_listed_and_drawn(tmp_path: Path) -> None:
+def test_the_new_method_and_scene_are_measured_listed_and_drawn(tmp_path: Path) -> None:
     folder = render_sequence('dusk', tmp_path, 3, size=(480, 270))
     dataset, = open_datasets([folder], Selection(), tmp_path)
     records = evaluate_chunk(PairChunk(dataset, 0, 2),

@@ -1,4 +1,4 @@
-"""The figures of ``djet lab``: what they show, and that they can be drawn."""
+"""The figures of ``djet lab``: their content, and that they can be drawn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
 
-# The library that matplotlib saves pictures with.
+# Used by matplotlib to save images.
 PIL = pytest.importorskip('PIL.Image')
 
 CONFIG = EstimatorConfig()
@@ -27,24 +27,24 @@ CONFIG = EstimatorConfig()
 
 @pytest.fixture(scope='module')
 def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give three rendered frames of a street."""
+    """Return three rendered frames of a street."""
     return render_sequence('road', tmp_path_factory.mktemp('road'), 3, size=(480, 160))
 
 
 @pytest.fixture(scope='module')
 def gray() -> np.ndarray:
-    """Give an image with structure of several sizes."""
+    """Return an image with structure of several sizes."""
     noise = np.random.default_rng(3).integers(0, 256, (200, 300)).astype(np.float32)
     image = sum(cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1, 2, 4))
     return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def lab(words: list[str]) -> int:
-    """Run a verb of djet lab in this process."""
+    """Run a subcommand of djet lab in this process."""
     return main(['lab', *words])
 
 
-def test_a_point_is_most_like_itself(gray):
+def test_a_point_is_most_similar_to_itself(gray):
     points = np.array([[100.0, 80.0], [150.4, 99.6]])
     found = self_similarity(gray, points, 6, 12, CONFIG)
     assert found.x.tolist() == found.y.tolist() == [[100, 80], [150, 100]]
@@ -57,10 +57,10 @@ def test_points_are_found_again_in_a_shifted_image(gray):
     shifted = np.roll(gray, (2, 5), axis=(0, 1))
     found = cross_similarity(gray, shifted, None, 40, 12, CONFIG)
     assert len(found.x) == 40
-    # Keypoints of coarse sizes are a pixel off in either image; surfaces tell by how much.
+    # Keypoints of coarse levels are a pixel off in either image; the surfaces show by how much.
     missing = np.array([5, 2]) - (found.y - found.x)
     right = np.abs(missing).max(1) <= 2
-    assert right.mean() > 0.85  # no matching of noise is free of false ones
+    assert right.mean() > 0.85  # some false matches are unavoidable in noise
     for index in np.flatnonzero(right):
         x, y = missing[index]
         assert found.surfaces[12 + y, 12 + x, index] == 0
@@ -83,12 +83,12 @@ def test_rounds_end_where_the_estimator_ends(road):
         assert len(trace.rounds) == result.iterations
         assert np.array_equal(trace.rounds[-1].optimum, result.y_opt)
         assert np.array_equal(trace.result.inliers, result.inliers)
-        # The chosen match has moved, but stays in what is shown.
+        # The chosen match has moved, but stays within the figure.
         match = telling_match(trace)
         assert 0 < np.linalg.norm(trace.rounds[-1].optimum[match] - trace.y[match]) < RADIUS
 
 
-def test_figures_are_drawn_in_the_size_of_what_they_show(road, tmp_path, capsys):
+def test_the_size_of_a_figure_follows_its_content(road, tmp_path, capsys):
     images = [str(road / 'image_0' / f'{i:06d}.png') for i in (0, 1)]
     few, many, both = (tmp_path / 'new' / f'{name}.png' for name in ('few', 'many', 'both'))
     assert lab(['similarity', images[0], '--points', '200,80', '--output', str(few)]) == 0
@@ -110,7 +110,7 @@ def test_an_animation_has_a_frame_for_each_round(road, tmp_path, capsys):
     assert PIL.open(still).size[0] > 500
 
 
-def test_two_images_and_a_camera_are_as_good_as_a_sequence(road, tmp_path, capsys):
+def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, capsys):
     images = [str(road / 'image_0' / f'{i:06d}.png') for i in (1, 2)]
     K = KittiSequence(road).K
     camera = ','.join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
@@ -152,7 +152,7 @@ def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, sai
 
 
 def without_screen():
-    """Give an environment in which nothing is found but Python's own modules."""
+    """Return an environment with nothing but Python's module path."""
     return {'PATH': '', 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
 
 

@@ -87,7 +87,7 @@ def installed(source: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope='module')
 def distribution(environment: Path) -> Distribution:
-    """Read what the installed package says of itself."""
+    """Return the metadata of the installed package."""
     packages, = environment.glob('lib/*/site-packages')
     found, = distributions(name='djet_ros', path=[str(packages)])
     return found
@@ -102,7 +102,7 @@ def workspace(request: pytest.FixtureRequest, copied: Callable[[str], Path]) -> 
 
 
 def shares_its_files(prefix: Path) -> bool:
-    """Whether all that ROS looks for is below the prefix."""
+    """Return whether all files that ROS looks for are below the prefix."""
     share = prefix / 'share' / 'djet_ros'
     wanted = [ROOT / 'package.xml', *ROOT.glob('config/*'), *ROOT.glob('launch/*.launch.*')]
     return (prefix / 'share/ament_index/resource_index/packages/djet_ros').exists() and all(
@@ -119,7 +119,7 @@ def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
 
 
 def has_compiled_loops(python: Path, cwd: Path) -> bool:
-    """Whether the package that is installed beside an interpreter finds them."""
+    """Return whether the package installed for an interpreter has the compiled loops."""
     return run(python, '-c', 'from pathlib import Path\n'
                'import djet_ros\nprint(*Path(djet_ros.__file__).parent.glob("compiled/_loops*"))',
                cwd=cwd) != '\n'
@@ -151,7 +151,7 @@ def test_colcon_puts_the_commands_where_ros2_run_looks(workspace: Path) -> None:
 @needs_colcon
 def test_colcons_commands_do_not_ask_for_pips_names_of_the_dependencies(
         workspace: Path, tmp_path: Path) -> None:
-    # Ubuntu's python3-opencv is no distribution 'opencv-python-headless'.
+    # Ubuntu's python3-opencv does not provide a distribution 'opencv-python-headless'.
     run(sys.executable, '-m', 'venv', '--without-pip', 'bare', cwd=tmp_path)
     answer = run('bash', '-c', '. install/setup.bash; '
                  f'{tmp_path}/bare/bin/python install/djet_ros/lib/djet_ros/djet --version',
@@ -181,17 +181,17 @@ def test_the_manifest_is_valid_and_agrees_with_setup_py(distribution: Distributi
     assert manifest.licenses == [metadata['License']]
     person, = manifest.maintainers
     assert (person.name, person.email) == (metadata['Maintainer'], metadata['Maintainer-email'])
-    # What reads the launch files, which are of Python or XML.
+    # The packages that read the launch files, which are Python or XML.
     formats = {path.suffix for path in (ROOT / 'launch').glob('*.launch.*')}
     assert formats == {'.py', '.xml'}
     assert {'launch', 'launch_xml'} <= {one.name for one in manifest.exec_depends}
 
 
-def test_the_package_tells_people_what_it_is(distribution: Distribution) -> None:
+def test_the_description_of_the_package_is_the_readme(distribution: Distribution) -> None:
     metadata = distribution.metadata
     assert metadata['Description-Content-Type'] == 'text/markdown'
-    told = metadata.get_payload() or metadata['Description']
-    assert told.strip() == (ROOT / 'README.md').read_text('utf-8').strip()
+    text = metadata.get_payload() or metadata['Description']
+    assert text.strip() == (ROOT / 'README.md').read_text('utf-8').strip()
     assert 'Operating System :: POSIX :: Linux' in metadata.get_all('Classifier')
 
 
@@ -221,7 +221,7 @@ def test_the_pages_list_every_dependency_with_its_bounds(distribution: Distribut
     assert listed == needed
 
 
-def test_the_audit_takes_a_package_that_nobody_knows_for_no_good_news(tmp_path: Path) -> None:
+def test_the_audit_fails_for_a_package_without_information(tmp_path: Path) -> None:
     answers = {'clean': '{"dependencies": [{"name": "a", "version": "1", "vulns": []}]}',
                'unknown': '{"dependencies": [{"name": "a", "skip_reason": "not found"}]}',
                'bad': '{"dependencies": [{"name": "a", "version": "1", "vulns": [{"id": "X-1", '

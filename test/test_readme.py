@@ -1,4 +1,4 @@
-"""What the pages name exists, and what they show is what the data beside them give."""
+"""Everything that the pages name exists, and their generated blocks match the data."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def exists(test: str) -> bool:
     return (ROOT / 'test' / file).exists() and (not name or name in functions_in(file))
 
 
-def test_the_readme_fits_in_the_hand():
+def test_the_readme_is_short():
     assert len((ROOT / 'README.md').read_bytes()) <= 8000
 
 
-def test_the_lines_of_python_in_the_readme_give_the_motion_between_two_images(capsys):
+def test_the_python_example_of_the_readme_estimates_the_motion_between_two_images(capsys):
     code, = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
     scene = make_scene('road', 0, (620, 188))
     poses = scene.trajectory(2)
@@ -62,7 +62,7 @@ def test_the_lines_of_python_in_the_readme_give_the_motion_between_two_images(ca
     assert np.degrees(direction_angle(pair.t, true[:3, 3])) < 1
 
 
-def test_what_the_package_gives_is_imported_where_it_is_asked_for():
+def test_the_package_imports_its_api_lazily():
     subprocess.run([sys.executable, '-c', 'import sys, djet_ros\n'
                     'assert not {"numpy", "cv2", "scipy"} & set(sys.modules)\n'
                     'from djet_ros import preset, Status, TwoViewEstimator\n'
@@ -71,13 +71,13 @@ def test_what_the_package_gives_is_imported_where_it_is_asked_for():
                     'assert not hasattr(djet_ros, "Statues")'], check=True)
 
 
-def test_the_pages_show_what_the_data_give(tmp_path):
+def test_the_generated_blocks_match_the_data():
     done = subprocess.run([sys.executable, DOC / 'pages.py', '--check'], capture_output=True,
                           text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_figure_that_was_typed_would_be_seen_and_mended(tmp_path):
+def test_a_block_edited_by_hand_is_detected_and_restored(tmp_path):
     shutil.copytree(DOC, tmp_path / 'doc')
     readme = tmp_path / 'README.md'
     whole = (ROOT / 'README.md').read_text()
@@ -92,7 +92,7 @@ def test_a_figure_that_was_typed_would_be_seen_and_mended(tmp_path):
 
 
 def complaints_of_the_code() -> set[tuple[str, str]]:
-    """Give what the diagnostics complain of, each with its level, a word standing for a blank."""
+    """Return the warnings of the diagnostics as patterns of their names, with their levels."""
     found = set()
     for path in (ROOT / 'djet_ros').rglob('*.py'):
         for call in ast.walk(ast.parse(path.read_text())):
@@ -104,7 +104,7 @@ def complaints_of_the_code() -> set[tuple[str, str]]:
     return found
 
 
-def test_the_table_of_complaints_has_those_of_the_code_and_no_others():
+def test_the_table_of_warnings_has_those_of_the_code_and_no_others():
     listed = {(one['name'], one['level']) for one in data('complaints')}
     code = complaints_of_the_code()
     fits = {(name, level): [one for one in code if one[1] == level and re.fullmatch(one[0], name)]
@@ -113,7 +113,7 @@ def test_the_table_of_complaints_has_those_of_the_code_and_no_others():
     assert {one for found in fits.values() for one in found} == code
 
 
-def test_every_promise_and_every_answer_names_tests_that_exist():
+def test_every_guarantee_and_every_answer_names_tests_that_exist():
     promises = data('promises')
     assert promises and all(one['tests'] for one in promises)
     for one in [*promises, *data('reports')]:
@@ -136,7 +136,7 @@ def test_every_make_target_that_is_named_exists(page):
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Give the words of each command in the blocks of shell code."""
+    """Yield the words of each command in the blocks of shell code."""
     for block in re.findall(r'^```(?:sh|bash)\n(.*?)^```', text, re.MULTILINE | re.DOTALL):
         for command in re.split(r'\n|&&', block):
             words = shlex.split(command, comments=True)
@@ -145,7 +145,7 @@ def commands(text: str) -> Iterator[list[str]]:
 
 
 def calls(text: str) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Give verbs and options of djet in blocks of code, and its verbs in sentences."""
+    """Yield subcommands and options of djet in blocks of code, and its subcommands in text."""
     for words in commands(text):
         if words[0] == 'djet':
             options = tuple(word.partition('=')[0] for word in words if word.startswith('-'))
@@ -177,19 +177,19 @@ def test_every_linked_file_and_section_exists(page):
 
 
 def sections(page: Path) -> list[str]:
-    """Anchors of the titles of a page."""
+    """Return the anchors of the headings of a page."""
     return [re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-')
             for title in re.findall(r'^#+ (.+)$', page.read_text(), re.MULTILINE)]
 
 
-def test_the_rooms_that_the_design_page_lists_are_the_folders_in_their_order():
+def test_the_packages_on_the_design_page_are_the_folders_in_order_of_imports():
     listed = [set(level) for level in data('rooms')]
     folders = {path.parent.name for path in ROOT.glob('djet_ros/*/__init__.py')}
     assert set().union(*listed) == folders
     assert listed == [set(rooms) & folders for rooms in reversed(ORDER) if set(rooms) & folders]
 
 
-def test_the_design_page_says_how_many_matches_have_to_agree_where_they_were_foreseen():
+def test_the_design_page_states_the_share_of_inliers_that_predicted_matches_need():
     assert f'no more than {RIGID * 100:.0f} % of its matches agree' in (
         DOC / 'design.md').read_text()
 

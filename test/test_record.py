@@ -1,4 +1,4 @@
-"""The figures of processes on a graph: measured by a command that never waits for ever."""
+"""The figures of processes on a graph: doc/record.py always ends."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIVE = shlex.join([sys.executable, '-c', 'from djet_ros.cli.main import main; '
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """Give a folder with the script, its figures, and a rendered street as KITTI 06."""
+    """Return a folder with the script, its figures, and a rendered street as KITTI 06."""
     for name in ('record.py', 'recorded.yaml'):
         shutil.copy(DOC / name, tmp_path)
     (tmp_path / 'kitti' / 'sequences').mkdir(parents=True)
@@ -33,7 +33,7 @@ def place(tmp_path: Path) -> Path:
 
 
 def record(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Measure tables, with less patience than one should have."""
+    """Measure tables, with a short PATIENCE."""
     return subprocess.run(
         [sys.executable, '-c', 'import record; record.PATIENCE = 5; raise SystemExit('
          'record.main())', *words, '--data', place], cwd=place, env=ENVIRONMENT,
@@ -45,7 +45,7 @@ def tables(place: Path) -> dict[str, dict[str, object]]:
     return found
 
 
-def test_a_node_that_ends_is_said_in_a_line_and_what_was_measured_is_kept(place: Path) -> None:
+def test_a_node_that_exits_is_reported_in_one_line_and_other_tables_are_kept(place: Path) -> None:
     before = tables(place)
     done = record(place, 'dds', 'node', '--node', 'echo there is no ROS >&2; exit 3;')
     assert done.returncode == 1
@@ -60,9 +60,9 @@ def test_a_node_that_ends_is_said_in_a_line_and_what_was_measured_is_kept(place:
     assert after == before
 
 
-def test_images_that_never_come_are_not_waited_for_without_end(place: Path) -> None:
+def test_waiting_for_images_that_never_come_ends(place: Path) -> None:
     before = tables(place)
-    # Of two rules the first counts: what is played goes past the node.
+    # Of two remappings the first counts, so the node does not hear the player.
     done = record(place, 'node', '--node', f'exec {LIVE} -r image:=/elsewhere')
     assert done.returncode == 1
     assert done.stderr == ('record.py: error: node: 0 of 30 images came to anything, and nothing '

@@ -1,4 +1,4 @@
-"""The figures of the pages: measured by commands, kept as they come, and shown as they are."""
+"""The figures of the pages: how they are measured, stored and shown."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def script(name: str) -> ModuleType:
 
 
 def measure(output: Path, *words: str) -> list[str]:
-    """Measure one scene; gives the parts that were measured and not taken over."""
+    """Measure one scene; returns the parts that were newly measured."""
     done = subprocess.run(
         [sys.executable, ROOT / 'doc' / 'measure.py', '--only', SCENE, '--frames', '3', '--seeds',
          '0', '--workers', '1', '--output', output, *words], capture_output=True, text=True,
@@ -73,7 +73,7 @@ def test_every_method_is_measured_on_every_pair(part):
         assert len(one['by_seed']) == 1
 
 
-def test_standing_still_is_no_failure_and_has_no_direction(part):
+def test_standstill_is_no_failure_and_has_no_direction(part):
     assert part['odometry']['failed'] == 0
     assert part['odometry']['direction']['mean'] is None
     bound, = (one['rotation'] for one in yaml.safe_load(BOUNDS.read_text())['hard_images']
@@ -82,7 +82,7 @@ def test_standing_still_is_no_failure_and_has_no_direction(part):
 
 
 @pytest.mark.slow
-def test_what_was_measured_is_taken_over_and_not_mixed_with_other_settings(output, tmp_path):
+def test_measured_parts_are_reused_and_not_mixed_with_other_settings(output, tmp_path):
     begun = tmp_path / 'results.json'
     begun.write_text(output.read_text())
     assert measure(begun) == []
@@ -92,7 +92,7 @@ def test_what_was_measured_is_taken_over_and_not_mixed_with_other_settings(outpu
     assert begun.read_text() == output.read_text()
 
 
-def test_one_part_is_added_to_all_that_is_measured_and_all_anew_begins_empty(tmp_path):
+def test_only_adds_a_part_to_complete_results_and_a_full_run_starts_empty(tmp_path):
     module, path = script('measure'), tmp_path / 'results.json'
     settings = {'frames': 7, 'seeds': [0], 'real_frames': None, 'code': 'abc'}
     whole = {**module.previous_results(path, settings), 'complete': True,
@@ -108,7 +108,7 @@ def test_one_part_is_added_to_all_that_is_measured_and_all_anew_begins_empty(tmp
     assert module.previous_results(path, {**settings, 'frames': 8})['parts'] == {}
 
 
-def test_errors_in_common_are_of_pairs_that_both_told_in_the_order_of_the_first():
+def test_common_errors_are_of_pairs_that_both_estimated_in_the_order_of_the_first():
     first, second = ([replace(record(i, Rotation.identity(), np.array([0, 0, 1.0])),
                               rotation_error_deg=rotation, translation_error_deg=direction)
                       for i, rotation, direction in rows] for rows in (
@@ -121,7 +121,7 @@ def test_errors_in_common_are_of_pairs_that_both_told_in_the_order_of_the_first(
     assert [errors.shape for errors in common_errors(first, other).values()] == [(0, 2), (0, 2)]
 
 
-def test_ratios_are_of_pairs_that_both_told():
+def test_ratios_are_of_pairs_that_both_estimated():
     errors = {'djet': (0.0002, 0.0004, 9.0), 'rpe': (0.0010, 0.0030, math.nan)}
     records = [replace(record(i, Rotation.identity(), np.array([0, 0, 1.0])), method=method,
                        rotation_error_deg=error, translation_error_deg=math.nan)
@@ -132,7 +132,7 @@ def test_ratios_are_of_pairs_that_both_told():
     pages = script('pages')
     part = {'methods': [{'method': method, 'preset': 'best', 'failed': 0} for method in errors],
             'against': [found]}
-    # Neither is cut off at what counts as no error.
+    # Errors below EQUAL count in the means.
     assert pages.compared_row('road', part, 'rpe', 'best') == (
         'road', 'best', '2 / 0', '0.15', '0.15', '–', '–', '0 / 0')
     del part['against']
@@ -142,11 +142,11 @@ def test_ratios_are_of_pairs_that_both_told():
 @pytest.mark.parametrize(('ours', 'theirs', 'text'), [
     (0.002, 0.001, '**2.00**'), (0.0101, 0.01, '**1.01**'), (0.010001, 0.01, '1.00'),
     (0.0002, 0.0009, '–'), (None, None, '–'), (0.5, 0.0, '**> 100**')])
-def test_a_ratio_is_bold_where_it_is_seen_to_be_above_one(ours, theirs, text):
+def test_a_ratio_is_bold_if_it_is_above_one_as_printed(ours, theirs, text):
     assert script('pages').ratio(ours, theirs) == text
 
 
-def test_the_paper_stands_beside_what_its_parameters_give():
+def test_table_1_has_the_paper_next_to_the_preset_paper():
     def own(method: str) -> dict[str, Any]:
         return {'method': method, 'preset': 'paper', 'pairs': 60, 'hamming': 21.0,
                 'rotation': {'mean': 0.0917}, 'direction': {'mean': 1.25}}
@@ -159,7 +159,7 @@ def test_the_paper_stands_beside_what_its_parameters_give():
     assert '0.0917 / 1.250 here and 0.119 / 0.044 there' in ' '.join(page.split())
 
 
-def test_few_triangles_have_no_95_percent():
+def test_few_triplets_have_no_95th_percentile():
     def page(triangles: int) -> str:
         figures = dict.fromkeys(('median_deg', 'claimed_median_deg', 'normalised_square_mean',
                                  'error_median_deg'), 0.5)
@@ -169,24 +169,24 @@ def test_few_triangles_have_no_95_percent():
     assert '| 0.500 | 0.750 |' in page(20)
 
 
-def test_triangles_are_of_all_seeds(tmp_path):
+def test_closure_is_over_all_seeds(tmp_path):
     datasets = open_datasets([render_sequence('road', tmp_path / str(seed), 3, seed, (480, 160))
                               for seed in (0, 1)], Selection(), tmp_path)
     for one in script('measure').closure_figures(datasets).values():
         assert one['triangles'] + one['without'] == 2
 
 
-def test_pairs_that_each_turn_too_far_drift_by_that_over_a_long_way(small_kitti, tmp_path):
+def test_a_constant_rotation_error_per_pair_gives_the_expected_drift(small_kitti, tmp_path):
     folder, turned = small_kitti(frames=250), Rotation.from_rotvec([0, 1e-4, 0])
     truth = KittiSequence(folder).poses
     records = [record(i, turned * Rotation.from_matrix(motion[:3, :3]), motion[:3, 3])
                for i, motion in enumerate(np.linalg.inv(truth[:-1]) @ truth[1:])]
     datasets = open_datasets([folder], Selection(), tmp_path)
     found = script('measure').drifts(datasets, records)
-    # Half a metre to a frame, and segments that begin at every tenth.
+    # 0.5 m per frame; segments start at every tenth frame.
     assert (found['drift']['segments'], found['drift']['longest']) == (5, 100)
     assert found['drift']['rotation_deg_per_100m'] == pytest.approx(np.degrees(0.02), rel=0.01)
-    # A step of 0.5 m after k turns of 1e-4 lies 5e-5 k m off: 1 m after 200 of them.
+    # A step of 0.5 m after k rotations of 1e-4 is 5e-5 k m off: 1 m after 200 steps.
     assert found['drift']['translation_percent'] == pytest.approx(1.0, rel=0.02)
     assert script('measure').drifts(datasets, records[:190]) == {}
     page = script('pages').drift({'parts': {'drive kitti 07': {
@@ -197,11 +197,11 @@ def test_pairs_that_each_turn_too_far_drift_by_that_over_a_long_way(small_kitti,
     assert f'| KITTI 07 | RP-E | {figures} |' in page
 
 
-def test_a_drive_that_tells_no_distortion_has_no_replays_without_it(small_kitti):
+def test_a_drive_without_significant_distortion_has_no_corrected_replays(small_kitti):
     assert script('measure').lens(small_kitti(frames=3)) == {}
 
 
-def test_the_page_holds_the_distortion_that_was_found_against_others():
+def test_the_page_compares_the_estimated_distortion_with_others():
     def one(off: float) -> dict[str, dict[str, float]]:
         return {'positions': {'rmse_m': off, 'scale_change': 1.0},
                 'drift': {'translation_percent': 0.5, 'rotation_deg_per_100m': 0.25}}
@@ -218,7 +218,7 @@ def test_the_page_holds_the_distortion_that_was_found_against_others():
 
 
 def record(pair: int, rotation: Rotation, way: np.ndarray) -> PairRecord:
-    """Give what a method made of a pair of sequence 07."""
+    """Return the record of a method for a pair of sequence 07."""
     return PairRecord('07', pair, pair, pair + 1, 'rpe', 'best', '', Status.OK.value, 99, 90,
                       False, 0.1, 0.1, 20.0, tuple(rotation.as_rotvec().tolist()),
                       tuple((way / np.linalg.norm(way)).tolist()), 50.0)
