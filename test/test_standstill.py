@@ -34,22 +34,22 @@ def behind_a_lorry(stand: int, lorry: int = 1000) -> RelativePose:
 
 def after_a_stand() -> Standstill:
     standstill = Standstill()
-    assert standstill.told(seen(WORLD, WORLD), MOST, at_rest=False)
+    assert standstill.detect(seen(WORLD, WORLD), MOST, at_rest=False)
     standstill.stay(seen(WORLD, WORLD), MOST)
     return standstill
 
 
 def test_what_stood_tells_that_the_camera_stands_however_little_of_it_is_left() -> None:
     for stand, told in ((200, True), (15, True), (3, False)):
-        assert after_a_stand().told(behind_a_lorry(stand), MOST, at_rest=True) is told
+        assert after_a_stand().detect(behind_a_lorry(stand), MOST, at_rest=True) is told
 
 
 def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
-    assert not after_a_stand().told(behind_a_lorry(40), MOST, at_rest=False)
-    assert not Standstill().told(behind_a_lorry(40), MOST, at_rest=True)
+    assert not after_a_stand().detect(behind_a_lorry(40), MOST, at_rest=False)
+    assert not Standstill().detect(behind_a_lorry(40), MOST, at_rest=True)
     elsewhere = after_a_stand()
     elsewhere.refer()
-    assert not elsewhere.told(behind_a_lorry(40), MOST, at_rest=True)
+    assert not elsewhere.detect(behind_a_lorry(40), MOST, at_rest=True)
 
 
 def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_is_known() -> None:
@@ -57,9 +57,9 @@ def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_i
                                              (0.03, False, False)):
         pair = seen(WORLD, WORLD + np.where(np.arange(400) < 400 * share, 0, 60)[:, None] * RIGHT)
         standstill = Standstill()
-        assert standstill.told(pair, MOST, at_rest=True) is told_at_first
+        assert standstill.detect(pair, MOST, at_rest=True) is told_at_first
         standstill.moved()
-        assert standstill.told(pair, MOST, at_rest=True) is told_after
+        assert standstill.detect(pair, MOST, at_rest=True) is told_after
 
 
 def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> None:
@@ -67,18 +67,18 @@ def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> N
     y = WORLD + np.random.default_rng(6).uniform(2, 40, (400, 1)) * RIGHT
     y[:15] = WORLD[:15]
     away = seen(WORLD, y, np.ones(400, bool))
-    assert not after_a_stand().told(away, MOST, at_rest=True)
+    assert not after_a_stand().detect(away, MOST, at_rest=True)
     # Where few of them are left in sight they decide alike.
     new = np.random.default_rng(8).uniform((0, 0), (1240, 376), (500, 2))
     few = seen(np.vstack([WORLD[:60], new]), np.vstack([y[:60], new + RIGHT * 20]),
                np.ones(560, bool))
-    assert not after_a_stand().told(few, MOST, at_rest=True)
+    assert not after_a_stand().detect(few, MOST, at_rest=True)
 
 
 def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
     """Near things move by a little at first, as far ones do later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
-    told = [after_a_stand().told(seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST,
+    told = [after_a_stand().detect(seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST,
                                  at_rest=True) for way in (1, 20, 40, 80)]
     assert told == [True, False, False, False]
 
@@ -86,10 +86,10 @@ def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
 def test_a_lorry_that_stood_as_well_tells_nothing_once_it_drove_on() -> None:
     standstill, lorry = after_a_stand(), np.arange(400) < 150
     away = seen(WORLD, WORLD + np.where(lorry[:, None], (30.0, 0), (0.0, 0)), lorry)
-    assert standstill.told(away, MOST, at_rest=True)
+    assert standstill.detect(away, MOST, at_rest=True)
     standstill.stay(away, MOST)
     # Another stops where it stood, and hides what else there was.
     beside = np.random.default_rng(9).uniform((0, 0), (1240, 376), (4000, 2))
     x = np.vstack([WORLD, beside])
     y = np.vstack([WORLD[:150], scattered(WORLD[150:]), beside + RIGHT * 40])
-    assert not standstill.told(seen(x, y, np.arange(len(x)) >= 400), MOST, at_rest=True)
+    assert not standstill.detect(seen(x, y, np.arange(len(x)) >= 400), MOST, at_rest=True)

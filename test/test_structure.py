@@ -24,7 +24,7 @@ from djet_ros.odometry.scale import (
     SpeedScale,
     Unmeasured,
 )
-from djet_ros.odometry.structure import OneScale
+from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
 import numpy as np
@@ -121,7 +121,7 @@ def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards)
 
 def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_has_them(cards):
     estimator, ways, here = TwoViewEstimator(ESTIMATOR), [*[0.32] * 6, 0.46, 0.46, 0.32], np.eye(4)
-    views, scale = [], OneScale()
+    views, scale = [], TrackScale()
     for number, way in enumerate([0, *ways]):
         here = here @ pose(x=way)
         frame = cards.frame(0.0, here, noise=number)
@@ -161,10 +161,10 @@ def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
 def test_after_a_turn_on_the_spot_steps_are_expected_to_be_as_long_as_before_it(cards):
     drive = Drive(cards)
     drive.go(steps()[:5])
-    expected = drive.odometry._one_scale._speed
+    expected = drive.odometry._scale._speed
     turns = drive.go([pose(yaw=0.02)] * 2 + [pose(yaw=-0.02)] * 2)
     assert all(result.status is Status.NO_PARALLAX for result in turns)
-    assert drive.odometry._one_scale._speed == expected
+    assert drive.odometry._scale._speed == expected
 
 
 def test_a_turn_beyond_all_that_was_seen_leaves_the_scale_to_one_guess():
@@ -183,7 +183,7 @@ def test_a_turn_beyond_all_that_was_seen_leaves_the_scale_to_one_guess():
     # Before a blank corner there are too few: the last of them may tell nothing, and then a usual
     # step is a guess, once for all frames without any.
     assert any(result.status not in TRACKED for result in results[23:])
-    assert odometry._one_scale._variance < 0.36 + 0.25 + 0.02
+    assert odometry._scale._filter.variance < 0.36 + 0.25 + 0.02
 
 
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
@@ -286,7 +286,7 @@ def test_the_same_frames_give_the_same_scale_to_the_last_bit(cards):
 def test_the_window_keeps_few_views(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12, yaw=0.004)] * 14)
-    window = drive.odometry._one_scale._window
+    window = drive.odometry._scale._window
     assert len(window._views) <= 7
     assert len(window._landmarks) < 2000
     assert window.landmarks().shape[1] == 3
@@ -312,7 +312,7 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
     drive.go(ways[:-1])
-    scale = drive.odometry._one_scale  # as it was before the last frame
+    scale = drive.odometry._scale  # as it was before the last frame
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     assert scale.agrees(aside, pair.x, pair.y_opt)
     assert scale.agrees(Pose(aside.R, -aside.t), pair.x, pair.y_opt)  # chirality is for others
@@ -329,7 +329,7 @@ def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
     drive.go(ways[:-1])
-    window = drive.odometry._one_scale._window
+    window = drive.odometry._scale._window
     assert len(window._views) == 3
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     agree, asked = window.agreement(aside, pair.x, pair.y_opt)
@@ -342,19 +342,19 @@ def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
     drive.go(ways[:-1])
-    scale = drive.odometry._one_scale  # as it was before the last frame
-    assert not scale.sees_no_way(pair)
+    scale = drive.odometry._scale  # as it was before the last frame
+    assert not scale.lacks_parallax(pair)
     length, error = scale._window.told_length(pair)
     assert length == pytest.approx(1, rel=0.05) and error < 0.02
     rng, none = np.random.default_rng(5), 0
     for _ in range(20):
         any_way = rng.normal(0, 1, len(pair.x))[:, None]
-        none += scale.sees_no_way(replace(pair, y_opt=pair.x + any_way * (pair.y_opt - pair.x)))
+        none += scale.lacks_parallax(replace(pair, y_opt=pair.x + any_way * (pair.y_opt - pair.x)))
     assert none >= 19
     # Without landmarks nobody knows.
     scale.reset()
-    scale.begin(drive.odometry._view)
-    assert not scale.sees_no_way(pair)
+    scale.begin(drive.odometry._reference.view)
+    assert not scale.lacks_parallax(pair)
 
 
 def test_another_estimator_goes_on_at_the_last_speed(cards):
@@ -367,7 +367,7 @@ def test_another_estimator_goes_on_at_the_last_speed(cards):
 def test_where_a_landmark_is_seen_does_not_hang_on_where_it_was_expected(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.03)] * 4)
-    window = drive.odometry._one_scale._window
+    window = drive.odometry._scale._window
     found = window._landmarks
     before, seen = found.minima[:, -1].copy(), found.seen[:, -1].copy()
     focal, R = window._K[0, 0], window._poses.R.copy()
@@ -471,7 +471,7 @@ def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
 
 
 def test_a_constant_length_that_is_wrong_is_wrong_alike_in_all_steps(cards):
-    frame, scale, count = cards.frame(0.0), OneScale(), 100
+    frame, scale, count = cards.frame(0.0), TrackScale(), 100
     view = TwoViewEstimator(ESTIMATOR).view(frame.gray, frame.K)
     scale.configure(ESTIMATOR, ConstantScale(1.0, 0.05), 0.05)
     ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
@@ -508,7 +508,7 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     added = [Addition(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
              for length, sigma in ((1.0, 1e-3), (0.02, 800.0))]
     source.exact, source.carried = False, True
-    scale = OneScale()
+    scale = TrackScale()
     scale.configure(ESTIMATOR, source, 0.0)
     scale._window = SimpleNamespace(
         is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
@@ -521,7 +521,7 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     assert scale._speed == pytest.approx(10)
     assert step.length.value == pytest.approx(usual)
     assert step.length.sigma >= 0.99 * usual
-    assert np.exp(scale._log) == pytest.approx(usual)
+    assert np.exp(scale._filter.log) == pytest.approx(usual)
 
 
 def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariances_are_theirs():
@@ -529,7 +529,7 @@ def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariance
     sure = np.diag([1, 2, 3, 4, 5, 6]) * 1e-6
     added = [Addition(np.eye(3), t, float(np.linalg.norm(t)), 1e-3, sure, np.eye(4))
              for t in (ahead, aside)]
-    scale = OneScale()
+    scale = TrackScale()
     scale.configure(ESTIMATOR, Unmeasured(), 0.0)
     scale._window = SimpleNamespace(
         is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
@@ -563,7 +563,7 @@ def factors(metres, alike):
     And the shares of their errors that were in those before.
     """
     step = Addition(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
-    scale = OneScale()
+    scale = TrackScale()
     scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
     # A window by which each step is as long as the one before, to two thousandths.
     scale._window = SimpleNamespace(
@@ -573,7 +573,7 @@ def factors(metres, alike):
     told = []
     for number in range(len(metres)):
         length = scale.of_step((number * 10**9, (number + 1) * 10**9), None, ahead).length
-        told.append((scale._log, scale._variance, length.common.kept[0]))
+        told.append((scale._filter.log, scale._filter.variance, length.common.kept[0]))
     return np.array(told).T
 
 

@@ -608,7 +608,7 @@ def test_a_frame_that_is_refused_leaves_no_trace(cards):
 def test_what_was_known_of_a_lens_is_not_of_another_camera(cards, gap):
     vo = odometry()
     drive(vo, cards, [np.eye(4), STEP, STEP])
-    vo._straighten(0.02)
+    vo._undistort(0.02)
     frame = cards.frame(0.2 + gap, STEP)
     result = vo.process(replace(frame, gray=frame.gray[:-20].copy()))
     assert result.status is (Status.SIZE_CHANGED if gap < 1 else Status.TIME_JUMP)

@@ -9,7 +9,7 @@ from enum import StrEnum, unique
 
 from djet_ros.core.types import RelativePose
 from djet_ros.odometry.health import Complaint
-from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.odometry.result import OdometryResult
 import numpy as np
 
 

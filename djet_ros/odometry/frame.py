@@ -1,8 +1,8 @@
-"""One image of the moving camera, and whether it can be related to the one before."""
+"""A frame of the moving camera, and the reference frame that later ones are related to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.types import Array, of_one_camera, Status, View
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 @dataclass(frozen=True)
 class Frame:
     """
-    An image as the odometry takes it.
+    An image with its camera matrix and stamp.
 
-    gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix in pixels, pixel centres
-    at integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame;
-    left_out: (H, W) bool, pixels that nothing is to be told from, or None.
+    gray: (H, W) uint8, undistorted; K: (3, 3) its camera matrix in pixels, pixel centres at
+    integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame;
+    left_out: (H, W) bool, mask of pixels to ignore, or None.
     """
 
     gray: NDArray[np.uint8]
@@ -27,16 +27,35 @@ class Frame:
     left_out: NDArray[np.bool_] | None = None
 
     def view(self, estimator: TwoViewEstimator) -> View:
-        """Prepare it for an estimator, without what is left out."""
+        """Return the view that an estimator prepares of it, without the ignored pixels."""
         return estimator.view(self.gray, self.K, left_out=self.left_out)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """
+    The reference frame, and the newest stamp at which the camera was still at its pose.
+
+    view: of the frame; since_ns: stamp of the frame, or of a later one in a standstill;
+    since_covariance: (6, 6) of the camera's pose at that stamp in the reference frame.
+    """
+
+    frame: Frame
+    view: View
+    since_ns: int
+    since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def seen_by(self, estimator: TwoViewEstimator) -> Reference:
+        """Return the same with the view that another estimator prepares."""
+        return replace(self, view=self.frame.view(estimator))
 
 
 def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:
     """
-    Tell whether a frame follows another: OK, TIME_JUMP or SIZE_CHANGED.
+    Return whether a frame can be related to the previous one: OK, TIME_JUMP or SIZE_CHANGED.
 
-    TIME_JUMP is a step back in time or a gap of more than max_gap seconds; SIZE_CHANGED is another
-    image size or another camera matrix.
+    TIME_JUMP: a step back in time, or a gap of more than max_gap seconds; SIZE_CHANGED: another
+    image size or camera matrix.
     """
     gap = (current.stamp_ns - previous.stamp_ns) * 1e-9
     if gap < 0 or gap > max_gap:

@@ -11,7 +11,7 @@ from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.images import Coarse
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
 from djet_ros.odometry.scale import Scale, ScaleSource
-from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.odometry.result import OdometryResult
 
 # Images over which shares are taken, and of which they say nothing yet.
 _WINDOW, _FEW = 100, 20

@@ -20,7 +20,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
 from djet_ros.odometry.scale import Scale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
-from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.odometry.result import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

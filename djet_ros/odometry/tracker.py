@@ -1,21 +1,19 @@
 """
-Messages in, messages out: everything of a live odometry that needs no clock, thread or socket.
+The odometry from ROS messages to ROS messages, without clock, thread or socket.
 
-The live nodes and the offline replay are thin faces on this one object, so that the same messages
-in the same order give the same poses everywhere.
+The live nodes and the offline replay are thin front ends of it, so that the same messages in the
+same order give the same poses everywhere.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 import math
 from typing import Any, NamedTuple
 
 from djet_ros import compiled
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
-from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.parallel import started_beside
+
 from djet_ros.core.types import Array, STARTED, TRACKED, View
 from djet_ros.odometry.beside import Beside
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
@@ -30,7 +28,7 @@ from djet_ros.odometry.health import (
     Health,
     why_restarted,
 )
-from djet_ros.odometry.images import BadMessage, Coarse, coarse, Gray, gray_image
+from djet_ros.odometry.images import BadMessage
 from djet_ros.odometry.messages import (
     frame_of,
     Messages,
@@ -39,9 +37,11 @@ from djet_ros.odometry.messages import (
     stamp_ns,
 )
 from djet_ros.odometry.order import Order
+from djet_ros.odometry.preprocessing import Preprocessor, Settings
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
-from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
+from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,50 +49,24 @@ _DIAGNOSTICS_PERIOD_NS = 10**9
 
 
 class Outgoing(NamedTuple):
-    """A message to publish; a topic without a leading slash is relative to the node's name."""
+    """A message to publish; a topic without a leading slash is in the node's namespace."""
 
     topic: str
     message: Any
 
 
-class _Seen(NamedTuple):
-    """
-    An undistorted image, the shape of the one that came, and its view where no mask hides any.
-
-    coarse: what is left of an image of 16 bits, where that is little.
-    """
-
-    gray: Gray
-    shape: tuple[int, ...]
-    view: View | None
-    coarse: Coarse | None
-
-
-class _Expected(NamedTuple):
-    """What was begun of an image, and by what."""
-
-    message: Any
-    camera: Camera
-    estimator: TwoViewEstimator
-    limits: tuple[int, int]
-    seen: Callable[[], _Seen]
-
-
 class Tracker:
     """
-    Pairs images with their CameraInfo, runs the odometry on them, and words what comes of it.
+    Runs the odometry on images with their CameraInfo, and makes messages of the results.
 
-    message_type gives the class for a type name such as 'sensor_msgs/msg/Image'; image_topic is
-    the resolved name of the images' topic, by which odometry.rectified 'auto' goes; speed_topics
-    are where speeds are heard, for people.
-
-    still_mask is what odometry.mask_file leaves out of all images, (H, W) bool.
-
-    node is the name by which the diagnostics are told from those of others.
+    message_type: returns the class for a type name such as 'sensor_msgs/msg/Image'; image_topic:
+    resolved name of the image topic, by which odometry.rectified 'auto' decides; speed_topics:
+    topics of speeds, for texts; still_mask: (H, W) bool, pixels of all images that
+    odometry.mask_file excludes; node: name of the node in diagnostics.
 
     Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
-    odometry (also for a first frame), path, /tf (both if configured), /diagnostics (on a change of
-    state and once per second of the images' stamps).
+    relative_pose_status, odometry (also for a first frame), path, /tf (both if configured),
+    /diagnostics (on a change of state and once per second of the images' stamps).
     """
 
     def __init__(self, config: Config, message_type: MessageType,
@@ -100,7 +74,7 @@ class Tracker:
                  speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME,
                  still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config = config
-        # What a face adds to each diagnostics message, such as its latency.
+        # What a front end adds to each diagnostics message, such as its latency.
         self.face_values: dict[str, str] = {}
         self.face_complaints: list[Complaint] = []
         self._message_type = message_type
@@ -116,7 +90,7 @@ class Tracker:
         self._info: Any = None
         self._info_frame = ''
         self._camera: Camera | None = None
-        self._hides = still_mask is not None
+        self._masked = still_mask is not None
         self._paused = False
         self._enter(State.WAITING_FOR_CAMERA_INFO)
         self._forget()
@@ -125,7 +99,7 @@ class Tracker:
         """
         Forget all images, poses, speeds and counts; the next image is the first.
 
-        The CameraInfo stays, because a latched one is not sent twice.
+        The CameraInfo is kept, because a latched one is not sent twice.
         """
         self._odometry.reset()
         self._scale.reset()
@@ -135,17 +109,16 @@ class Tracker:
     def _forget(self) -> None:
         self.counts = Counts()
         self.last: OdometryResult | None = None
-        # What became of the newest image: a status, or the reason why it was not used.
+        # Outcome of the newest image: a status, or the reason why it was not used.
         self.verdict = ''
-        # Why the newest message could not be used, for a log; None when it could.
+        # Why the newest message could not be used, for a log; None if it could.
         self.problem: BadMessage | None = None
-        # What the newest frame without a pair means, for a log.
+        # Why the newest frame restarted the odometry, for a log.
         self.remark = ''
-        # Whether the newest frame has thrown away all before it, as its stamp went back.
+        # Whether the newest frame reset everything, as its stamp went back.
         self.went_back = False
         self._frame: Frame | None = None
-        # The next images, of which a face knows one or two.
-        self._expected: deque[_Expected] = deque(maxlen=2)
+        self._preprocessor = Preprocessor()
         self._health = Health(self.config.odometry, self._speed_topics)
         odometry = self.config.odometry
         self._order = Order(odometry.max_backwards, odometry.max_gap)
@@ -158,9 +131,9 @@ class Tracker:
 
     def configure(self, config: Config) -> None:
         """
-        Take other parameters from the next frame on; the trajectory goes on.
+        Change the parameters from the next frame on; the trajectory continues.
 
-        DjetError where the scale needs something that can't be had while running.
+        Raises DjetError if the scale needs something that is not available at run time.
         """
         before, after = self.config.odometry, config.odometry
         if not same_scale(before, after):
@@ -168,11 +141,11 @@ class Tracker:
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
         self._beside.configure(after, self._scale)
-        self._odometry.listen_to(self._beside.gyro, self._beside.guess)
+        self._odometry.set_priors(self._beside.gyro, self._beside.guess)
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
         self._order.configure(after.max_backwards, after.max_gap)
-        # Poses of another frame are no part of a path.
+        # A path has poses of one frame only.
         self._path = deque(self._path if _frames(before) == _frames(after) else (),
                            maxlen=config.ros.path_length)
         if self._info is not None and (before.rectified, before.residual_k1) != (
@@ -181,7 +154,7 @@ class Tracker:
             self.camera_info(info)
 
     def camera_info(self, message: Any) -> list[Outgoing]:
-        """Take a CameraInfo; the camera is made anew only where it says something new."""
+        """Take a CameraInfo; a new camera is made only if it differs from the last one."""
         self._info_frame = frame_of(message.header)
         if self._info is not None and same_camera(self._info, message):
             return []
@@ -195,7 +168,7 @@ class Tracker:
             self._camera = None
             self.counts.rejected_infos[problem.reason] += 1
             return self._reject(problem, stamp_ns(message.header))
-        self._odometry.another_lens()
+        self._odometry.recalibrated()
         self.problem = None
         if self.last is None:
             self._await()
@@ -203,44 +176,28 @@ class Tracker:
 
     @property
     def camera(self) -> Camera | None:
-        """Give the camera of the newest CameraInfo; None where that can't be used."""
+        """Return the camera of the newest CameraInfo; None if there is no usable one."""
         return self._camera
 
     def expect(self, message: Any) -> None:
         """
-        Begin with an image that is to come after the next one, beside the work on that one.
+        Prepare an image ahead, in parallel with the work on the one before it.
 
-        What comes of it is the same; it needs not be told, and the image need not come.
+        This is optional, does not change the results, and the image need not be processed.
         """
-        if self._camera is None or self._paused or any(
-                one.message is message for one in self._expected):
-            return
-        camera, estimator, limits = self._camera, self._odometry.estimator, self._limits
-        # What is left out of an image may not be known yet.
-        whole = not (self._hides or self.config.odometry.mask)
-        self._expected.append(_Expected(message, camera, estimator, limits, started_beside(
-            lambda: _seen(message, camera, limits, estimator if whole else None))))
+        if self._camera is not None and not self._paused:
+            # A mask of the image may not be known yet.
+            masked = self._masked or bool(self.config.odometry.mask)
+            self._preprocessor.start(message, self._settings(self._camera), not masked)
 
-    @property
-    def _limits(self) -> tuple[int, int]:
-        return self.config.odometry.gray_limits()
-
-    def _see(self, message: Any, camera: Camera) -> _Seen:
-        """See an image, by what was begun of it unless that was by another camera."""
-        for one in self._expected:
-            if one.message is message:
-                self._expected.remove(one)
-                if one.camera is camera and one.estimator is self._odometry.estimator \
-                        and one.limits == self._limits:
-                    return one.seen()
-                break
-        return _seen(message, camera, self._limits, None)
+    def _settings(self, camera: Camera) -> Settings:
+        return Settings(camera, self._odometry.estimator, self.config.odometry.gray_limits())
 
     def leaps(self, image: Any) -> bool:
         """
-        Tell whether an image comes after a gap, or has a wrong stamp: the one after it knows.
+        Return whether an image comes after a gap of more than max_gap, or has a wrong stamp.
 
-        A face waits for that one, a live one for a moment.
+        The image after it decides which; a front end should wait for that one.
         """
         newest = self._frame
         return newest is not None and not self._paused and (
@@ -248,9 +205,9 @@ class Tracker:
 
     def image(self, message: Any, following: Any = None) -> list[Outgoing]:
         """
-        Take an Image or a CompressedImage, and give what comes of it.
+        Process an Image or a CompressedImage, return the messages to publish.
 
-        following: the image after it, where that is known; it matters where this one leaps.
+        following: the image after it, if known; it matters only if this one ``leaps``.
         """
         self.counts.received += 1
         stamp = stamp_ns(message.header)
@@ -265,29 +222,29 @@ class Tracker:
             self._drop(reason, frame_of(message.header))
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
-            seen = self._see(message, self._camera)
-            left_out = self._beside.left_out(stamp, frame_of(message.header), seen.shape,
+            prepared = self._preprocessor.image(message, self._settings(self._camera))
+            left_out = self._beside.left_out(stamp, frame_of(message.header), prepared.shape,
                                              self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
-        self._health.gray(seen.coarse)
-        # A view that was begun leaves out what the camera does not see, and no more.
-        whole = left_out is self._camera.unseen(seen.shape)
-        return self._process(Frame(seen.gray, self._camera.K, stamp, frame_of(message.header),
-                                   left_out), seen.view if whole else None)
+        self._health.gray(prepared.coarse)
+        # A view that was prepared ahead is without the pixels that the camera does not see only.
+        usable = left_out is self._camera.unseen(prepared.shape)
+        return self._process(Frame(prepared.gray, self._camera.K, stamp, frame_of(message.header),
+                                   left_out), prepared.view if usable else None)
 
     @property
     def mounted(self) -> bool:
-        """Whether all is known of the frame whose pose is asked for."""
+        """Return whether the camera's pose on base_frame is known, or not needed."""
         return not self.config.odometry.base_frame or self._mounting is not None
 
     def mount(self, transform: Transform, image_frame: str) -> str:
         """
-        Ask where the camera is on base_frame; until that is known nothing is in the odom frame.
+        Look up the camera's pose on base_frame, which all poses in the odom frame need.
 
-        image_frame: frame_id of the images. Gives what was found in words, or nothing.
+        image_frame: frame_id of the images. Returns a text on what was found, or an empty one.
         """
         config = self.config.odometry
         camera, axes = mounted_frame(config, image_frame)
@@ -300,27 +257,27 @@ class Tracker:
         return f'{camera} is at ({x:.3f}, {y:.3f}, {z:.3f}) m on {config.base_frame}'
 
     def pause(self) -> None:
-        """Drop all images until ``resume``; whatever is known by then stays known."""
+        """Drop all images until ``resume``; the state is kept."""
         self._paused = True
 
     def resume(self) -> None:
-        """Take images again; whether the next one has a pair is for max_gap to say."""
+        """Process images again; after more than max_gap the odometry restarts."""
         self._paused = False
         self._await()
 
     def no_image_comes(self) -> None:
-        """Hear from a face, which has a clock, that no image has come for a while."""
+        """Note that no image has come for a while; for front ends, which have a clock."""
         self._await()
         self._rate = StampRate()
 
     @property
     def state(self) -> State:
-        """Tell what the odometry is doing."""
+        """Return the state of the odometry."""
         return State.PAUSED if self._paused else self._state
 
     @property
     def detail(self) -> str:
-        """Say what the state is about, such as a status or a reason."""
+        """Return the detail of the state, such as a status or a reason."""
         return '' if self._paused else self._detail
 
     def speed(self, message: Any) -> None:
@@ -350,38 +307,38 @@ class Tracker:
 
     def lacks(self, image: Any) -> str:
         """
-        Name what has still to come before an image is worked on, if anything.
+        Return the name of an input that an image still needs, or an empty string.
 
-        A face waits for it for a moment. What comes later is of no use to that image.
+        A front end should wait for it for a moment; later it is of no use to the image.
         """
         return self._beside.lacks(stamp_ns(image.header), frame_of(image.header))
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
-        """Name frames (parent, child) of which a mounting is still wanted, by 'imu' or 'guess'."""
+        """Return frames (parent, child) with an unknown transform, keyed by 'imu' or 'guess'."""
         return self._beside.wanted_mountings(image_frame)
 
     @property
     def wants_frames(self) -> bool:
-        """Tell whether tf is still to be asked how anything is mounted."""
+        """Return whether transforms are still to be looked up on tf."""
         return not self.mounted or self._beside.wants_mountings
 
     def mount_beside(self, what: str, mounting: Array) -> None:
-        """Take a mounting (4, 4) that was wanted."""
+        """Take a transform (4, 4) of ``wanted_mountings``."""
         self._beside.mount(what, mounting)
 
     def count_dropped(self, reason: str, number: int = 1) -> None:
-        """Count images that a face received and did not hand on."""
+        """Count images that a front end received and dropped."""
         self.counts.received += number
         self.counts.dropped[reason] += number
         self._health.dropped(reason, number)
 
     def count_lost(self, number: int) -> None:
-        """Take notice of images that were sent and never came."""
+        """Note images that were sent and never received."""
         self._health.dropped('lost', number)
 
     @property
     def complaints(self) -> list[Complaint]:
-        """Say what there is to mend beside the state: what is seen, and what helps."""
+        """Return the present problems and their remedies."""
         more = self._of_calibration
         return [*self._health.complaints(self._scale, self.mounted),
                 *(one for one in more if one is not None),
@@ -394,7 +351,7 @@ class Tracker:
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
-        """Say what there is to mend of what a whole recording holds."""
+        """Return the problems of a whole recording."""
         found = (self._health.stamps_stood(), self._health.few_levels(),
                  self._health.never_measured(self._scale), self._health.two_cameras(),
                  *self._of_calibration, *self.complaints_beside)
@@ -402,11 +359,11 @@ class Tracker:
 
     @property
     def complaints_beside(self) -> list[Complaint]:
-        """Say what there is to mend of what comes beside the images."""
+        """Return the problems of the inputs other than images."""
         return self._beside.complaints(self.last.frame_id if self.last else '')
 
     def diagnosis(self) -> Diagnosis:
-        """Say how the odometry is doing."""
+        """Return the content of a diagnostics message."""
         diagnosis = diagnose(self.state, self.detail, self.counts,
                              self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
@@ -418,14 +375,14 @@ class Tracker:
         return diagnosis
 
     def diagnostics(self, stamp: int) -> Outgoing:
-        """Give the diagnostics message of this moment, in nanoseconds."""
+        """Return the diagnostics message with a stamp in nanoseconds."""
         diagnosis = self.diagnosis()
         return Outgoing('/diagnostics', self._messages.diagnostics(
             stamp, f'{self._node}: visual odometry', diagnosis.level, diagnosis.summary,
             diagnosis.values, self.last.frame_id if self.last else ''))
 
     def debug_image(self) -> Outgoing | None:
-        """Draw the last pair; None where there is none. Costs time: ask only if somebody looks."""
+        """Return a drawing of the last pair, None without one; for subscribers, as it is slow."""
         if self._frame is None or self.last is None or self.last.relative is None:
             return None
         return Outgoing('debug_image', self._messages.picture(
@@ -434,18 +391,18 @@ class Tracker:
                         self.last.relative)))
 
     def landmarks(self) -> Outgoing | None:
-        """Give the landmarks of the last pair; None where none of them carry its scale."""
+        """Return the landmarks in the last frame; None without any."""
         if self._frame is None or self.last is None or not self._moved \
                 or not len(places := self._odometry.landmarks()):
             return None
         return Outgoing('landmarks', self._messages.landmarks(self.last, places))
 
     def settled(self) -> Array:
-        """Places (M, 3), in the first camera, of landmarks that the last pair refined last."""
+        """Return landmarks (M, 3), in the first camera, that the last pair refined last."""
         return self._in_first(self._odometry.landmarks(settled=True))
 
     def unsettled(self) -> Array:
-        """Places (M, 3), in the first camera, of landmarks that the next pair may refine."""
+        """Return landmarks (M, 3), in the first camera, that the next pair may refine."""
         return self._in_first(self._odometry.landmarks())
 
     def _in_first(self, places: Array) -> Array:
@@ -455,24 +412,24 @@ class Tracker:
 
     @property
     def _moved(self) -> bool:
-        """Whether the last image went on from the one before."""
+        """Return whether the motion of the last image was estimated."""
         return self.last is not None and self.last.status in TRACKED \
             and not self.last.stationary
 
     def _without_camera(self, stamp: int) -> list[Outgoing]:
-        """Drop an image for want of a camera; an unusable CameraInfo stays the problem."""
+        """Drop an image without a camera; an unusable CameraInfo stays the state."""
         self._drop('waiting_for_camera_info')
         self._await()
         return self._diagnostics_if_due(stamp)
 
     def _astray(self, image: Any, following: Any, newest: Frame) -> str:
-        """Why an image that leaps is of no use: ahead, where the next one goes on before it."""
-        goes_on = (following is not None and stamp_ns(following.header) > newest.stamp_ns
-                   and not self.leaps(following))
-        return 'ahead' if goes_on and self.leaps(image) else ''
+        """Return 'ahead' if only this image leaps, but not the one after it; otherwise ''."""
+        continues = (following is not None and stamp_ns(following.header) > newest.stamp_ns
+                     and not self.leaps(following))
+        return 'ahead' if continues and self.leaps(image) else ''
 
     def _out_of_order(self, stamp: int, newest: Frame) -> str:
-        """Why an image is of no use beside the newest one: equal_stamp, late, or nothing."""
+        """Return why an image cannot follow the newest one: 'equal_stamp', 'late' or ''."""
         if stamp > newest.stamp_ns:
             return ''
         if stamp == newest.stamp_ns:
@@ -508,7 +465,7 @@ class Tracker:
         return [*self._poses(result), *self._diagnostics_if_due(frame.stamp_ns)]
 
     def _judge(self, result: OdometryResult) -> tuple[State, str]:
-        """State that a result puts the odometry into."""
+        """Return the state after a result, with its detail."""
         status = result.status
         if status in TRACKED or status in STARTED:
             self._bad_pairs = 0
@@ -546,7 +503,7 @@ class Tracker:
         return [Outgoing('path', self._messages.path(self._path))]
 
     def _await(self) -> None:
-        """Wait for what is missing; an unusable CameraInfo stays the problem."""
+        """Enter the state of waiting for what is missing; an unusable CameraInfo stays it."""
         if self._camera is not None:
             self._enter(State.WAITING_FOR_IMAGE)
         elif self._info is None:
@@ -566,15 +523,5 @@ class Tracker:
 
 
 def _frames(config: OdometryConfig) -> tuple[str, ...]:
-    """Name what poses in the odom frame are of, and along which axes."""
+    """Return what frames and axes the poses in the odom frame depend on."""
     return config.odom_frame, config.base_frame, config.camera_frame, config.frame_convention
-
-
-def _seen(message: Any, camera: Camera, limits: tuple[int, int],
-          estimator: TwoViewEstimator | None) -> _Seen:
-    """See an image by a camera, and prepare its view where there is an estimator for it."""
-    raw = gray_image(message, limits)
-    gray = camera.undistort(raw)
-    view = None if estimator is None else estimator.view(
-        gray, camera.K, left_out=camera.unseen(raw.shape))
-    return _Seen(gray, raw.shape, view, coarse(message, raw))
