@@ -8,8 +8,8 @@ from djet_ros.core.geometry import rotation_exp, rotation_log
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Common, Length
 from djet_ros.odometry.uncertainty import (
-    _ALIKE,
-    _PASSED_ON,
+    _CORRELATED,
+    _PERSISTENCE,
     compose,
     in_a_chain,
     PathCovariance,
@@ -74,9 +74,9 @@ def test_pairs_that_see_the_same_err_alike():
     rng = np.random.default_rng(1)
     lasting, own = np.zeros((SAMPLES, 6)), []
     for number in range(COUNT):
-        fresh = np.sqrt(_ALIKE * (1 - _PASSED_ON**2 * (number > 0)))
-        lasting = _PASSED_ON * lasting + fresh * rng.normal(size=(SAMPLES, 6))
-        rest = np.sqrt(1 - _ALIKE) * rng.normal(size=(SAMPLES, 6))
+        fresh = np.sqrt(_CORRELATED * (1 - _PERSISTENCE**2 * (number > 0)))
+        lasting = _PERSISTENCE * lasting + fresh * rng.normal(size=(SAMPLES, 6))
+        rest = np.sqrt(1 - _CORRELATED) * rng.normal(size=(SAMPLES, 6))
         own.append((lasting + rest) @ ROOT)
     found = sampled(np.zeros((COUNT, SAMPLES)), np.array(own))
     same(told(ROOT**2, [None] * COUNT, by_pairs=True), found)

@@ -22,7 +22,7 @@ from djet_ros.odometry.scale import (
     scale_source,
     ScaleSource,
     SpeedScale,
-    Unmeasured,
+    RelativeScale,
 )
 from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
@@ -135,7 +135,7 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
     wrong = replace(doubtful, y_opt=doubtful.x + moved)
     found = []
     for pair in doubtful, wrong:
-        scale.configure(ESTIMATOR, Unmeasured(), 0.05)
+        scale.configure(ESTIMATOR, RelativeScale(), 0.05)
         scale.reset()
         scale.begin(views[0])
         for n, known in enumerate(pairs[:-2]):
@@ -277,7 +277,7 @@ def test_one_wild_speed_does_not_change_the_scale(cards):
 
 
 def test_the_same_frames_give_the_same_scale_to_the_last_bit(cards):
-    first, second = (Drive(cards, Unmeasured()).go(steps()[:6]) for _ in range(2))
+    first, second = (Drive(cards, RelativeScale()).go(steps()[:6]) for _ in range(2))
     for one, other in zip(first, second):
         assert np.array_equal(one.pose, other.pose)
         assert np.array_equal(one.pose_covariance, other.pose_covariance)
@@ -360,7 +360,7 @@ def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
 def test_another_estimator_goes_on_at_the_last_speed(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12)] * 3)
-    drive.odometry.configure(EstimatorConfig(max_features=600), OdometryConfig(), Unmeasured())
+    drive.odometry.configure(EstimatorConfig(max_features=600), OdometryConfig(), RelativeScale())
     assert lengths(drive.go([pose(x=0.16, z=0.12)] * 2)) == pytest.approx(1, rel=0.05)
 
 
@@ -501,13 +501,13 @@ def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
     assert after.scale_kind is Scale.RELATIVE
 
 
-@pytest.mark.parametrize('source', [Unmeasured(), ConstantScale(1.2)])
+@pytest.mark.parametrize('source', [RelativeScale(), ConstantScale(1.2)])
 def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(source):
     """A window that sees none of them has its newest frame wherever rounding puts it."""
     ahead = np.array([0, 0, -1.0])
     added = [Addition(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
              for length, sigma in ((1.0, 1e-3), (0.02, 800.0))]
-    source.exact, source.carried = False, True
+    source.exact, source.uses_landmarks = False, True
     scale = TrackScale()
     scale.configure(ESTIMATOR, source, 0.0)
     scale._window = SimpleNamespace(
@@ -530,7 +530,7 @@ def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariance
     added = [Addition(np.eye(3), t, float(np.linalg.norm(t)), 1e-3, sure, np.eye(4))
              for t in (ahead, aside)]
     scale = TrackScale()
-    scale.configure(ESTIMATOR, Unmeasured(), 0.0)
+    scale.configure(ESTIMATOR, RelativeScale(), 0.0)
     scale._window = SimpleNamespace(
         is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
         add=lambda view, relative, guess: added.pop(0))
@@ -549,7 +549,7 @@ class Ground(ScaleSource):
     """A source that tells given lengths in metres, one for each second, each to two per cent."""
 
     def __init__(self, metres, alike):
-        self.metres, self.alike = metres, alike
+        self.metres, self.correlation_length = metres, alike
 
     def between(self, start_ns, end_ns):
         metres = self.metres[start_ns // 10**9]

@@ -22,7 +22,7 @@ from djet_ros.odometry.scale import (
     scale_source,
     SpeedScale,
     UnitScale,
-    Unmeasured,
+    RelativeScale,
 )
 from djet_ros.odometry.uncertainty import compose, motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
@@ -487,7 +487,7 @@ def test_with_other_parameters_both_images_of_the_next_pair_are_seen_by_them(car
     for before, after in ((ESTIMATOR, other), (other, ESTIMATOR)):
         vo = VisualOdometry(before)
         prior = [vo.process(frame) for frame in frames[:3]][-1].relative
-        vo.configure(after, OdometryConfig(), Unmeasured())
+        vo.configure(after, OdometryConfig(), RelativeScale())
         estimator = TwoViewEstimator(after)
         views = [estimator.view(frame.gray, frame.K) for frame in frames[2:]]
         expected, found = estimator.estimate(*views, prior), vo.process(frames[3]).relative
@@ -579,7 +579,7 @@ def test_ground_truth_is_interpolated_and_not_believed_across_holes():
 
 
 def test_the_configuration_names_the_scale():
-    assert isinstance(scale_source(OdometryConfig()), Unmeasured)
+    assert isinstance(scale_source(OdometryConfig()), RelativeScale)
     assert isinstance(scale_source(OdometryConfig(scale='none')), UnitScale)
     assert scale_source(OdometryConfig(scale='constant', scale_value=2)).between(0, 1).value == 2
     assert isinstance(scale_source(OdometryConfig(scale='speed')), SpeedScale)

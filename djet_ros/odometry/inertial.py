@@ -1,11 +1,11 @@
 """
-A gyro beside the camera: how it turned between two images, and what is wrong with its rates.
+Gyro preintegration: the camera's rotation between two images, and an estimate of the bias.
 
-Rates are integrated on SO(3) as if they were linear between two samples (Magnus expansion to the
-fourth order; Blanes et al., Physics Reports 2009), from the stamp of one image to that of the
-other. A Kalman filter learns the bias, which wanders, from what the images tell of the same turn.
+Rates are interpolated linearly and integrated on SO(3) (Magnus expansion to the fourth order;
+Blanes et al., Physics Reports 2009), from the stamp of one image to that of the other. A Kalman
+filter estimates the bias, a random walk, from rotations that the images measure.
 
-What an image calls t is t + offset to the IMU, as Kalibr's timeshift_cam_imu has it.
+The IMU's stamp is the image's stamp plus an offset, as Kalibr's timeshift_cam_imu.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from djet_ros.odometry.stamped import Stamped
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-# Samples that are kept: a minute and more of the fastest IMUs.
+# Samples that are kept: more than a minute of the fastest IMUs.
 _KEPT = 200_000
 
-# A hole between two samples beyond which nobody knows what happened in it.
-_LONGEST_HOLE_NS = 250_000_000
+# Longest gap between two samples over which rates are interpolated.
+_LONGEST_GAP_NS = 250_000_000
 
-# rad/s that no gyro measures, and from which on equal values in a row are the end of its range.
+# rad/s beyond every gyro's range, and from which on equal values in a row mean saturation.
 _FASTEST, _FAST = 200.0, 3.0
 _EQUAL_IN_A_ROW = 3
 
-# Standard deviation of a bias that nobody has measured yet, in rad/s: of cheap gyros, warming up,
-# hardly any is beyond 0.05.
+# Standard deviation of the initial bias in rad/s: cheap gyros, warming up, rarely exceed 0.05.
 _BIAS_AT_FIRST = 0.05 / 3
 
-# Standard deviation by which an interpolated rate is off, as a share of its change.
+# Standard deviation of an interpolated rate, as a share of the change between its samples.
 _INTERPOLATION = 1 / 6
 
-# Standard deviations within which a turn is none, and factor within which noise is noise.
+# At rest: largest rotation in standard deviations, and largest spread of the rates as a multiple
+# of their white noise.
 _AT_REST, _NOISE_AT_REST = 4.0, 3.0
 
-# Pairs by which a gyro is judged, and those that are too few for that.
+# Newest pairs by which a gyro is judged, and the number below which it is not.
 _JUDGED, _FEW = 50, 20
 
-# rad: a turn that is known worse than this says nothing of rest.
-_TELLING = np.radians(0.1)
+# rad: largest standard deviation of a rotation from which rest can be concluded.
+_SIGMA_AT_REST = np.radians(0.1)
 
 
 @dataclass(frozen=True)
 class GyroNoise:
     """
-    What a data sheet says of a gyro.
+    Noise parameters of a gyro's data sheet.
 
-    density: of white noise, rad/s/√Hz; walk: of the bias, rad/s²/√Hz.
+    density: of white noise, rad/s/√Hz; walk: random walk of the bias, rad/s²/√Hz.
     """
 
     density: float
@@ -63,11 +63,11 @@ class GyroNoise:
 @dataclass(frozen=True)
 class _Integral:
     """
-    Of rates between two stamps, bias taken off, along the IMU's axes.
+    Integrated rates between two stamps, without the bias, along the IMU's axes.
 
-    turn: (3, 3) the IMU at the end in the IMU at the start; by_bias: (3, 3) by what rotation
-    vector from the right a unit of bias falsifies it; seconds; interpolation: variance in rad
-    squared; spread: (3,) standard deviation of the rates; samples: how many.
+    turn: (3, 3) the IMU at the end in the IMU at the start; by_bias: (3, 3) Jacobian of its error,
+    a rotation vector from the right, by the bias; seconds: duration; interpolation: variance in
+    rad squared; spread: (3,) standard deviation of the rates; samples: their number.
     """
 
     turn: Array
@@ -79,23 +79,28 @@ class _Integral:
 
 
 class Gyro:
-    """Takes rates as they come, and tells turns of the camera once it knows how it is mounted."""
+    """
+    Measures rotations of the camera, once its mounting is known.
+
+    noise: of its data sheet; offset_ns: of its stamps to those of images; to_camera: (3, 3) rotation of the IMU's axes to the camera's, or
+    None; bias: (3,) rad/s, with bias_covariance (3, 3); refused: counts of unusable samples.
+    """
 
     def __init__(self, noise: GyroNoise, offset_ns: int = 0) -> None:
         self.configure(noise, offset_ns)
         self.to_camera: Array | None = None
         self.bias: Array = np.zeros(3)
-        self._learnt_ns: int | None = None
-        self._unlearn()
+        self._bias_ns: int | None = None
+        self._reset_bias()
         self._verdicts: deque[bool] = deque(maxlen=_JUDGED)
         self.reset()
 
     def configure(self, noise: GyroNoise, offset_ns: int) -> None:
-        """Take other parameters; what was measured and learnt stays."""
+        """Change the parameters; samples and the estimated bias are kept."""
         self.noise, self.offset_ns = noise, offset_ns
 
     def reset(self) -> None:
-        """Forget all samples; the bias is the device's, and stays known."""
+        """Forget all samples; the estimated bias is kept."""
         self._rates = Stamped[Array](_KEPT)
         self._saturated: list[int] = []
         self._equal = 0
@@ -103,11 +108,11 @@ class Gyro:
         self.refused: Counter[str] = Counter()
 
     def mount(self, to_camera: Array) -> None:
-        """Take the rotation (3, 3) of the IMU's axes to those of the camera."""
+        """Set the rotation (3, 3) of the IMU's axes to those of the camera."""
         self.to_camera = to_camera
 
     def add(self, stamp_ns: int, rate: Array) -> None:
-        """Take a rate (3,) in rad/s; what is of no use is counted in ``refused``."""
+        """Take a rate (3,) in rad/s; unusable ones are counted in ``refused``."""
         if not (np.abs(rate) < _FASTEST).all():
             self.refused['not a rate'] += 1
             return
@@ -119,22 +124,22 @@ class Gyro:
             self.refused['equal stamp'] += 1
             return
         if self._rates and stamp_ns < self._rates.stamps[-1]:
-            # Of use all the same; what its neighbours say of the range of the gyro is known.
+            # It is used, but not tested for saturation, which needs samples in order.
             self.refused['out of order'] += 1
         else:
             self._note_saturation(stamp_ns, rate)
         self._rates.add(stamp_ns, rate)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Let go of what was before an image that no other will be related to."""
+        """Drop samples that are not needed after the stamp of an image."""
         self._rates.forget_before(stamp_ns + self.offset_ns)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Tell whether there is a sample at the stamp of an image, or after it."""
+        """Return whether there is a sample at the stamp of an image, or after it."""
         return self._rates.covers(stamp_ns + self.offset_ns)
 
     def turn(self, start_ns: int, end_ns: int) -> Turn | None:
-        """Tell how the camera turned between two images; None where that was not measured."""
+        """Return the camera's rotation between two images; None if it was not measured."""
         if self.to_camera is None or (integral := self._integral(start_ns, end_ns)) is None:
             return None
         C, by_bias = self.to_camera, self.to_camera @ integral.by_bias
@@ -145,87 +150,87 @@ class Gyro:
 
     def learn(self, start_ns: int, end_ns: int, R: Array, covariance: Array) -> None:
         """
-        Learn the bias from a rotation that the images tell, R (3, 3) and its covariance (3, 3).
+        Estimate the bias from a rotation R (3, 3) with covariance (3, 3) by the images.
 
-        Both as those of a RelativePose.
+        Both are as in a RelativePose.
         """
         turn = self.turn(start_ns, end_ns)
         integral = self._integral(start_ns, end_ns)
         if turn is None or integral is None or self.to_camera is None \
                 or not np.isfinite(covariance).all():
             return
-        # R_true = exp(J db) R_told, with db what the bias is beyond what it was taken for.
+        # R_true = exp(J db) R_measured, where db is the true bias minus the assumed one.
         J, P = self.to_camera @ integral.by_bias, self._bias_at(end_ns)
         noise = turn.covariance - J @ P @ J.T + covariance
         gain = P @ J.T @ np.linalg.inv(J @ P @ J.T + noise)
         keep = np.eye(3) - gain @ J
         self.bias = self.bias - gain @ turn.off(R)
         self.bias_covariance = keep @ P @ keep.T + gain @ noise @ gain.T
-        self._learnt_ns = end_ns
+        self._bias_ns = end_ns
 
     def at_rest(self, start_ns: int, end_ns: int) -> bool:
-        """Tell whether the gyro felt nothing between two images, and would have felt a turn."""
+        """Return whether the rotation between two images is insignificant, and well measured."""
         turn, integral = self.turn(start_ns, end_ns), self._integral(start_ns, end_ns)
         if turn is None or integral is None or integral.samples < _EQUAL_IN_A_ROW:
             return False
         sigma = float(np.sqrt(np.linalg.eigvalsh(turn.covariance)[-1]))
         white = self.noise.density * np.sqrt(integral.samples / integral.seconds)
         angle = float(np.linalg.norm(turn.off(np.eye(3))))
-        return bool(sigma < _TELLING and angle < _AT_REST * sigma
+        return bool(sigma < _SIGMA_AT_REST and angle < _AT_REST * sigma
                     and (integral.spread < _NOISE_AT_REST * white).all())
 
     def judge(self, agreed: bool) -> None:
-        """Take whether the images told the same turn, as far as both knew it."""
+        """Note whether the rotation of a pair agreed with the gyro's, by both covariances."""
         fitted = self.fits
         self._verdicts.append(agreed)
         if fitted and not self.fits:
-            # The bias may have been learnt from something that moved by itself.
-            self._unlearn()
+            # The bias may have been estimated from an object that moved by itself.
+            self._reset_bias()
 
     @property
     def fits(self) -> bool:
-        """Whether most of the newest turns were those that the images told."""
+        """Return whether most of the newest rotations agreed with the images."""
         return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
 
     @property
     def ever_fitted(self) -> bool:
-        """Whether any of the newest turns was the one that the images told."""
+        """Return whether any of the newest rotations agreed with the images."""
         return any(self._verdicts)
 
     @property
     def bears_alone(self) -> bool:
-        """Whether a turn may be told by it alone: the images were not mostly against it so far."""
+        """Return whether it may be used without images: at least half of the pairs agreed."""
         return self.fits and 2 * sum(self._verdicts) >= len(self._verdicts)
 
-    def _unlearn(self) -> None:
-        """Know no more of the bias than of any gyro's."""
+    def _reset_bias(self) -> None:
+        """Reset the bias."""
         self.bias, self.bias_covariance = np.zeros(3), np.eye(3) * _BIAS_AT_FIRST**2
-        self._learnt_ns = None
+        self._bias_ns = None
 
     def _bias_at(self, end_ns: int) -> Array:
-        """Covariance (3, 3) of the bias, which wanders since it was learnt."""
-        seconds = 0.0 if self._learnt_ns is None else abs(end_ns - self._learnt_ns) * 1e-9
+        """Return the covariance (3, 3) of the bias, by its random walk since it was estimated."""
+        seconds = 0.0 if self._bias_ns is None else abs(end_ns - self._bias_ns) * 1e-9
         return self.bias_covariance + self.noise.walk**2 * seconds * np.eye(3)
 
     def _integral(self, start_ns: int, end_ns: int) -> _Integral | None:
-        """Give the integral of the rates, which several ask for in turn."""
+        """Return the integrated rates; the last result is cached."""
         asked = start_ns, end_ns, self.offset_ns, self.bias.tobytes(), len(self._rates)
         if self._latest is None or self._latest[0] != asked:
             self._latest = asked, self._integrated(start_ns, end_ns)
         return self._latest[1]
 
     def _integrated(self, start_ns: int, end_ns: int) -> _Integral | None:
-        """Integrate the rates; None where samples are missing, or at the end of their range."""
+        """Integrate the rates; None if samples are missing or saturated."""
         start, end = start_ns + self.offset_ns, end_ns + self.offset_ns
         known = self._rates.stamps
         first, last = bisect_right(known, start) - 1, bisect_left(known, end)
         if first < 0 or last >= len(known) or end <= start:
             return None
         stamps = known[first:last + 1]
-        if max(b - a for a, b in pairwise(stamps)) > _LONGEST_HOLE_NS \
+        if max(b - a for a, b in pairwise(stamps)) > _LONGEST_GAP_NS \
                 or self._is_saturated(stamps[0], stamps[-1]):
             return None
-        # Seconds from the start: absolute ones would lose digits.
+        # Seconds from the start, as absolute ones lose precision.
         seconds = np.array([(stamp - start) * 1e-9 for stamp in stamps])
         rates = np.array([self._rates[stamp] for stamp in stamps]) - self.bias
         inside = (seconds > 0) & (seconds < (end - start) * 1e-9)
@@ -235,9 +240,9 @@ class Gyro:
 
     def _note_saturation(self, stamp_ns: int, rate: Array) -> None:
         """
-        Take values that stay the same at a high rate for the end of the gyro's range.
+        Note the newest sample as saturated if a high rate stays exactly the same.
 
-        Of the newest sample, so that stamps of these stay sorted.
+        Only the newest one, so that the stamps stay sorted.
         """
         before = self._rates[self._rates.stamps[-1]] if self._rates else np.zeros(3)
         same = bool(((rate == before) & (np.abs(rate) > _FAST)).any())
@@ -253,7 +258,7 @@ class Gyro:
 
 
 def _integrate(times: Array, knots: Array, rates: Array) -> _Integral:
-    """Integrate rates (M, 3) at times (M,), linear in between; rates (N, 3): as measured."""
+    """Integrate knots (M, 3), rates at times (M,), linear in between; rates (N, 3): measured."""
     h = np.diff(times)[:, None]
     before, after = knots[:-1], knots[1:]
     steps = Rotation.from_rotvec(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from djet_ros.core.geometry import skew
 from djet_ros.core.types import Array
-from djet_ros.odometry.uncertainty import both_turned, symmetric
+from djet_ros.odometry.uncertainty import block_rotation, symmetric
 import numpy as np
 
 
@@ -30,6 +30,6 @@ def twist_of_base(velocity: Array, covariance: Array, T: Array) -> tuple[Array, 
 
 def _lever(T: Array, arm: Array) -> Array:
     """Jacobian (6, 6) of a turn by T's rotation, with a lever arm (3, 3) after it."""
-    J = both_turned(T[:3, :3])
+    J = block_rotation(T[:3, :3])
     J[:3, 3:] = arm @ T[:3, :3]
     return J

@@ -1,8 +1,8 @@
 """
-The length of a translation, which two views of one camera cannot tell.
+Scale sources: the length of a translation, which two views of one camera do not determine.
 
-A scale source answers for a stretch of time. Where it knows nothing, its answer is marked so, and
-the covariance of the motion says it.
+A source returns the length between two stamps. If it has none, the length is marked as unknown,
+and the covariance of the motion is large accordingly.
 """
 
 from __future__ import annotations
@@ -26,45 +26,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-# Standard deviation, in units of the trajectory, of a length that is not known: huge for every
-# filter that weighs by it, and far from where squares lose their precision.
+# Standard deviation of an unknown length, in units of the trajectory: large for every filter that
+# weights by it, yet its square keeps its precision.
 UNKNOWN_LENGTH_SIGMA = 1e3
 
-# A speed or a position older than this says nothing any more.
+# Nanoseconds for which a speed, a position or the ground's motion is held.
 _LONGEST_HOLD_NS = 500_000_000
 
-# Metres per second that no camera goes; squares of what a broken sensor sends may be infinite.
+# Metres per second that no camera reaches; a broken sensor may send values with infinite squares.
 _FASTEST = 1e5
 
-# Speeds kept for intervals that are still to come.
+# Speeds that are kept for later intervals.
 _KEPT_SPEEDS = 10_000
 
-# How speed (m/s) wanders in a second, and the camera's pitch and roll against the ground (rad)
-# where no rotation tells what they do.
+# Random walk over a second of speed (m/s), and of the camera's pitch and roll against the ground
+# (rad) if no rotation predicts them.
 _WANDERING = np.array([1.0, np.radians(0.5), np.radians(0.5)])
 
-# How ground in sight of a car tilts as the way goes on, in rad after a metre; chosen. The heights
+# Random walk over a metre of the slope of the ground that a car sees, in rad; chosen. The heights
 # of a road of class C (ISO 8608) make 0.07 degrees, to which its bends are added.
 _BENDING = np.radians(0.1)
 
-# What nobody knows before the first pair: speed, and how well the camera is mounted.
+# Standard deviations before the first pair: of speed (m/s), and of pitch and roll (rad) by
+# mounting.
 _AT_FIRST = np.array([1e3, np.radians(2.0), np.radians(2.0)])
 
-# By how much a plane through that ground, eight metres of it, leans otherwise than the road;
+# Standard deviation in rad between a plane through eight metres of that ground and the road;
 # chosen: heights of class B make 0.08 degrees, those of class C 0.16.
 _UNEVEN = np.radians(0.1)
 
-# Lengths that a scale can't do without: their parameter, the smallest in metres, their meaning.
+# Lengths that a scale requires: their parameter, the smallest value in metres, their meaning.
 _WANTED = {'constant': ('scale_value', 1e-6, 'the metres of each translation'),
            'camera_height': ('camera_height', 0.01, 'the metres from the ground to the camera')}
 
-# Normalised squared error (1 or 2 expected) beyond which something is not what it was taken for.
-_SURPRISE = 20.0
+# Normalised squared innovation (1 or 2 expected) of an outlier.
+_OUTLIER = 20.0
 
 
 @unique
 class Scale(StrEnum):
-    """What lengths are in: metres, the one unit of the track, or nothing that lasts."""
+    """Unit of a length: metres, the unit of the track, or an unknown one for each step."""
 
     METRIC = 'metric'
     RELATIVE = 'relative'
@@ -76,8 +77,8 @@ class Common:
     """
     Errors that a length has in common with the lengths before and after it, as shares of it.
 
-    variances: (2,) of that of the track's factor, as it has wandered by now, and of that which all
-    metric lengths have for good; kept: (2,) how much of either was in the length before.
+    variances: (2,) of the track's scale factor, which drifts, and of the error that all metric
+    lengths have in common; kept: (2,) the share of either error that the previous length had too.
     """
 
     variances: Array
@@ -87,12 +88,11 @@ class Common:
 @dataclass(frozen=True)
 class Length:
     """
-    How long a translation is.
+    Length of a translation, with its standard deviation sigma.
 
-    known: whether value and sigma mean anything, in metres if `metric`, otherwise in the unit
-    that all lengths of the track have in common; measured: whether its source measured it; common:
-    what of its error is in its neighbours too, None where that is not known. In sigma that is of
-    metres alone.
+    known: whether both are meaningful, in metres if `metric`, otherwise in the unit of the track;
+    measured: whether its source measured it; common: its error in common with other lengths, None
+    if that is unknown; sigma includes it only if the length is metric.
     """
 
     value: float
@@ -104,7 +104,7 @@ class Length:
 
     @property
     def own(self) -> Length:
-        """Take what it has in common with its neighbours from its sigma."""
+        """Return it with the standard deviation of its own error alone."""
         if not self.metric or self.common is None:
             return self
         variance = self.sigma**2 - self.value**2 * float(self.common.variances.sum())
@@ -112,29 +112,27 @@ class Length:
 
     @property
     def scale(self) -> Scale:
-        """Tell what the length is in."""
+        """Return its unit."""
         return (Scale.UNKNOWN if not self.known else
                 Scale.METRIC if self.metric else Scale.RELATIVE)
 
 
 class ScaleSource(Protocol):
     """
-    Something that knows how far the camera went.
+    Source of the lengths of translations.
 
-    What it does not use of what it is shown, and what it does not measure, it leaves as it is.
-
-    carried: whether the landmarks that frames share carry its scale from step to step, and on
-    where it falls silent; exact: whether each length that it knows is right as it is; alike: of
-    how many metres in a row lengths err by the same share.
+    uses_landmarks: whether landmarks carry its scale from step to step, also while it has no
+    measurements; exact: whether its lengths have no error of their own; correlation_length: metres
+    over which its lengths have the same relative error.
     """
 
-    carried: bool = True
+    uses_landmarks: bool = True
     exact: bool = False
-    alike: float = 0.0
+    correlation_length: float = 0.0
 
     def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
                 relative: RelativePose) -> None:
-        """Look at a pair of views and the motion between them, before its length is asked for."""
+        """Take a pair of views and their relative pose, before ``between`` is called for it."""
         return
 
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
@@ -142,65 +140,64 @@ class ScaleSource(Protocol):
         return
 
     def why_unknown(self, stamp_ns: int) -> str:
-        """Say what is seen of the reason why a length up to a stamp is not known."""
+        """Return a text on why the length up to a stamp is unknown."""
         return 'nothing is measured'
 
     @abstractmethod
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Length of the translation between two stamps."""
+        """Return the length of the translation between two stamps."""
 
     def reset(self) -> None:
-        """Forget what was measured."""
+        """Forget all measurements."""
         return
 
     def go_back(self, stamp_ns: int) -> None:
         """
-        Hear that time begins anew with the image of a stamp.
+        Forget the measurements from before time went back to the stamp of an image.
 
-        What was measured before that time did is forgotten; what comes on a topic of its own may
-        have told of the new time already, and that stays.
+        Those of other topics may already be of the new time, and are kept.
         """
         self.reset()
 
 
 class UnitScale(ScaleSource):
-    """Every translation has length one, and nothing is known."""
+    """Every translation has length one, of an unknown unit."""
 
-    carried = False
+    uses_landmarks = False
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Give one, unknown."""
+        """Return an unknown length of one."""
         return unknown(1.0)
 
 
-class Unmeasured(ScaleSource):
-    """Nothing measures metres; landmarks carry one unit, the length of the first step."""
+class RelativeScale(ScaleSource):
+    """No metric measurements: landmarks carry the unit, which is the length of the first step."""
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Give one, unknown."""
+        """Return an unknown length of one."""
         return unknown(1.0)
 
 
 class ConstantScale(ScaleSource):
-    """Every translation has the same known length in metres; uncertainty is a share of it."""
+    """Every translation has the same known length in metres; uncertainty: sigma as its share."""
 
-    carried, exact = False, True
+    uses_landmarks, exact = False, True
 
     def __init__(self, metres: float, uncertainty: float = 0.05) -> None:
         self._length = Length(metres, metres * uncertainty, True)
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Give the constant length."""
+        """Return the constant length."""
         return self._length
 
 
 class SpeedScale(ScaleSource):
     """
-    Speed times time, from stamped speeds that come in as the camera moves.
+    Integral of measured speeds over time.
 
-    The speed between two stamps is their linear interpolation, and that of the outermost ones
-    holds beyond them. Where the nearest one is more than half a second away, the length is
-    unknown, and what that makes is the guess.
+    Speeds are interpolated linearly, and held constant before the first and after the last one. If
+    the nearest one is more than half a second away, the length is unknown, and the integral only a
+    guess.
     """
 
     def __init__(self, uncertainty: float = 0.05) -> None:
@@ -208,7 +205,7 @@ class SpeedScale(ScaleSource):
         self.reset()
 
     def why_unknown(self, stamp_ns: int) -> str:
-        """Say how far the newest speed is off."""
+        """Return how far the stamp of the newest speed is off."""
         if not self._speeds:
             return 'no speed has come'
         off = (self._speeds.stamps[-1] - stamp_ns) * 1e-9
@@ -216,7 +213,7 @@ class SpeedScale(ScaleSource):
                 f'{"after" if off > 0 else "before"} the newest image')
 
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
-        """Take a measured speed; one beyond any sense, or of a stamp that has one, is ignored."""
+        """Take a measured speed; an impossible one, or one with a known stamp, is ignored."""
         if not abs(metres_per_second) <= _FASTEST or stamp_ns in self._speeds:
             return
         self.go_back(stamp_ns)
@@ -246,44 +243,43 @@ class SpeedScale(ScaleSource):
         self._speeds = Stamped[float](_KEPT_SPEEDS)
 
     def go_back(self, stamp_ns: int) -> None:
-        """Forget the speeds unless the last ones are of the new time: then all of them are."""
+        """Forget the speeds unless the newest ones are of the new time."""
         if self._speeds.goes_back(stamp_ns):
             self.reset()
 
 
 class CameraHeightScale(ScaleSource):
     """
-    Translations over level ground in heights of the camera, which is known in metres.
+    Translation over level ground, from the known height of the camera above it.
 
-    Each pair of views gives the translation between them and the camera's pitch and roll, with an
-    uncertainty; one is often sure only against the other. A Kalman filter over (speed, pitch,
-    roll) brings together what pairs say. Speed changes as vehicles can. Pitch and roll change with
-    the turn of each pair, as ground keeps still: so a vehicle that nods is told from ground that
-    bends. What bends more than roads do is none. While no ground is seen they stay as they were:
-    on a hill the road turns with the vehicle.
+    Each pair of views measures the translation in heights, and the camera's pitch and roll against
+    the ground; their errors are strongly correlated. A Kalman filter over (speed, pitch, roll)
+    fuses the pairs. Speed is a random walk. Pitch and roll are predicted by the rotation of each
+    pair, as the ground is static: this separates a vehicle that nods from ground that bends.
+    Measurements of more bend than roads have are outliers. While no ground is seen, pitch and roll
+    are kept: on a hill the road turns with the vehicle.
 
-    The ground must be seen to fill the lower part of the image, and the camera must not roll.
-    Where no ground was seen for half a second, the length is unknown, and the last speed remains
-    the guess.
+    The ground must fill the lower part of the image, and the camera must not roll. If no ground
+    was seen for half a second, the length is unknown, and the last speed gives the guess.
 
-    uncertainty: standard deviation of the height as a share of it, all bumps of the road included.
+    uncertainty: standard deviation of the height as a share of it, bumps of the road included.
     """
 
     def __init__(self, height: float, pitch: float, uncertainty: float = 0.05) -> None:
-        """Take the camera's height in metres and its pitch in rad, looking down is positive."""
+        """Set the camera's height in metres and its pitch in rad, positive when looking down."""
         self._height, self._pitch, self._uncertainty = height, pitch, uncertainty
-        # A kerb, a lawn or a bump is seen from where it comes into sight until it leaves it.
-        self.alike = height * SIGHT
+        # A kerb, a lawn or a bump falsifies lengths as long as it is in view.
+        self.correlation_length = height * SIGHT
         self._ground: tuple[Array, tuple[int, ...], Ground] | None = None
         self._seen_ns: int | None = None
         self.reset()
 
     def observe(self, start_ns: int, end_ns: int, previous: View, current: View,
                 relative: RelativePose) -> None:
-        """Take from a pair of views how far the ground moved."""
+        """Measure the ground's motion in a pair of views, and update the filter."""
         seconds = (end_ns - start_ns) * 1e-9
         x, P = self._predicted(start_ns, end_ns)
-        # Lengths that the filter expects, in heights; four deviations to both sides.
+        # The interval of lengths that the filter predicts, in heights: four sigma to both sides.
         expected = (x[0] + np.array([-4, 4]) * np.sqrt(P[0, 0])) * seconds / self._height
         seen = self._ground_of(current).motion(
             previous, current, relative, (float(expected[0]), float(expected[1])))
@@ -292,7 +288,7 @@ class CameraHeightScale(ScaleSource):
             self._turn(relative, seconds)
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Speed over the ground times time."""
+        """Return the speed over the ground times time."""
         if self._seen_ns is None:
             return unknown(1.0)
         x, P = self._predicted(start_ns, end_ns)
@@ -304,7 +300,7 @@ class CameraHeightScale(ScaleSource):
         return Length(metres, max(float(sigma), 1e-3), True)
 
     def why_unknown(self, stamp_ns: int) -> str:
-        """Say that no ground was seen."""
+        """Return that no ground was seen."""
         return 'the images show no level ground as far below as it should be'
 
     def reset(self) -> None:
@@ -313,14 +309,14 @@ class CameraHeightScale(ScaleSource):
         self._seen_ns = None
 
     def _ground_of(self, view: View) -> Ground:
-        """Ground of the camera, which seldom changes."""
+        """Return the ground detector of a view's camera; kept, as the camera rarely changes."""
         if self._ground is None or self._ground[1] != view.gray.shape \
                 or not np.array_equal(self._ground[0], view.K):
             self._ground = view.K, view.gray.shape, Ground(view.K, view.gray.shape, self._pitch)
         return self._ground[2]
 
     def _predicted(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
-        """State (3,) in a pair, speed to its end and lean at its start, and covariance (3, 3)."""
+        """Return the state (3,) with its covariance: speed at the end, lean at the start."""
         gaps = np.zeros(3)
         if self._seen_ns is not None:
             gaps[0] = max(end_ns - self._seen_ns, 0)
@@ -328,19 +324,19 @@ class CameraHeightScale(ScaleSource):
         return self._x, self._P + np.diag(_WANDERING**2 * gaps * 1e-9)
 
     def _measured(self, seen: GroundMotion, seconds: float) -> tuple[Array, Array]:
-        """Speed, pitch and roll (3,) and their covariance, with how uneven ground is."""
+        """Return speed, pitch and roll (3,) and their covariance, roughness of ground included."""
         scale = np.array([self._height / seconds, 1.0, 1.0])
         return seen.value * scale, seen.covariance * np.outer(scale, scale) + np.diag(
             [0.0, _UNEVEN**2, _UNEVEN**2])
 
     def _update(self, z: Array, R: Array, x: Array, P: Array) -> bool:
-        """Take a measurement z (3,) with its covariance into what was predicted, if it is one."""
+        """Update a prediction x, P by a measurement z, R; return whether it is no outlier."""
         off, S = z - x, P + R
-        if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _SURPRISE:
+        if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _OUTLIER:
             # No ground leans like this.
             return False
-        if off[0]**2 > _SURPRISE * S[0, 0]:
-            # What is seen counts more than how vehicles speed up.
+        if off[0]**2 > _OUTLIER * S[0, 0]:
+            # The measurement overrules the model of how speed changes.
             P = P.copy()
             P[0] = P[:, 0] = 0.0
             P[0, 0] = _AT_FIRST[0]**2
@@ -351,7 +347,7 @@ class CameraHeightScale(ScaleSource):
         return True
 
     def _turn(self, relative: RelativePose, seconds: float) -> None:
-        """Take the lean from the start of a pair to its end."""
+        """Predict pitch and roll at the end of a pair by its rotation."""
         covariance = relative.covariance_5[:3, :3]
         if not np.isfinite(covariance).all():
             self._P = self._P + np.diag([0.0, *_WANDERING[1:]**2 * seconds])
@@ -364,20 +360,20 @@ class CameraHeightScale(ScaleSource):
 
 
 class GuessScale(ScaleSource):
-    """How far another odometry says that the camera went."""
+    """Distances by another odometry."""
 
     def __init__(self, uncertainty: float = 0.05) -> None:
         self._uncertainty = uncertainty
-        # Replaced by the one that hears something.
+        # To be replaced by the one that receives poses.
         self.guess = Guess()
 
     def why_unknown(self, stamp_ns: int) -> str:
-        """Say what is missing of the guess."""
+        """Return what is missing: a transform or poses."""
         return ('nobody says where the camera is in the frame of the guess'
                 if self.guess.mounting is None else 'no guess covers the time of the newest image')
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Give the way of the guess, unknown where it has none."""
+        """Return the distance, unknown if poses or the transform are missing."""
         motion = self.guess.motion(start_ns, end_ns)
         if motion is None:
             return unknown(1.0)
@@ -389,7 +385,7 @@ class GuessScale(ScaleSource):
         self.guess.reset()
 
     def go_back(self, stamp_ns: int) -> None:
-        """Forget the poses, but not those of the new time."""
+        """Forget the poses unless the newest ones are of the new time."""
         self.guess.go_back(stamp_ns)
 
 
@@ -405,11 +401,11 @@ class GroundTruthScale(ScaleSource):
         self._uncertainty = uncertainty
 
     def why_unknown(self, stamp_ns: int) -> str:
-        """Say that this time is not covered."""
+        """Return that this time is not covered."""
         return 'the ground truth does not cover the time of the newest image'
 
     def between(self, start_ns: int, end_ns: int) -> Length:
-        """Give the distance, unknown outside the stretch and wherever a gap is too wide."""
+        """Return the distance, unknown outside the track and in gaps that are too long."""
         start, end = positions_at(self._stamps, self._positions, np.array([start_ns, end_ns]),
                                   _LONGEST_HOLD_NS)
         metres = float(np.linalg.norm(end - start))
@@ -419,22 +415,21 @@ class GroundTruthScale(ScaleSource):
 
 
 def unknown(guess: float) -> Length:
-    """Make a length that is only a guess."""
+    """Return an unknown length, with a guess of it."""
     return Length(guess, UNKNOWN_LENGTH_SIGMA, False)
 
 
 def same_scale(before: OdometryConfig, after: OdometryConfig) -> bool:
-    """Tell whether two configurations ask for the same source."""
+    """Return whether two configurations have the same source."""
     return _made_of(before) == _made_of(after)
 
 
 def scale_source(config: OdometryConfig,
                  ground_truth: tuple[NDArray[np.int64], Array] | None = None) -> ScaleSource:
     """
-    Make the source that the configuration asks for.
+    Return the source of a configuration; raises DjetError as ``check_scale`` does.
 
-    ground_truth: stamps (N,) and positions (N, 3), needed for scale 'ground_truth'; without them
-    DjetError, as where ``check_scale`` raises it.
+    ground_truth: stamps (N,) and positions (N, 3), required by scale 'ground_truth' (DjetError).
     """
     check_scale(config)
     kind, parameters = _made_of(config)
@@ -447,7 +442,7 @@ def scale_source(config: OdometryConfig,
 
 
 def check_scale(config: OdometryConfig) -> None:
-    """Raise DjetError where a scale wants a length that nobody gave."""
+    """Raise DjetError if a scale requires a length that is not given."""
     if config.scale not in _WANTED:
         return
     name, least, meaning = _WANTED[config.scale]
@@ -458,11 +453,11 @@ def check_scale(config: OdometryConfig) -> None:
 
 
 def _made_of(config: OdometryConfig) -> tuple[Callable[..., ScaleSource], tuple[float, ...]]:
-    """Class of the source, and the parameters that it is made of."""
+    """Return the class of the source, and its parameters."""
     share = config.scale_uncertainty
     kinds: dict[str, tuple[Callable[..., ScaleSource], tuple[float, ...]]] = {
         'none': (UnitScale, ()),
-        'structure': (Unmeasured, ()),
+        'structure': (RelativeScale, ()),
         'constant': (ConstantScale, (config.scale_value, share)),
         'speed': (SpeedScale, (share,)),
         'camera_height': (CameraHeightScale, (

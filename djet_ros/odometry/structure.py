@@ -58,7 +58,7 @@ class TrackScale:
 
     def __init__(self) -> None:
         self._estimator: EstimatorConfig | None = None
-        self._carried, self._filter = False, ScaleFilter()
+        self._uses_landmarks, self._filter = False, ScaleFilter()
         # Survives an interruption of the track, as images stay undistorted by it.
         self._lens: SelfCalibration | None = None
         self.reset()
@@ -70,8 +70,9 @@ class TrackScale:
         share: standard deviation that all metric lengths have in common, as a share of them.
         """
         self._filter.configure(share)
-        restart = estimator != self._estimator or (source.carried and not self._carried)
-        self._source, self._carried = source, source.carried
+        restart = estimator != self._estimator or (
+            source.uses_landmarks and not self._uses_landmarks)
+        self._source, self._uses_landmarks = source, source.uses_landmarks
         if estimator != self._estimator:
             self._estimator, self._window = estimator, Window(estimator)
         return restart
@@ -87,12 +88,12 @@ class TrackScale:
     @property
     def keyframe(self) -> bool | None:
         """Return whether the newest frame is a keyframe; None without a window."""
-        return self._window.is_keyframe if self._carried else None
+        return self._window.is_keyframe if self._uses_landmarks else None
 
     @property
     def is_new(self) -> bool:
         """Return whether there are no landmarks."""
-        return not self._carried or self._window.is_new
+        return not self._uses_landmarks or self._window.is_new
 
     def landmarks(self, settled: bool = False) -> Array:
         """
@@ -100,7 +101,7 @@ class TrackScale:
 
         settled: instead return those that it was the last step to refine.
         """
-        if self._speed is None or not self._carried:
+        if self._speed is None or not self._uses_landmarks:
             return np.empty((0, 3))
         places = self._window.settled if settled else self._window.landmarks()
         return places * self._filter.factor
@@ -110,7 +111,7 @@ class TrackScale:
     @property
     def lens(self) -> SelfCalibration | None:
         """Return the distortion that landmarks have shown; None until it is significant."""
-        if not self._carried or self._speed is None:
+        if not self._uses_landmarks or self._speed is None:
             return None
         lens = self._window.lens
         return lens if lens.certain or lens.undone else None
@@ -118,7 +119,7 @@ class TrackScale:
     @property
     def k1_due(self) -> float | None:
         """Return the k1 that is to be removed from images from now on; None for no change."""
-        return self._window.lens.k1 if self._carried and self._window.lens.due else None
+        return self._window.lens.k1 if self._uses_landmarks and self._window.lens.due else None
 
     def straighten(self, newest: View) -> None:
         """Continue with images without that k1; newest: the newest frame without it."""
@@ -133,7 +134,7 @@ class TrackScale:
 
     def begin(self, view: View) -> None:
         """Begin at a frame without a known motion from the one before: its scale is a guess."""
-        if not self._carried:
+        if not self._uses_landmarks:
             return
         self._window.start(view, self._lens)
         self._filter.restart_sum()
@@ -144,7 +145,7 @@ class TrackScale:
     def expected_length(self, span_ns: tuple[int, int]) -> Length:
         """Return the length at the last speed, or as measured: where none can be estimated."""
         measured = self._source.between(*span_ns)
-        if measured.known or not self._carried or self._speed is None:
+        if measured.known or not self._uses_landmarks or self._speed is None:
             return measured
         usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * self._filter.factor
         return Length(usual, usual, True, self._filter.metric, False)
@@ -157,7 +158,7 @@ class TrackScale:
         from a larger baseline determine its translation.
         """
         measured = self._source.between(*span_ns)
-        if not self._carried:
+        if not self._uses_landmarks:
             return Step(relative, self._filter.as_measured(measured))
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
@@ -170,8 +171,8 @@ class TrackScale:
             relative, addition = _by_window(relative, addition, guess)
         sigma = self._wander(addition, seconds, parallax)
         if measured.known:
-            self._filter.update(measured, addition.length, sigma, seconds, self._source.alike,
-                                self._source.exact)
+            self._filter.update(measured, addition.length, sigma, seconds,
+                                self._source.correlation_length, self._source.exact)
             # Until the factor is known, a length is as sure as its measurement.
             if self._source.exact or not self._filter.metric:
                 return self._onward(relative, self._filter.as_measured(measured), addition, True)

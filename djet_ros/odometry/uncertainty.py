@@ -1,8 +1,8 @@
 """
-Covariances of poses in ROS order (x, y, z, rotation about x, y, z).
+Covariances of motions and poses, in ROS order (x, y, z, rotation about x, y, z).
 
-A pose (R, p) is perturbed as geometry_msgs/PoseWithCovariance has it: p + dp and exp(dtheta) R,
-both along the axes of the frame in which the pose is given.
+A pose (R, p) is perturbed as in geometry_msgs/PoseWithCovariance: p + dp and exp(dtheta) R, both
+along the axes of the frame in which the pose is given.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from djet_ros.core.types import Array, RelativePose
 from djet_ros.odometry.scale import Common, Length, UNKNOWN_LENGTH_SIGMA
 import numpy as np
 
-# A rotation about which nothing is known: standard deviation of half a turn.
+# Standard deviation of an unknown rotation, in rad.
 _UNKNOWN_ANGLE = np.pi
 
-# Share of a pair's variance that is of errors which the next pair has too, and how much of such an
-# error is left a pair later: by `djet lab lengths`, a metre a frame.
-_ALIKE, _PASSED_ON = 0.25, 0.9
+# Correlated errors of consecutive pairs, an autoregressive process: their share of a pair's
+# variance, and their correlation from pair to pair; by `djet lab lengths`, a metre a frame.
+_CORRELATED, _PERSISTENCE = 0.25, 0.9
 
-# Metres, or units of the track, to which no place is known better.
-_SHORTEST = 1e-3
+# Metres, or units of the track: least standard deviation of a position.
+_LEAST_SIGMA = 1e-3
 
-# Covariance (6, 6) of a motion about which nothing is known.
+# Covariance (6, 6) of an unknown motion.
 UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
 
 
 def motion_covariance(relative: RelativePose, length: Length) -> Array:
     """
-    Covariance (6, 6) of the current camera in the previous one, (R^T, -s R^T t).
+    Return the covariance (6, 6) of the current camera in the previous one, (R^T, -s R^T t).
 
-    To the covariance of (rotation, direction) comes the length's own, along the direction. A
-    translation without a direction (no parallax) may have gone its length along any axis.
+    It is that of (rotation, direction), plus the variance of the length s along the direction. A
+    translation without a direction (no parallax) has the standard deviation s along each axis.
     """
     if not np.isfinite(relative.covariance_6).all():
         return UNKNOWN_MOTION.copy()
     back, t = relative.R.T, relative.t
-    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt. Where it is
-    # measured that s is nothing, the direction is off all the same.
-    J, s = np.zeros((6, 6)), max(length.value, _SHORTEST)
+    # With R -> exp(w) R:  dtheta = -R^T w  and  dp = -s R^T [t]x w - s R^T dt. A measured s of
+    # zero does not make the direction exact.
+    J, s = np.zeros((6, 6)), max(length.value, _LEAST_SIGMA)
     J[:3, :3], J[:3, 3:] = -s * back @ skew(t), -s * back
     J[3:, :3] = -back
     covariance = J @ relative.covariance_6 @ J.T
@@ -49,34 +49,34 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
         covariance[:3, :3] += length.sigma**2 * np.outer(direction, direction)
     else:
         covariance[:3] = covariance[:, :3] = 0.0
-        reach = max(length.value, _SHORTEST) if length.known else UNKNOWN_LENGTH_SIGMA
-        covariance[:3, :3] = np.eye(3) * reach**2
+        sigma = max(length.value, _LEAST_SIGMA) if length.known else UNKNOWN_LENGTH_SIGMA
+        covariance[:3, :3] = np.eye(3) * sigma**2
     return symmetric(covariance)
 
 
 def standstill_covariance(relative: RelativePose, length: Length) -> Array:
     """
-    Covariance (6, 6) of no motion: the rotation's own, and a tenth of a usual translation.
+    Return the covariance (6, 6) of a standstill: a tenth of a usual length, and the rotation's.
 
-    A translation of unknown length is unknown also where it was short.
+    length: of a usual translation; if it is unknown, so is a tenth of it.
     """
     sigma = 0.1 * length.value if length.known else UNKNOWN_LENGTH_SIGMA
     rotation = relative.covariance_6[:3, :3]
     if not np.isfinite(rotation).all():
-        # Standing still tells the rotation about as well as a displacement of a pixel would.
+        # A standstill bounds the rotation as well as a displacement of about a pixel does.
         rotation = np.eye(3) * 1e-6
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * max(sigma, _SHORTEST)**2
+    covariance[:3, :3] = np.eye(3) * max(sigma, _LEAST_SIGMA)**2
     covariance[3:, 3:] = rotation
     return symmetric(covariance)
 
 
 def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Array) -> Array:
     """
-    Covariance (6, 6) of ``pose @ motion``, both (4, 4) and with independent errors.
+    Return the covariance (6, 6) of ``pose @ motion``, both (4, 4) with independent errors.
 
-    First order: the motion's error is turned into the outer frame, and an error of the
-    pose's rotation swings the motion like a lever.
+    To first order: the motion's error is rotated to the outer frame, and an error of the pose's
+    rotation has the motion's translation as its lever arm.
     """
     lever = _lever(pose, motion)
     return symmetric(lever @ pose_covariance @ lever.T + rotated(pose[:3, :3], covariance))
@@ -85,12 +85,11 @@ def compose(pose: Array, pose_covariance: Array, motion: Array, covariance: Arra
 @dataclass(frozen=True)
 class PathCovariance:
     """
-    How sure an integrated pose is, where its steps have errors in common.
+    Covariance of an integrated pose whose steps have correlated errors.
 
-    pose: (6, 6) its covariance; with_common: (6, 2) that of the pose with the two errors of
-    `Common`, by which a step is too long as all steps before it were; with_pair: (6, 6) that of
-    the pose with the part of the last pair's error that the next pair has too, in units of what
-    pairs are unsure by.
+    pose: (6, 6) covariance of the pose; with_common: (6, 2) its cross-covariance with the two
+    errors of `Common`, which all lengths share; with_pair: (6, 6) its cross-covariance with the
+    correlated part of the last pair's error, whitened by the pair's covariance.
     """
 
     pose: Array = field(default_factory=lambda: np.zeros((6, 6)))
@@ -100,75 +99,75 @@ class PathCovariance:
     def moved(self, pose: Array, motion: Array, covariance: Array,
               common: Common | None = None) -> PathCovariance:
         """
-        Give that of ``pose @ motion``, both (4, 4), for a motion that errs by itself.
+        Return that of ``pose @ motion``, both (4, 4), if the motion's error is independent.
 
-        covariance: (6, 6) of what errs in the motion alone; common: of its length, beside that.
+        covariance: (6, 6) of the motion's own error; common: further errors of its length.
         """
         lever = _lever(pose, motion)
         moved = PathCovariance(compose(pose, self.pose, motion, covariance),
                                lever @ self.with_common)
-        return moved if common is None else moved._stretched(pose, motion, common)
+        return moved if common is None else moved._with_length_errors(pose, motion, common)
 
     def moved_by_pair(self, pose: Array, motion: Array, covariance: Array,
                       common: Common | None = None) -> PathCovariance:
         """
-        Give that of ``pose @ motion``, both (4, 4), for a motion that a pair alone has told.
+        Return that of ``pose @ motion``, both (4, 4), for the motion of a single pair.
 
-        Pairs that follow one another see the same things, and err alike.
+        Consecutive pairs see the same features, so their errors are correlated.
         """
         moved = self.moved(pose, motion, covariance, common)
         values, axes = np.linalg.eigh(rotated(pose[:3, :3], covariance))
-        turn = both_turned(pose[:3, :3])
-        # Along the camera's own axes errors stay what they are.
+        turn = block_rotation(pose[:3, :3])
+        # Along the axes of the camera the correlated error stays the same.
         root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T @ turn
-        before = _PASSED_ON * _lever(pose, motion) @ self.with_pair
-        both = before @ root.T
-        return replace(moved, pose=symmetric(moved.pose + both + both.T),
-                       with_pair=before + _ALIKE * root)
+        before = _PERSISTENCE * _lever(pose, motion) @ self.with_pair
+        cross = before @ root.T
+        return replace(moved, pose=symmetric(moved.pose + cross + cross.T),
+                       with_pair=before + _CORRELATED * root)
 
-    def _stretched(self, pose: Array, motion: Array, common: Common) -> PathCovariance:
-        """Add what the errors do that lengths have in common."""
+    def _with_length_errors(self, pose: Array, motion: Array, common: Common) -> PathCovariance:
+        """Add the errors that lengths have in common."""
         along = np.zeros(6)
         along[:3] = pose[:3, :3] @ motion[:3, 3]
-        crossed = self.with_common * common.kept
-        both = np.outer(crossed.sum(1), along)
+        with_common = self.with_common * common.kept
+        cross = np.outer(with_common.sum(1), along)
         return PathCovariance(
-            symmetric(self.pose + both + both.T
+            symmetric(self.pose + cross + cross.T
                       + common.variances.sum() * np.outer(along, along)),
-            crossed + np.outer(along, common.variances))
+            with_common + np.outer(along, common.variances))
 
 
 def in_a_chain(covariance: Array) -> Array:
     """
-    Covariance (6, 6) of a pair's motion for a graph, whose edges err independently.
+    Return the covariance (6, 6) of a pair for a pose graph, whose edges have independent errors.
 
-    What neighbours err alike adds up along a chain as if each were that much less sure. Loops
-    close long chains; a few pairs by themselves are surer than that.
+    Along a long chain, as loops close them, the inflated independent errors add up to as much as
+    the correlated ones; a chain of a few pairs is more certain than that.
     """
-    return covariance * (1 + 2 * _ALIKE * _PASSED_ON / (1 - _PASSED_ON))
+    return covariance * (1 + 2 * _CORRELATED * _PERSISTENCE / (1 - _PERSISTENCE))
 
 
 def _lever(pose: Array, motion: Array) -> Array:
-    """(6, 6) what an error of a pose (4, 4) becomes at the end of the next motion (4, 4)."""
+    """Return the Jacobian (6, 6) of ``pose @ motion``, both (4, 4), by the pose's error."""
     lever = np.eye(6)
     lever[:3, 3:] = -skew(pose[:3, :3] @ motion[:3, 3])
     return lever
 
 
 def rotated(R: Array, covariance: Array) -> Array:
-    """Express a covariance (6, 6) along the axes of another frame."""
-    turn = both_turned(R)
+    """Return a covariance (6, 6) along the axes of another frame, to which R (3, 3) rotates."""
+    turn = block_rotation(R)
     return np.asarray(turn @ covariance @ turn.T)
 
 
-def both_turned(R: Array) -> Array:
-    """Matrix (6, 6) that turns a translation and a rotation vector, one below the other, by R."""
-    # np.kron takes twenty times as long, and a frame has a dozen of these.
+def block_rotation(R: Array) -> Array:
+    """Return the block-diagonal matrix (6, 6) of R (3, 3), R."""
+    # np.kron takes twenty times as long, and a frame needs a dozen of these.
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R
     return turn
 
 
 def symmetric(covariance: Array) -> Array:
-    """Take off what rounding leaves a covariance that is not symmetric."""
+    """Return the symmetric part of a covariance, without rounding errors."""
     return np.asarray((covariance + covariance.T) / 2)
