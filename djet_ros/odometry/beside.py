@@ -1,4 +1,4 @@
-"""What comes beside the images, message by message: a gyro, another odometry, masks."""
+"""Inputs other than images, from their messages: a gyro, another odometry and masks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-# Images over which it is told whether something comes in time, and those that tell nothing yet.
+# Newest images by which late inputs are judged, and the number below which they are not.
 _WINDOW, _FEW = 30, 5
 
-# Share of the samples of a gyro that may be of no use before somebody should look at it.
+# Least share of unusable gyro samples that is a problem.
 _REFUSED = 0.02
 
 _CLOCKS = ('stamped by the clock of the images (use_sim_time on both sides or on none), and not '
@@ -31,9 +31,9 @@ _CLOCKS = ('stamped by the clock of the images (use_sim_time on both sides or on
 
 class Beside:
     """
-    Takes messages and hands them on to those that go by them.
+    Passes messages on to the gyro, the other odometry and the masks.
 
-    gyro and guess are None where nobody asked for them.
+    gyro, guess: None unless configured.
     """
 
     def __init__(self, config: OdometryConfig, scale: ScaleSource,
@@ -46,7 +46,7 @@ class Beside:
         self.reset()
 
     def configure(self, config: OdometryConfig, scale: ScaleSource) -> None:
-        """Take other parameters; what was learnt stays as far as it is still asked for."""
+        """Change the parameters; the state of inputs that stay configured is kept."""
         self._config = config
         noise = GyroNoise(config.imu_noise, config.imu_bias_walk)
         offset = round(config.imu_offset * 1e9)
@@ -67,19 +67,19 @@ class Beside:
             scale.guess = self.guess
 
     def reset(self) -> None:
-        """Forget what was measured; mountings and the gyro's bias stay."""
+        """Forget all measurements; mountings and the gyro's bias are kept."""
         self._masks.reset()
         self._samples = 0
-        # What each of the newest images had to do without.
+        # What each of the newest images lacked.
         self._lacking: deque[str] = deque(maxlen=_WINDOW)
         for one in (self.gyro, self.guess):
             if one is not None:
                 one.reset()
 
-    # What comes
+    # Messages
 
     def imu(self, message: Any) -> None:
-        """Take an Imu; of it the rates."""
+        """Take the rates of an Imu."""
         if self.gyro is None:
             return
         self._samples += 1
@@ -88,7 +88,7 @@ class Beside:
         self.gyro.add(stamp_ns(message.header), np.array([rate.x, rate.y, rate.z], np.float64))
 
     def other_odometry(self, message: Any) -> None:
-        """Take an Odometry; of it the pose."""
+        """Take the pose of an Odometry."""
         if self.guess is None or isinstance(self.guess, FrameGuess):
             return
         self._frames['guess'] = message.child_frame_id.lstrip('/')
@@ -103,10 +103,10 @@ class Beside:
         """Take the mask of an image."""
         self._masks.add(message)
 
-    # What an image needs
+    # Needs of an image
 
     def lacks(self, stamp: int, image_frame: str) -> str:
-        """Name what has still to come for an image, if anything."""
+        """Return the name of an input that an image still needs, or an empty string."""
         if isinstance(self.guess, FrameGuess):
             camera, axes = mounted_frame(self._config, image_frame)
             self.guess.look_for(camera)
@@ -119,7 +119,7 @@ class Beside:
 
     def left_out(self, stamp: int, image_frame: str, shape: tuple[int, ...], camera: Camera
                  ) -> NDArray[np.bool_] | None:
-        """Give the mask of an image that is worked on now; see ``Masks.of``."""
+        """Return the mask of the image that is processed now; see ``Masks.of``."""
         self._lacking.append(self.lacks(stamp, image_frame))
         return self._masks.of(stamp, shape, camera)
 
@@ -143,18 +143,18 @@ class Beside:
         return gyro or guess
 
     def mount(self, what: str, mounting: Array) -> None:
-        """Take a mounting (4, 4) that was wanted."""
-        # The images' axes in the frame that was asked for.
+        """Take a transform (4, 4) of ``wanted_mountings``."""
+        # The images' axes in the frame that was looked up.
         _, axes = mounted_frame(self._config, '')
         if what == 'imu' and self.gyro is not None:
             self.gyro.mount((axes.T @ mounting)[:3, :3])
         elif what == 'guess' and self.guess is not None:
             self.guess.mount(mounting @ axes)
 
-    # What people are told
+    # Diagnostics
 
     def values(self) -> dict[str, str]:
-        """Give what diagnostics say of it."""
+        """Return the entries in diagnostics messages."""
         if self.gyro is None:
             return {}
         bias, sigma = self.gyro.bias, np.sqrt(np.diag(self.gyro.bias_covariance))
@@ -166,7 +166,7 @@ class Beside:
                     f'{value:.4f}' for value in np.degrees(sigma))}
 
     def complaints(self, image_frame: str) -> list[Complaint]:
-        """Say what there is to mend."""
+        """Return the problems."""
         return [one for one in (
             *map(self._late, ('imu', 'guess', 'mask')), *self._mountings(image_frame),
             self._samples_refused(), self._misfit()) if one is not None]

@@ -1,4 +1,4 @@
-"""Another odometry that tf tells: how the camera's frame moves in one that stands still."""
+"""Another odometry on tf as a guess: the motion of the camera's frame in a fixed frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class FrameGuess(Guess):
-    """The camera's own frame in one that stands still, through whatever is between them on tf."""
+    """Poses of the camera's frame in a fixed frame, through the chain of frames between them."""
 
     def __init__(self, still: str) -> None:
         super().__init__()
@@ -19,11 +19,11 @@ class FrameGuess(Guess):
 
     @property
     def still(self) -> str:
-        """Name the frame that stands still."""
+        """Return the name of the fixed frame."""
         return self._still
 
     def look_for(self, camera: str) -> None:
-        """Say what the camera's frame is called; ``mount`` takes the images' axes in it."""
+        """Set the name of the camera's frame; ``mount`` takes the images' axes in it."""
         self.camera = camera
 
     def hear(self, message: Any, *, static: bool) -> None:
@@ -31,20 +31,20 @@ class FrameGuess(Guess):
         self._frames.add(message, static=static)
 
     def reset(self) -> None:
-        """Forget all that moves."""
+        """Forget the poses of moving frames."""
         super().reset()
         self._frames.reset()
 
     def go_back(self, stamp_ns: int) -> None:
-        """Hear that time begins anew at a stamp; what came of the new time already stays."""
+        """Forget the poses from before time went back to a stamp."""
         self._frames.go_back(stamp_ns)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Tell whether all that moves between the two is known at a stamp, or after it."""
+        """Return whether all moving frames between the two have a pose at a stamp or after it."""
         return self._frames.covers(self._still, self.camera, stamp_ns)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Let go of what was before an image that no other will be related to."""
+        """Drop poses that are not needed after the stamp of an image."""
         self._frames.forget_before(stamp_ns)
 
     def _at(self, start_ns: int, end_ns: int) -> Array:

@@ -82,8 +82,9 @@ class Gyro:
     """
     Measures rotations of the camera, once its mounting is known.
 
-    noise: of its data sheet; offset_ns: of its stamps to those of images; to_camera: (3, 3) rotation of the IMU's axes to the camera's, or
-    None; bias: (3,) rad/s, with bias_covariance (3, 3); refused: counts of unusable samples.
+    noise: of its data sheet; offset_ns: from stamps of images to its own; to_camera: (3, 3)
+    rotation of the IMU's axes to the camera's, or None; bias: (3,) rad/s, with bias_covariance
+    (3, 3); refused: counts of unusable samples.
     """
 
     def __init__(self, noise: GyroNoise, offset_ns: int = 0) -> None:

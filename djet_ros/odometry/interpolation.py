@@ -13,10 +13,10 @@ Stamps = NDArray[np.int64]
 def positions_at(known_ns: Stamps, positions: Array, stamps_ns: Stamps, longest_gap_ns: int
                  ) -> Array:
     """
-    Positions (N, 3) at stamps (N,) between those known (M, 3) at increasing stamps (M,).
+    Return positions (N, 3) at stamps (N,), from those (M, 3) known at increasing stamps (M,).
 
-    They are linear between two that are at most longest_gap_ns apart, exact at the known stamps,
-    and NaN elsewhere.
+    Interpolated linearly between two that are at most longest_gap_ns apart, exact at known stamps,
+    NaN elsewhere.
     """
     if not len(known_ns):
         return np.full((len(stamps_ns), 3), np.nan)
@@ -26,7 +26,7 @@ def positions_at(known_ns: Stamps, positions: Array, stamps_ns: Stamps, longest_
 
 
 def poses_at(known_ns: Stamps, poses: Array, stamps_ns: Stamps, longest_gap_ns: int) -> Array:
-    """Poses (N, 4, 4) as ``positions_at``, each turning about one axis from pose to pose."""
+    """Return poses (N, 4, 4) as ``positions_at``, with rotations interpolated by slerp."""
     result = np.full((len(stamps_ns), 4, 4), np.nan)
     if not len(known_ns):
         return result
@@ -46,7 +46,7 @@ def poses_at(known_ns: Stamps, poses: Array, stamps_ns: Stamps, longest_gap_ns: 
 
 def _neighbours(known_ns: Stamps, stamps_ns: Stamps, longest_gap_ns: int
                 ) -> tuple[Stamps, Stamps, Array]:
-    """Give indices (N,) before and after, and the share between them, NaN where unknown."""
+    """Return indices (N,) before and after, and the share between them, NaN if unknown."""
     place = np.searchsorted(known_ns, stamps_ns)
     after = np.minimum(place, len(known_ns) - 1)
     before = np.maximum(after - 1, 0)

@@ -1,7 +1,7 @@
 """
-From the camera to the vehicle that carries it.
+Pose and twist of a vehicle's base frame, from those of the camera on it.
 
-T (4, 4) is the camera's optical frame in the vehicle's base frame. Poses are perturbed as in
+T (4, 4) is the pose of the camera's optical frame in the base frame. Poses are perturbed as in
 ``uncertainty``: p + dp and exp(dtheta) R along the axes of the frame in which they are given.
 """
 
@@ -14,22 +14,22 @@ import numpy as np
 
 
 def pose_of_base(pose: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-    """Pose (4, 4) of the base in where it began, and covariance (6, 6), from the camera's."""
+    """Return the base's pose (4, 4) in the first base, with covariance (6, 6), by the camera's."""
     result = np.asarray(T @ pose @ np.linalg.inv(T))
-    # The base's origin swings about the camera: p' = R_T p + t - R' t.
+    # The camera is a lever arm t away from the base's origin: p' = R_T p + t - R' t.
     J = _lever(T, skew(result[:3, :3] @ T[:3, 3]))
     return result, symmetric(J @ covariance @ J.T)
 
 
 def twist_of_base(velocity: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-    """Velocity (6,) of the base along its axes, and covariance (6, 6), from the camera's."""
-    # The base's origin is seen from the camera at -R_T^T t, and turns with it.
+    """Return the base's twist (6,) along its axes, with covariance (6, 6), by the camera's."""
+    # The base's origin is at -R_T^T t in the camera, and rotates with it.
     J = _lever(T, skew(T[:3, 3]))
     return np.asarray(J @ velocity), symmetric(J @ covariance @ J.T)
 
 
 def _lever(T: Array, arm: Array) -> Array:
-    """Jacobian (6, 6) of a turn by T's rotation, with a lever arm (3, 3) after it."""
+    """Return the Jacobian (6, 6) of a rotation by T, then a lever arm, its skew matrix (3, 3)."""
     J = block_rotation(T[:3, :3])
     J[:3, 3:] = arm @ T[:3, :3]
     return J

@@ -1,4 +1,4 @@
-"""Where frames are on one another at a time, as /tf and /tf_static tell it."""
+"""Transforms between frames over time, from /tf and /tf_static."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 TOPIC = '/tf'
 
-# Poses that are kept of each frame: twenty seconds of the usual pace.
+# Poses that are kept of each frame: twenty seconds at the usual rate.
 _KEPT = 2_000
 
 
@@ -26,18 +26,18 @@ class _Link(NamedTuple):
 
 
 class MovingFrames:
-    """A forest of frames, some of which move on others."""
+    """A forest of moving and static frames."""
 
     def __init__(self) -> None:
         self._static = StaticFrames()
         self._moving: dict[str, _Link] = {}
 
     def reset(self) -> None:
-        """Forget all that moves."""
+        """Forget the poses of moving frames."""
         self._moving.clear()
 
     def go_back(self, stamp_ns: int) -> None:
-        """Hear that time begins anew at a stamp; what came of the new time already stays."""
+        """Forget the poses from before time went back to a stamp."""
         for link in self._moving.values():
             link.poses.go_back(stamp_ns)
 
@@ -57,12 +57,12 @@ class MovingFrames:
             link.poses.add(stamp, pose)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Let go of what is not needed from a stamp on."""
+        """Drop poses that are not needed from a stamp on."""
         for link in self._moving.values():
             link.poses.forget_before(stamp_ns)
 
     def covers(self, parent: str, child: str, stamp_ns: int) -> bool:
-        """Tell whether all that moves between two frames is known at a stamp, or after it."""
+        """Return whether all moving frames between two have a pose at a stamp, or after it."""
         above = [[frame for frame, _ in self._upwards(one, np.empty(0, np.int64))]
                  for one in (parent, child)]
         return not set(above[0]).isdisjoint(above[1]) and all(
@@ -70,7 +70,7 @@ class MovingFrames:
             for frame in set(above[0]) ^ set(above[1]) if frame in self._moving)
 
     def poses(self, parent: str, child: str, stamps_ns: Stamps) -> Array:
-        """Poses (N, 4, 4) of a frame in another at stamps (N,), NaN where they are not known."""
+        """Return poses (N, 4, 4) of a frame in another at stamps (N,), NaN if unknown."""
         above = dict(self._upwards(parent, stamps_ns))
         for frame, poses in self._upwards(child, stamps_ns):
             if frame in above and np.isfinite(above[frame]).all():
@@ -78,7 +78,7 @@ class MovingFrames:
         return np.full((len(stamps_ns), 4, 4), np.nan)
 
     def _upwards(self, frame: str, stamps_ns: Stamps) -> Iterator[tuple[str, Array]]:
-        """Yield a frame and those it stands on, each with the first one in it (N, 4, 4)."""
+        """Yield a frame and its ancestors, each with the first frame's poses (N, 4, 4) in it."""
         def above(frame: str) -> tuple[str, Array] | None:
             link = self._moving.get(frame)
             return (link.parent, link.poses.at(stamps_ns)) if link else self._static.above(frame)

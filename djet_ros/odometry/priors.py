@@ -12,7 +12,7 @@ from dataclasses import replace
 from djet_ros.core.fusion import agrees, fused, Turn
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
-from djet_ros.odometry.guess import as_start, Guess
+from djet_ros.odometry.guess import initial_pose, Guess
 from djet_ros.odometry.inertial import Gyro
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 import numpy as np
@@ -53,7 +53,7 @@ class MotionPriors:
         motion = self.guess.motion(*span_ns) if self.guess else None
         trusted = self.gyro is not None and self.gyro.fits
         return Known(self._turn(span_ns) if trusted else None,
-                     None if motion is None else as_start(motion))
+                     None if motion is None else initial_pose(motion))
 
     def _turn(self, span_ns: Span) -> Turn | None:
         """Return the rotation that the gyro measured, if it did."""

@@ -1,4 +1,4 @@
-"""What others measure, by its stamps: in order or not, twice, or from another time."""
+"""Buffer of stamped measurements, which may be out of order or of a time before a restart."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Generic, TypeVar
 
 Value = TypeVar('Value')
 
-# Stamps that go back by more belong to another time, as when a bag begins again.
+# Stamps that go back by more mean that time restarted, as when a bag loops.
 _BACK_NS = 500_000_000
 
 
 class Stamped(Generic[Value]):
-    """Values by their stamps in ns, sorted; kept: how many of the newest."""
+    """Values by their stamps in ns, sorted; kept: the most values that are kept."""
 
     def __init__(self, kept: int) -> None:
         self._kept = kept
@@ -33,22 +33,22 @@ class Stamped(Generic[Value]):
         return self._values[stamp_ns]
 
     def goes_back(self, stamp_ns: int) -> bool:
-        """Tell whether time begins again with a stamp."""
+        """Return whether time restarted with a stamp."""
         return bool(self.stamps) and stamp_ns < self.stamps[-1] - _BACK_NS
 
     def add(self, stamp_ns: int, value: Value) -> None:
-        """Take a value of a stamp that has none yet."""
+        """Take a value with a stamp that has none yet."""
         insort(self.stamps, stamp_ns)
         self._values[stamp_ns] = value
         if len(self.stamps) > self._kept:
             self._drop(1)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Tell whether there is a value at a stamp, or after it."""
+        """Return whether there is a value at a stamp, or after it."""
         return bool(self.stamps) and self.stamps[-1] >= stamp_ns
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Let go of what is not needed from a stamp on; the last value up to it is."""
+        """Drop values before the last one up to a stamp."""
         self._drop(bisect_right(self.stamps, stamp_ns) - 1)
 
     def _drop(self, number: int) -> None:
