@@ -1,4 +1,4 @@
-"""A picture of a pair: where the matches went, and how far they are from their epipolar lines."""
+"""Drawing of a pair: displacements of its matches, and distances from their epipolar lines."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from djet_ros.core.types import Array, RelativePose
 import numpy as np
 from numpy.typing import NDArray
 
-# Residuals are fractions of a pixel; drawn this many times as long they can be seen.
+# Factor by which residuals, fractions of a pixel, are drawn longer.
 MAGNIFICATION = 20.0
 
 _INLIER, _OUTLIER, _RESIDUAL = (80, 220, 80), (60, 60, 230), (0, 210, 255)
 
-# OpenCV draws to fractions of a pixel given as integers.
+# Fractional bits of the integer coordinates for OpenCV.
 _SHIFT = 4
 
 
 def debug_image(gray: NDArray[np.uint8], relative: RelativePose) -> NDArray[np.uint8]:
     """
-    Draw a pair on its current image (H, W): gives (H, W, 3) BGR.
+    Draw a pair on its current image (H, W), return (H, W, 3) BGR.
 
-    Green: shift of an inlier from x to y; red: of an outlier; yellow: from y towards its place on
-    the epipolar line, 20 times as far.
+    Green: displacement of an inlier from x to y; red: of an outlier; yellow: 20 times the residual
+    from y to the optimum on its epipolar line.
     """
     picture = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     inliers = (relative.inliers if len(relative.inliers) == len(relative.x)
@@ -39,7 +39,7 @@ def debug_image(gray: NDArray[np.uint8], relative: RelativePose) -> NDArray[np.u
 def _draw(picture: NDArray[np.uint8], start: Array, end: Array,
           colour: tuple[int, int, int]) -> None:
     lines = np.stack([start, end], axis=1)
-    # What lies far outside would overflow OpenCV's integers.
+    # Points far outside would overflow OpenCV's integers.
     limit = 4.0 * max(picture.shape)
     shown = lines[np.isfinite(lines).all(axis=(1, 2)) & (np.abs(lines) < limit).all(axis=(1, 2))]
     cv2.polylines(picture, list(np.rint(shown * 2**_SHIFT).astype(np.int32)), False, colour, 1,

@@ -1,4 +1,4 @@
-"""What the odometry says about itself, as a pure function of counts and of the last result."""
+"""Content of diagnostics messages, from counts and the last result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 @unique
 class State(StrEnum):
-    """What the odometry is doing."""
+    """State of the odometry."""
 
     WAITING_FOR_CAMERA_INFO = 'waiting for camera_info'
     WAITING_FOR_IMAGE = 'waiting for an image'
@@ -42,12 +42,11 @@ _RANKING = ('OK', 'WARN', 'ERROR')
 @dataclass
 class Counts:
     """
-    Every image that came in is counted once more: processed, dropped or rejected.
+    Counts of images: each received one is also processed, dropped or rejected.
 
-    dropped: by why it was of no use (equal_stamp, late, ahead, waiting_for_camera_info,
-    queue_full …);
-    rejected: by what was wrong with an image; rejected_infos: the same for CameraInfo messages;
-    status: of the processed frames.
+    dropped: by reason (equal_stamp, late, ahead, waiting_for_camera_info, queue_full …);
+    rejected: unusable images, by reason; rejected_infos: the same for CameraInfo messages; status:
+    of the processed frames.
     """
 
     received: int = 0
@@ -60,7 +59,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Content of a DiagnosticStatus: level OK, WARN or ERROR, one line, and details."""
+    """Content of a DiagnosticStatus: level OK, WARN or ERROR, a one-line summary, and values."""
 
     level: str
     summary: str
@@ -70,10 +69,10 @@ class Diagnosis:
 def diagnose(state: State, detail: str, counts: Counts, last: OdometryResult | None,
              rate: float | None, complaints: Sequence[Complaint] = ()) -> Diagnosis:
     """
-    Say how the odometry is doing.
+    Return the content of a diagnostics message.
 
-    detail: what the state is about, such as a status or a reason; last: the last result; rate:
-    processed frames per second of their stamps; complaints: what else there is to mend.
+    detail: of the state, such as a status or a reason; last: the last result; rate: processed
+    frames per second of their stamps; complaints: present problems.
     """
     values = {
         'state': state.value,
@@ -110,20 +109,20 @@ def _pair(relative: RelativePose) -> dict[str, str]:
 
 
 class StampRate:
-    """Frames per second by their stamps, over the last few frames."""
+    """Frame rate by the stamps of the last few frames."""
 
     def __init__(self, frames: int = 30) -> None:
         self._stamps: deque[int] = deque(maxlen=frames)
 
     def add(self, stamp_ns: int) -> None:
-        """Count a frame; a step back in time restarts the count."""
+        """Take the stamp of a frame; a step back in time discards the ones before."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
             self._stamps.clear()
         self._stamps.append(stamp_ns)
 
     @property
     def hertz(self) -> float | None:
-        """Frames per second, None before the second frame."""
+        """Return frames per second, None before the second frame."""
         if len(self._stamps) < 2:
             return None
         return (len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0])

@@ -1,4 +1,4 @@
-"""What goes wrong in silence: images that are of no use, and lengths that nobody knows."""
+"""Problems that would go unnoticed, such as unusable images and unknown lengths, and remedies."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
 from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.result import OdometryResult
 
-# Images over which shares are taken, and of which they say nothing yet.
+# Newest images over which shares are taken, and the number below which they are zero.
 _WINDOW, _FEW = 100, 20
 
-# Share of the images from which on it matters that they were of no use.
+# Least share of unusable images that is a problem.
 _SHARE = 0.1
 
-# Images or pairs in a row from which on something is no accident.
+# Images or pairs in a row from which on something is a problem.
 _IN_A_ROW = 5
 
-# What helps where a scale source does not know a length.
+# Remedies for a scale source without measurements.
 _REMEDIES = {
     'speed': 'publish it on {topics}, stamped by the clock of the images (use_sim_time on both '
              'sides or on none), or choose another odometry.scale',
@@ -37,7 +37,7 @@ _REMEDIES_RECORDED = {
 
 
 class Complaint(NamedTuple):
-    """Something to mend: a short name of it, level WARN or ERROR, and what is seen and helps."""
+    """A problem: its short name, its level WARN or ERROR, and a text with the remedy."""
 
     name: str
     level: str
@@ -45,28 +45,29 @@ class Complaint(NamedTuple):
 
 
 class Health:
-    """Watches the images of one camera; speed_topics: where speeds are heard, for people."""
+    """Monitors the images of one camera and their results; speed_topics: for texts."""
 
     def __init__(self, config: OdometryConfig, speed_topics: str) -> None:
         self._config = config
         self._speed_topics = speed_topics
         self._fates: deque[str] = deque(maxlen=_WINDOW)
-        # The frame_id of the newest image, and whether each of the newest had another than before.
+        # The frame_id of the newest image, and for the newest ones whether it changed.
         self._image_frame: str | None = None
         self._changes: deque[bool] = deque(maxlen=_WINDOW)
         self._equal = self._unknown_lengths = self._coarse_images = 0
-        self._ways, self._measured = False, False
-        # The most images in a row that ever had one stamp, and which.
+        # Whether there was a translation, and a measured length.
+        self._translated, self._measured = False, False
+        # The most images in a row with one stamp, and that stamp.
         self._most_equal, self._stood_ns = 0, 0
         self._coarse: Coarse | None = None
         self._last: OdometryResult | None = None
 
     def configure(self, config: OdometryConfig) -> None:
-        """Take another configuration; what was seen of lengths is about the last one."""
+        """Change the configuration; counts of unknown lengths were of the last one."""
         self._config, self._unknown_lengths = config, 0
 
     def dropped(self, reason: str, number: int = 1, image_frame: str | None = None) -> None:
-        """Take images that were dropped for a reason; image_frame: the frame_id of one of them."""
+        """Count images dropped for a reason; image_frame: the frame_id of one of them."""
         self._fates.extend([reason] * min(number, _WINDOW))
         if image_frame is not None:
             self._saw(image_frame)
@@ -79,7 +80,7 @@ class Health:
         self._image_frame = image_frame
 
     def gray(self, coarse: Coarse | None) -> None:
-        """Take how few gray levels an image of 16 bits became, or that it is none of them."""
+        """Note an image; coarse: None unless it has few gray levels of its 16 bits."""
         self._coarse = coarse
         self._coarse_images = 0 if coarse is None else self._coarse_images + 1
 
@@ -88,7 +89,7 @@ class Health:
         self._fates.append('')
         self._saw(result.frame_id)
         self._equal, self._last = 0, result
-        self._ways = self._ways or result.status is Status.OK
+        self._translated = self._translated or result.status is Status.OK
         measured = result.scale_kind is Scale.METRIC and result.measured
         self._measured = self._measured or measured
         if measured or not self._asks_for_metres:
@@ -97,21 +98,21 @@ class Health:
             self._unknown_lengths += 1
 
     def complaints(self, scale: ScaleSource, mounted: bool) -> list[Complaint]:
-        """Say what there is to mend now; mounted: whether base_frame is known, if asked for."""
+        """Return the present problems; mounted: whether base_frame is known, if it is needed."""
         return [one for one in (
             self._stamps(), self.few_levels(), self._frame(),
             None if mounted else self._mounting(), self._length(scale), self._load(),
             self._way(), self._order(), self.two_cameras()) if one is not None]
 
     def _stamps(self) -> Complaint | None:
-        return None if self._last is None else _still(self._equal, self._last.stamp_ns)
+        return None if self._last is None else _equal_stamps(self._equal, self._last.stamp_ns)
 
     def stamps_stood(self) -> Complaint | None:
-        """Say that stamps stood still at some time, though they may have gone on."""
-        return _still(self._most_equal, self._stood_ns)
+        """Return the problem that several images once had the same stamp."""
+        return _equal_stamps(self._most_equal, self._stood_ns)
 
     def few_levels(self) -> Complaint | None:
-        """Say that images of 16 bits become next to nothing."""
+        """Return the problem that images of 16 bits become few gray levels."""
         if self._coarse_images < _IN_A_ROW or self._coarse is None:
             return None
         levels, low, high = self._coarse
@@ -156,8 +157,8 @@ class Health:
                 else self._no_length(scale, 'is measured', _REMEDIES))
 
     def never_measured(self, scale: ScaleSource) -> Complaint | None:
-        """Say that of a whole recording no length was measured, though that was asked for."""
-        return (None if self._measured or not self._ways or not self._asks_for_metres
+        """Return the problem that no length of a recording was measured, though configured."""
+        return (None if self._measured or not self._translated or not self._asks_for_metres
                 else self._no_length(scale, 'was measured', _REMEDIES_RECORDED))
 
     def _no_length(self, scale: ScaleSource, what: str, remedies: dict[str, str]
@@ -197,7 +198,7 @@ class Health:
             'and dropped; do two cameras publish on one topic, or was one image stamped ahead?'))
 
     def two_cameras(self) -> Complaint | None:
-        """Say that images have now one frame_id, now another."""
+        """Return the problem that the frame_id of images alternates."""
         images, changes = len(self._changes), sum(self._changes)
         if images < _FEW or changes < _SHARE * images:
             return None
@@ -207,8 +208,8 @@ class Health:
             'and poses are of now one, now the other'))
 
 
-def another_frame(info_frame: str, image_frame: str) -> Complaint | None:
-    """Say that a CameraInfo speaks of another frame than the images have; not where one is ''."""
+def frame_mismatch(info_frame: str, image_frame: str) -> Complaint | None:
+    """Return the problem that CameraInfo and images have different frames, neither empty."""
     if '' in (info_frame, image_frame) or info_frame == image_frame:
         return None
     return Complaint('camera_info of another frame', 'WARN', (
@@ -217,8 +218,8 @@ def another_frame(info_frame: str, image_frame: str) -> Complaint | None:
         'give both one frame_id'))
 
 
-def bent(lens: SelfCalibration | None) -> Complaint | None:
-    """Say that images have a distortion that their calibration does not know, if it was told."""
+def residual_distortion(lens: SelfCalibration | None) -> Complaint | None:
+    """Return the problem of a significant distortion that the calibration does not have."""
     if lens is None:
         return None
     return Complaint('distortion left', 'WARN', (
@@ -227,8 +228,8 @@ def bent(lens: SelfCalibration | None) -> Complaint | None:
         'for what was before: djet lens finds it by all of the recording, and says what to do'))
 
 
-def _still(images: int, stamp_ns: int) -> Complaint | None:
-    """Say that images in a row had a stamp, if they were many."""
+def _equal_stamps(images: int, stamp_ns: int) -> Complaint | None:
+    """Return the problem that many images in a row had one stamp."""
     if images < _IN_A_ROW:
         return None
     return Complaint('stamps stand still', 'ERROR', (
@@ -237,20 +238,20 @@ def _still(images: int, stamp_ns: int) -> Complaint | None:
 
 
 def has_frame(config: OdometryConfig, image_frame: str) -> bool:
-    """Tell whether a camera has a name that can stand on tf."""
+    """Return whether the frame of the poses has a name that can be published on tf."""
     if config.base_frame:
         return config.base_frame != config.odom_frame
     return bool(config.camera_frame or image_frame) and not _like_odom(config, image_frame)
 
 
 def _like_odom(config: OdometryConfig, image_frame: str) -> bool:
-    """Tell whether a camera is called like the odom frame, by what its images or its poses say."""
+    """Return whether the frame of the images or of the poses is named as the odom frame."""
     return config.odom_frame in (config.camera_frame or image_frame,
                                  camera_frame(config, image_frame))
 
 
-def why_restarted(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:
-    """Word why a frame has no pair, and what that means."""
+def restart_reason(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:
+    """Return a text on why the odometry restarted, an empty one if it did not."""
     if result.status is Status.SIZE_CHANGED:
         return ('another image size or another camera; it goes on at the last pose, and the '
                 'motion in between is unknown')

@@ -1,4 +1,4 @@
-"""Pixels that are left out of an image: by its lens, by a still mask, by one for each stamp."""
+"""Masks of ignored pixels: beyond the undistorted image, a static mask, and one per image."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from djet_ros.odometry.messages import stamp_ns
 import numpy as np
 from numpy.typing import NDArray
 
-# Gray level below which a pixel of a mask is left out.
+# Gray level of a mask below which a pixel is ignored.
 _FREE = 128
 
-# Masks that wait for their image, or came too late for it.
+# Masks that are kept until their image comes.
 _KEPT = 50
 
 
 def left_out(gray: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) bool, True where a mask (H, W) is dark."""
+    """Return the ignored pixels (H, W) bool: True where a mask (H, W) is dark."""
     return np.asarray(gray < _FREE)
 
 
 class Masks:
-    """A still mask (H, W) bool of the images as they come, or None; and others by their stamps."""
+    """Masks by stamp, and a static mask (H, W) bool or None; all before undistortion."""
 
     def __init__(self, still: NDArray[np.bool_] | None = None) -> None:
         self._still = still
@@ -33,7 +33,7 @@ class Masks:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the masks of stamps."""
+        """Forget the masks by stamp."""
         self._waiting: deque[tuple[int, Any]] = deque(maxlen=_KEPT)
 
     def add(self, message: Any) -> None:
@@ -41,15 +41,15 @@ class Masks:
         self._waiting.append((stamp_ns(message.header), message))
 
     def has(self, stamp: int) -> bool:
-        """Tell whether the mask of an image has come."""
+        """Return whether the mask of an image was received."""
         return any(one == stamp for one, _ in self._waiting)
 
     def of(self, stamp: int, shape: tuple[int, ...], camera: Camera) -> NDArray[np.bool_] | None:
         """
-        Give what is left out of an undistorted image, (H, W) bool, or None.
+        Return the ignored pixels of an undistorted image, (H, W) bool, or None.
 
-        shape: of the image as it came. Where there are no masks, what the camera does not see is
-        given as the camera has it. Raises BadMessage where a mask is none, or for another size.
+        shape: of the image before undistortion. Without masks it is the camera's ``unseen`` object
+        itself. Raises BadMessage if a mask is no image, or of another size.
         """
         found = [message for one, message in self._waiting if one == stamp]
         while self._waiting and self._waiting[0][0] <= stamp:
@@ -60,7 +60,7 @@ class Masks:
         return reduce(np.logical_or, parts) if parts else None
 
     def _of_camera(self, shape: tuple[int, ...], camera: Camera) -> NDArray[np.bool_] | None:
-        """Give the still mask without the distortion of a camera, which seldom changes."""
+        """Return the undistorted static mask; cached, as the camera rarely changes."""
         if self._still is None:
             return None
         if self._undistorted is None or self._undistorted[0] is not camera \
@@ -71,7 +71,7 @@ class Masks:
 
 
 def _gray(message: Any) -> NDArray[np.bool_]:
-    """(H, W) bool of a mask's message; BadMessage that says whose fault it is."""
+    """Return the ignored pixels of a mask's message; raises BadMessage that names the mask."""
     try:
         return left_out(gray_image(message))
     except BadMessage as problem:
@@ -83,5 +83,5 @@ def _undistorted(mask: NDArray[np.bool_], shape: tuple[int, ...], camera: Camera
     if mask.shape != shape:
         raise BadMessage('mask_size', f'{what} has {mask.shape[1]}x{mask.shape[0]} pixels, the '
                          f'image {shape[1]}x{shape[0]}; both must be of one size, as they come')
-    # What lies between a pixel that is left out and one that is not, is left out too.
+    # A pixel interpolated from any ignored one is ignored.
     return np.asarray(camera.undistort(np.where(mask, 255, 0).astype(np.uint8)) > 0)

@@ -1,10 +1,10 @@
-"""What PNG data declares about itself, before a decoder believes it."""
+"""Checks of PNG data before it is decoded."""
 
 from __future__ import annotations
 
 import struct
 
-# 8192 x 8192: beyond any camera we know, and far below what would exhaust memory.
+# 8192 x 8192: larger than any known camera's image, and far below what exhausts memory.
 LARGEST_IMAGE_PIXELS = 1 << 26
 
 
@@ -13,10 +13,10 @@ PNG_START = b'\x89PNG\r\n\x1a\n'
 
 def whole_png(data: bytes) -> bool:
     """
-    Tell whether a PNG file has all of its chunks.
+    Return whether a PNG file has all of its chunks.
 
-    Decoders make room for whatever length a chunk declares, and libpng reports a file that is cut
-    short on stderr by itself.
+    Decoders allocate the length that a chunk declares, and libpng writes to stderr about a
+    truncated file.
     """
     at = len(PNG_START)
     while at + 12 <= len(data):

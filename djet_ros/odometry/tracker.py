@@ -21,12 +21,12 @@ from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import (
-    another_frame,
-    bent,
+    frame_mismatch,
+    residual_distortion,
     Complaint,
     has_frame,
     Health,
-    why_restarted,
+    restart_reason,
 )
 from djet_ros.odometry.images import BadMessage
 from djet_ros.odometry.messages import (
@@ -347,7 +347,7 @@ class Tracker:
     @property
     def _of_calibration(self) -> tuple[Complaint | None, ...]:
         frame = self.last.frame_id if self.last else ''
-        return bent(self._odometry.lens), another_frame(self._info_frame, frame)
+        return residual_distortion(self._odometry.lens), frame_mismatch(self._info_frame, frame)
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
@@ -452,7 +452,7 @@ class Tracker:
             self._path.clear()
             self._path_stamp = None
         result = self._odometry.process(frame, view)
-        self.remark = why_restarted(result, self._frame.stamp_ns if self._frame else None,
+        self.remark = restart_reason(result, self._frame.stamp_ns if self._frame else None,
                                     self.config.odometry)
         self.last, self._frame, self.problem = result, frame, None
         self._order.take(frame.stamp_ns)
