@@ -124,7 +124,7 @@ class Beside:
         return self._masks.of(stamp, shape, camera)
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
-        """Name the frames (parent, child) of which a mounting is still to be found, by topic."""
+        """Return frames (parent, child) with an unknown transform, keyed by 'imu' or 'guess'."""
         camera, _ = mounted_frame(self._config, image_frame)
         wanted = {}
         if self.gyro is not None and self.gyro.to_camera is None and 'imu' in self._frames:
@@ -135,9 +135,9 @@ class Beside:
 
     @property
     def wants_mountings(self) -> bool:
-        """Tell whether a mounting will be asked for, of frames that may still have no names."""
+        """Return whether a transform is missing, possibly of frames with yet unknown names."""
         gyro = self.gyro is not None and self.gyro.to_camera is None
-        # One on tf finds its own way there.
+        # A guess on tf needs no further transform.
         guess = self.guess is not None and not isinstance(self.guess, FrameGuess) \
             and self.guess.mounting is None
         return gyro or guess

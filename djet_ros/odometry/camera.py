@@ -1,10 +1,10 @@
 """
-sensor_msgs CameraInfo to the camera matrix of an undistorted image, and the undistortion itself.
+Camera model of a CameraInfo: camera matrix of the undistorted image, and undistortion.
 
-Which part of a CameraInfo holds depends on whether the images come rectified: P for rectified
-ones, K and D for raw ones. Nothing in a message tells; the parameter ``odometry.rectified`` does,
-and its value ``auto`` goes by the name of the image topic: see ``means_rectified``. Where the
-images have no distortion by that, ``odometry.residual_k1`` says what they still have.
+Rectified images have the camera matrix in P and no distortion, raw ones K and D. Messages do not
+say which they are; the parameter ``odometry.rectified`` does, and its value ``auto`` decides by
+the name of the image topic, see ``means_rectified``. Images without distortion by that may have a
+residual one, ``odometry.residual_k1``.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS
 import numpy as np
 from numpy.typing import NDArray
 
-# Numbers of coefficients that OpenCV knows for the polynomial models.
+# Numbers of coefficients of OpenCV's polynomial models.
 _POLYNOMIAL = (4, 5, 8, 12, 14)
 _MODELS = {'plumb_bob': _POLYNOMIAL, 'rational_polynomial': _POLYNOMIAL, 'equidistant': (4,)}
 
-# Focal lengths, and how far off the middle the optical axis may lie, in sides of an image: wide of
-# every lens, and near enough that nothing computed with them overflows.
+# Bounds in image sides of the focal length, and of the principal point's distance from the centre:
+# beyond every lens, yet nothing computed with them overflows.
 _SHORTEST, _LONGEST, _FARTHEST = 1e-2, 1e3, 10.0
 
-# Share of the undistorted image that must be seen in the image that comes, and the points on
-# either of its sides by which that is told.
+# Least share of the undistorted image that the raw image has to show, and the points along each
+# side by which it is measured.
 _LEAST_SEEN, _GRID = 0.1, 16
 
-# What mends a distortion that leaves hardly anything.
-_ANEW = 'calibrate the camera anew'
+# Remedies for a distortion that leaves less.
+_CALIBRATE = 'calibrate the camera anew'
 _OF_PARAMETER = 'it is odometry.residual_k1; set that to what djet lens finds, or to 0'
 
-# Directions from the optical axis, and places along each, by which a fold is found.
+# Directions from the optical axis, and points along each, to find where the distortion folds over.
 _DIRECTIONS, _ALONG = 32, 1000
 
-# By what words a topic's name tells whether its images are rectified, and the names that
-# image_transport and its plugins append to it.
+# Words in the name of an image topic that say whether it is rectified, and the names that
+# image_transport and its plugins append.
 _RECTIFIED, _NOT_RECTIFIED = {'rect', 'rectified'}, {'raw', 'unrect', 'unrectified'}
 _TRANSPORTS = {'raw', 'compressed', 'compressedDepth', 'theora', 'zstd', 'ffmpeg', 'foxglove',
                'h264', 'h265', 'avif'}
 
 
 class _Undistortion(NamedTuple):
-    """How images of a shape (H, W) are undistorted: OpenCV's maps, and what they don't show."""
+    """Undistortion of images of a shape (H, W): OpenCV's maps, and the pixels without content."""
 
     shape: tuple[int, ...]
     maps: tuple[Any, Any]
@@ -55,21 +55,20 @@ class _Undistortion(NamedTuple):
 
 class Camera:
     """
-    A camera, and what makes its images those of a pinhole.
+    A camera, and the undistortion of its images to those of a pinhole camera.
 
-    K: (3, 3) camera matrix of the images that ``undistort`` gives; raw_K: (3, 3) that of those
-    that it takes; size: (width, height) of the images that it takes, or None where that is open.
+    K: (3, 3) camera matrix of undistorted images; raw_K: (3, 3) of raw ones; size: (width, height)
+    of raw images, or None if unknown.
     """
 
     def __init__(self, K: Array, D: Array, size: tuple[int, int] | None,
                  model: str = 'plumb_bob', pinhole: Array | None = None,
-                 remedy: str = _ANEW) -> None:
+                 remedy: str = _CALIBRATE) -> None:
         """
-        Take the camera matrix K (3, 3) of the images as they come, and their distortion.
+        Create it from the camera matrix K (3, 3) of the raw images; raises BadMessage.
 
-        D: as OpenCV has it for the model, see ``distorts``; pinhole: (3, 3) camera matrix of the
-        undistorted images, by default K; remedy: what to do where D leaves hardly anything of an
-        image, for people. Raises BadMessage.
+        D: distortion coefficients of OpenCV's model; pinhole: (3, 3) camera matrix of the
+        undistorted images, by default K; remedy: text for a D that leaves hardly any image.
         """
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
@@ -84,15 +83,15 @@ class Camera:
     @classmethod
     def from_info(cls, info: Any, rectified: bool, residual_k1: float = 0.0) -> Camera:
         """
-        Make the camera that a CameraInfo describes; raises BadMessage.
+        Return the camera of a CameraInfo; raises BadMessage.
 
-        residual_k1: distortion of images that have none by it. With another one it is refused.
+        residual_k1: distortion of images that have none by it; an error if it has its own.
         """
         K = _numbers(info, 'k', 9).reshape(3, 3)
         projection = _numbers(info, 'p', 12).reshape(3, 4)[:, :3]
         D, size = _numbers(info, 'd', None), _image_size(info)
         if rectified:
-            # Drivers without a calibration leave zeros; some rectifiers fill in P alone, or K.
+            # Drivers without a calibration leave zeros; some rectifiers fill in only P, or only K.
             K = projection if projection.any() else K
         _check_camera(K)
         check_lens(K, _whole_size(info))
@@ -113,7 +112,7 @@ class Camera:
         return cls(_of_image(K, info), D, size, model, _of_image(pinhole, info))
 
     def undistort(self, gray: Gray) -> Gray:
-        """Image (H, W) without its distortion; BadMessage where its size is not the camera's."""
+        """Return an undistorted image (H, W); raises BadMessage if its size is not the camera's."""
         height, width = gray.shape
         if self.size is not None and self.size != (width, height):
             raise BadMessage('size_mismatch', f'image is {width}x{height} pixels, CameraInfo '
@@ -122,34 +121,34 @@ class Camera:
             check_lens(self.raw_K, (width, height))
         if self._distortion is None:
             return gray
-        # A black rim would be an edge that moves with the camera.
+        # A black border would be an edge that moves with the camera.
         return np.asarray(cv2.remap(gray, *self._undistortion(gray.shape).maps, cv2.INTER_LINEAR,
                                     borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
 
     def unseen(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """
-        (H, W) bool, pixels of an undistorted image that the image as it comes does not show.
+        Return the pixels (H, W) bool of an undistorted image that the raw image does not show.
 
-        They lie beyond its sides, or beyond where the distortion folds over, and shows for a
-        second time what is nearer to the axis. None where there are none.
+        They are outside the raw image, or beyond the radius at which the distortion folds over and
+        repeats what is nearer to the axis. None if there are none.
         """
         return None if self._distortion is None else self._undistortion(shape).unseen
 
     @property
     def k1(self) -> float:
-        """Give the first coefficient of its radial distortion."""
+        """Return the first coefficient of the radial distortion."""
         return float(self.distortion[1][0])
 
     @property
     def distortion(self) -> tuple[str, Array]:
-        """Give the model and its coefficients, zeros where the images are undistorted."""
+        """Return the model and its coefficients, zeros if the images have no distortion."""
         return self._distortion or ('plumb_bob', np.zeros(5))
 
     def pixels(self, places: Array, k1: float) -> tuple[Array, Array]:
         """
-        Show points X/Z, Y/Z (N, 2) in the images as they come, with another coefficient k1.
+        Project points X/Z, Y/Z (N, 2) to raw images, with another coefficient k1.
 
-        Gives pixels (N, 2), and how these move with the points (N, 2, 2).
+        Returns pixels (N, 2), and their Jacobians by the points (N, 2, 2).
         """
         model, D = self.distortion
         points = np.column_stack([places, np.ones(len(places))])[:, None]
@@ -157,12 +156,12 @@ class Camera:
                            else (cv2.projectPoints, 3))
         pixels, slopes = project(points, np.zeros(3), np.zeros(3), self.raw_K,
                                  np.append(k1, D[1:]))
-        # A step of the camera moves points at a depth of one as they would move themselves.
+        # At a depth of one the Jacobian by the camera's translation is that by the point.
         return (np.asarray(pixels, float).reshape(-1, 2),
                 np.asarray(slopes[:, by_way:by_way + 2], float).reshape(-1, 2, 2))
 
     def _undistortion(self, shape: tuple[int, ...]) -> _Undistortion:
-        """Tell how images (H, W) are undistorted; computed once, as sizes seldom change."""
+        """Return the undistortion of images (H, W); cached, as sizes rarely change."""
         if self._undistorting is None or self._undistorting.shape != shape:
             height, width = shape
             model, D = self.distortion
@@ -172,7 +171,7 @@ class Camera:
             maps, (x, y) = (module.initUndistortRectifyMap(
                 self.raw_K, D, np.eye(3), self.K, (width, height), kind)
                 for kind in (cv2.CV_16SC2, cv2.CV_32FC1))
-            # Up to half a pixel beyond the middles of the outermost ones something is seen.
+            # An image reaches half a pixel beyond the centres of its outermost pixels.
             seen = (np.abs(x - (width - 1) / 2) <= width / 2) \
                 & (np.abs(y - (height - 1) / 2) <= height / 2)
             unseen = ~seen | folded
@@ -181,10 +180,10 @@ class Camera:
 
     def _folded(self, width: int, height: int) -> NDArray[np.bool_]:
         """
-        (H, W) bool, pixels as far from the optical axis as where the distortion folds, or farther.
+        Return the pixels (H, W) bool at or beyond the radius at which the distortion folds over.
 
-        There it ceases to bring out what is farther out. Tangential coefficients bend that circle
-        a little, and the nearest place counts.
+        There its Jacobian is singular. Tangential coefficients make that curve no exact circle;
+        its smallest radius counts.
         """
         x, y = np.meshgrid(np.arange(width), np.arange(height))
         rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
@@ -193,7 +192,7 @@ class Camera:
         radii = step * np.arange(1, _ALONG + 1)
         angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         places = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        # What is too far off for a number is folded.
+        # Overflow counts as folded.
         with np.errstate(all='ignore'):
             _, slopes = self.pixels(places.reshape(-1, 2), self.k1)
             unfolded = np.linalg.det(slopes).reshape(_ALONG, _DIRECTIONS) > 0
@@ -202,11 +201,11 @@ class Camera:
         return np.asarray(away.reshape(height, width) > fold)
 
     def _check_distortion(self, folded: NDArray[np.bool_]) -> None:
-        """Refuse a distortion by which hardly anything of the image would be seen."""
+        """Raise BadMessage if hardly any of the undistorted image is in the raw image."""
         height, width = folded.shape
         x, y = np.meshgrid(*((np.arange(_GRID) + 0.5) * side / _GRID for side in (width, height)))
         rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-        # What is too far off for a number is not seen.
+        # Overflow counts as not seen.
         with np.errstate(all='ignore'):
             seen, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
         inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
@@ -220,10 +219,10 @@ class Camera:
 
 def means_rectified(rectified: str, image_topic: str) -> bool:
     """
-    Tell whether images come rectified, by the parameter or, with 'auto', by the topic's name.
+    Return whether images are rectified, by the parameter or, for 'auto', by the topic.
 
-    Its last name tells (image_rect_color), by its words, or else the one before (rect/image); a
-    transport's suffix (image_rect/compressed) is none of them.
+    The words of its last name decide (image_rect_color), or of the one before (rect/image), after
+    suffixes of transports (image_rect/compressed) are removed.
     """
     if rectified != 'auto':
         return rectified == 'true'
@@ -239,15 +238,15 @@ def means_rectified(rectified: str, image_topic: str) -> bool:
 
 def distorts(model: str, D: Array) -> bool:
     """
-    Tell whether coefficients D of a model make images other than those of a pinhole.
+    Return whether coefficients D of a model make an image other than a pinhole's.
 
-    Zeros do so for a fisheye: it has angles in equal steps, r = f theta, and not r = f tan(theta).
+    For a fisheye zeros do, too: r = f theta, not r = f tan(theta).
     """
     return bool(D.any()) or (model == 'equidistant' and len(D) > 0)
 
 
 def same_camera(a: Any, b: Any) -> bool:
-    """Tell whether two CameraInfo say the same about the camera; their headers don't matter."""
+    """Return whether two CameraInfo are equal, but for their headers."""
     return _identity(a) == _identity(b)
 
 
@@ -269,7 +268,7 @@ def _numbers(info: Any, name: str, count: int | None) -> Array:
 
 
 def _turned(info: Any) -> bool:
-    """Tell of a rectifying rotation: to follow it would turn the poses off the camera's axes."""
+    """Return whether there is a rectifying rotation, which would rotate poses off the camera."""
     R = _numbers(info, 'r', 9).reshape(3, 3)
     return bool(R.any()) and not np.allclose(R, np.eye(3), atol=1e-6)
 
@@ -285,9 +284,9 @@ def _check_camera(K: Array) -> None:
 
 def check_lens(K: Array, size: tuple[int, int]) -> None:
     """
-    Refuse a camera matrix (3, 3) that no lens before an image of (width, height) pixels has.
+    Raise BadMessage if no lens has a camera matrix (3, 3) with images of (width, height) pixels.
 
-    A size of zeros is open, and refuses nothing. Raises BadMessage.
+    A size of zeros is unknown, and not checked.
     """
     side = max(size)
     if not side:
@@ -315,24 +314,24 @@ def _distortion(model: str, D: Array) -> tuple[str, Array]:
 
 
 def _words(D: Array) -> str:
-    """Coefficients for people."""
+    """Return coefficients as text."""
     return ' '.join(f'{value:g}' for value in D)
 
 
 def _binning(info: Any) -> tuple[int, int]:
-    """Zero means one, as the message has it."""
+    """Return the binning in x and y; zero means one."""
     return max(int(info.binning_x), 1), max(int(info.binning_y), 1)
 
 
 def _whole_size(info: Any) -> tuple[int, int]:
-    """Size of the full resolution, which the matrices are of; zeros where it is open."""
+    """Return the size at full resolution, to which the matrices refer; zeros if unknown."""
     roi = info.roi
     return (max(int(info.width), int(roi.x_offset) + int(roi.width)),
             max(int(info.height), int(roi.y_offset) + int(roi.height)))
 
 
 def _image_size(info: Any) -> tuple[int, int] | None:
-    """Size of the images: that of the ROI (all zeros: everything), divided by the binning."""
+    """Return the size of the images: of the ROI (zeros: everything), divided by the binning."""
     binning_x, binning_y = _binning(info)
     whole = not (info.roi.width and info.roi.height)
     width, height = ((info.width, info.height) if whole
@@ -346,9 +345,10 @@ def _image_size(info: Any) -> tuple[int, int] | None:
 
 def _of_image(K: Array, info: Any) -> Array:
     """
-    Camera matrix of the image at hand, from that of the full resolution.
+    Return the camera matrix of the image, from that at full resolution.
 
-    The ROI is in full pixels and comes first, then the binning divides, as in image_geometry.
+    First the ROI is subtracted, in pixels of full resolution, then the binning divides, as in
+    image_geometry.
     """
     result = K.copy()
     result[0, 2] -= info.roi.x_offset

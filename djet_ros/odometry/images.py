@@ -1,8 +1,8 @@
 """
-sensor_msgs Image and CompressedImage to gray images, whatever the camera calls its pixels.
+Conversion of sensor_msgs Image and CompressedImage, of any encoding, to gray images.
 
-Sizes are compared with the data before anything is allocated or decoded. Whatever cannot become
-an image is a BadMessage with a reason that is counted.
+Sizes are checked against the data before anything is allocated or decoded. An unusable message
+raises BadMessage, with a reason to count it by.
 """
 
 from __future__ import annotations
@@ -21,33 +21,38 @@ from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
 
-# The values of images of 16 bits, of which all become gray unless somebody says less.
+# Values of 16-bit images that become black and white by default.
 WHOLE_RANGE = (0, 65535)
 
-# Gray levels below which an image of 16 bits shows little of what it has, and the share of the
-# pixels that makes a level one: broken pixels have any value.
+# Number below which a 16-bit image has few gray levels, and the least share of the pixels of a
+# level that counts: broken pixels have any value.
 _FEW_LEVELS, _LEAST_SHARE = 32, 1e-4
 
 # Features need a neighbourhood; OpenCV fails on slivers.
 _SMALLEST_SIDE = 16
 
 
-# Encoders of progressive images make about ten.
+# Scans of a progressive JPEG: encoders write about ten.
 _MOST_SCANS = 64
 
 
 class BadMessage(DjetError):
-    """A message that can't be used: ``reason`` is a word to count by, the text is for people."""
+    """An unusable message: ``reason`` is a word to count by, the text is for the user."""
 
     def __init__(self, reason: str, text: str) -> None:
-        """Keep the reason beside the text."""
+        """Store reason and text."""
         super().__init__(text)
         self.reason = reason
 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Bytes of one pixel, and what makes it gray: uint8 arrays (H, W, size) to (H, W)."""
+    """
+    An encoding.
+
+    size: channels of a pixel; to_gray: from uint8 (H, W, size) to (H, W); wide: whether they have
+    16 bits.
+    """
 
     size: int
     to_gray: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
@@ -73,7 +78,7 @@ _COLOURS = {
     'bgra': (4, cv2.COLOR_BGRA2GRAY), 'rgba': (4, cv2.COLOR_RGBA2GRAY),
 }
 
-# OpenCV names a mosaic by its second row, ROS by its first.
+# OpenCV names a Bayer pattern by its second row, ROS by its first.
 _MOSAICS = {
     'rggb': cv2.COLOR_BayerBG2GRAY, 'bggr': cv2.COLOR_BayerRG2GRAY,
     'gbrg': cv2.COLOR_BayerGR2GRAY, 'grbg': cv2.COLOR_BayerGB2GRAY,
@@ -89,7 +94,7 @@ _ENCODINGS = {
     # Interleaved: U Y V Y, and Y U Y V.
     **dict.fromkeys(('yuv422', 'uyvy'), _Pixels(2, _one_byte(1))),
     **dict.fromkeys(('yuv422_yuy2', 'yuyv'), _Pixels(2, _one_byte(0))),
-    # A plane of Y comes first, those of the colours follow it.
+    # Planar: Y first.
     **dict.fromkeys(('nv12', 'nv21', 'nv24'), _Pixels(1, _one_byte(0))),
     **{f'{name}{bits}': _Pixels(channels, _converted(code), wide=bits == 16)
        for name, (channels, code) in _COLOURS.items() for bits in (8, 16)},
@@ -102,33 +107,32 @@ ENCODINGS = tuple(_ENCODINGS)
 
 def gray_image(message: Any, limits: tuple[int, int] = WHOLE_RANGE) -> Gray:
     """
-    Gray image (H, W) uint8 of an Image or a CompressedImage.
+    Return the gray image (H, W) uint8 of an Image or a CompressedImage; raises BadMessage.
 
-    limits: which values of 16 bits become 0 and 255, in equal steps between them; of the whole
-    range the upper 8 bits are taken. The result may share memory with the message. Raises
-    BadMessage.
+    limits: values of 16 bits that become 0 and 255, with equal steps in between; for the whole
+    range these are the upper 8 bits. The result may share memory with the message.
     """
     if not hasattr(message, 'encoding'):
         return _demosaiced(narrowed(_compressed(message), limits), message.format)
     pixels, values = _raw(message)
-    # Most cameras send no padding: then a gray image is the message's own memory.
+    # No copy without padding, as most cameras send it.
     return np.ascontiguousarray(pixels.to_gray(narrowed(values, limits)))
 
 
 def narrowed(values: NDArray[Any], limits: tuple[int, int] = WHOLE_RANGE) -> NDArray[np.uint8]:
-    """Make numbers of 16 bits gray levels by limits; those of 8 bits stay as they are."""
+    """Return values of 16 bits as 8-bit gray levels by limits; 8-bit values are unchanged."""
     return values if values.dtype == np.uint8 else _levels_of_values(limits).take(values)
 
 
 @lru_cache
 def _levels_of_values(limits: tuple[int, int]) -> NDArray[np.uint8]:
-    """Gray level (65536,) of each value."""
+    """Return a lookup table (65536,) from values to gray levels."""
     low, high = limits
     return np.clip((np.arange(65536) - low) * 256 // (high - low + 1), 0, 255).astype(np.uint8)
 
 
 class Coarse(NamedTuple):
-    """What became of 16 bits where it is little: gray levels, and between which values it was."""
+    """A 16-bit image with few gray levels: their number, and the range of its values."""
 
     levels: int
     low: int
@@ -137,9 +141,9 @@ class Coarse(NamedTuple):
 
 def coarse(message: Any, gray: Gray) -> Coarse | None:
     """
-    Say how few gray levels an image of 16 bits became; None where they are enough, or 8 bits came.
+    Return the number of gray levels of a 16-bit image if it is small; otherwise None.
 
-    gray: what ``gray_image`` made of the message. Outside the two values is a thousandth each.
+    gray: result of ``gray_image``. The range is that of quantiles 0.001 and 0.999.
     """
     if not _is_wide(message):
         return None
@@ -154,12 +158,12 @@ def coarse(message: Any, gray: Gray) -> Coarse | None:
 def _is_wide(message: Any) -> bool:
     if hasattr(message, 'encoding'):
         return _ENCODINGS[message.encoding].wide
-    # Of formats that are decoded PNG alone has 16 bits, and says so after its size.
+    # Of the formats that are decoded only PNG has 16 bits; its bit depth follows its size.
     return bytes(message.data[:8]) == PNG_START and bytes(message.data[24:25]) == bytes([16])
 
 
 def _raw(message: Any) -> tuple[_Pixels, NDArray[Any]]:
-    """Give the meaning of an encoding, and numbers (H, W, size) of 8 or 16 bits."""
+    """Return the encoding of an Image, and its values (H, W, size) of 8 or 16 bits."""
     pixels = _ENCODINGS.get(message.encoding)
     if pixels is None:
         raise BadMessage('unknown_encoding', f"image encoding '{message.encoding:.40}' is not "
@@ -190,10 +194,10 @@ def _compressed(message: Any) -> NDArray[Any]:
 
 def _demosaiced(gray: Gray, said: str) -> Gray:
     """
-    Make gray of a mosaic (H, W) that was compressed as it is, which its format says.
+    Return the gray image of a Bayer mosaic (H, W) that was compressed as such, by its format.
 
-    So compressed_image_transport does with PNG ('bayer_rggb8; png compressed ') and, where it is
-    told to, with JPEG ('bayer_rggb8; jpeg compressed bayer_rggb8'), but not 'compressed mono8'.
+    compressed_image_transport does so with PNG ('bayer_rggb8; png compressed ') and, if so
+    configured, with JPEG ('bayer_rggb8; jpeg compressed bayer_rggb8'), not for 'compressed mono8'.
     """
     encoding, _, how = said.partition('; ')
     _, whole, became = how.partition(' compressed')
@@ -204,11 +208,11 @@ def _demosaiced(gray: Gray, said: str) -> Gray:
 
 
 def decoded(data: NDArray[np.uint8]) -> NDArray[Any]:
-    """Gray image (H, W), uint8 or uint16, of the bytes (N,) of a PNG or JPEG file; BadMessage."""
+    """Return the gray image (H, W), uint8 or uint16, of PNG or JPEG bytes; raises BadMessage."""
     width, height = _declared_size(data.tobytes())
     _check_size(width, height)
     try:
-        # A camera's geometry must not be turned by what the file says of its orientation.
+        # The EXIF orientation must not rotate the image against its calibration.
         gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
                             | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -219,7 +223,7 @@ def decoded(data: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _bytes(data: Any) -> NDArray[np.uint8]:
-    """View message data (array.array, bytes, or array) as bytes, without a copy."""
+    """Return message data (array.array, bytes or array) as bytes, without a copy."""
     try:
         return np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
@@ -238,17 +242,17 @@ def _check_size(width: int, height: int) -> None:
 
 
 def _declared_size(raw: bytes) -> tuple[int, int]:
-    """Give (width, height) that a PNG or JPEG declares, before anything is decoded."""
+    """Return (width, height) that a PNG or JPEG declares, without decoding it."""
     if raw[:8] == PNG_START and raw[12:16] == b'IHDR' and len(raw) >= 24:
         if not whole_png(raw):
             raise BadMessage('undecodable', f'PNG image of {len(raw)} bytes is cut short')
         width, height = struct.unpack('>II', raw[16:24])
         return width, height
     if raw[:2] == b'\xff\xd8':
-        # Decoders fill what is missing with gray. Cameras pad the end with zeros.
+        # Decoders fill a truncated image with gray. Cameras pad the end with zeros.
         if b'\xff\xd9' not in raw[-4096:]:
             raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')
-        # Each costs a pass over the whole image, and may have a few bytes only.
+        # Each scan costs a pass over the whole image, and may have a few bytes only.
         if (scans := raw.count(b'\xff\xda')) > _MOST_SCANS:
             raise BadMessage('undecodable', f'JPEG image has {scans} scans, at most {_MOST_SCANS} '
                              'are decoded')
@@ -256,12 +260,12 @@ def _declared_size(raw: bytes) -> tuple[int, int]:
     raise BadMessage('unknown_encoding', 'compressed image is neither JPEG nor PNG')
 
 
-# Markers of a JPEG that start a frame, and so carry its size.
+# Start-of-frame markers of JPEG, which are followed by its size.
 _START_OF_FRAME = set(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
 
 
 def jpeg_size(raw: bytes) -> tuple[int, int]:
-    """Give (width, height) that the beginning of a JPEG file declares. Raises BadMessage."""
+    """Return (width, height) that the header of a JPEG file declares; raises BadMessage."""
     at = 2
     while at + 9 <= len(raw) and raw[at] == 0xff:
         marker = raw[at + 1]

@@ -1,9 +1,9 @@
 """
-Results to ROS messages and back: the one place where poses change their frame and their form.
+Conversion of results to ROS messages and back, with all changes of frames and conventions.
 
-The classes are asked for by type name, so that rclpy's and rosbags' messages come out alike.
-rclpy's setters insist on plain float, int and str, on covariances as a float64 array of 36, and on
-``array.array`` for long sequences; rosbags' writers insist on NumPy arrays. The values here suit
+Classes are looked up by type name, so that rclpy's and rosbags' messages have equal content.
+rclpy's setters require plain float, int and str, covariances as a float64 array of 36, and
+``array.array`` for long sequences; rosbags' writers require NumPy arrays. The values here suit
 both.
 """
 
@@ -27,55 +27,55 @@ from scipy.spatial.transform import Rotation
 
 MessageType = Callable[[str], Any]
 
-# The first pose is exact by definition, but filters divide by what they are told.
+# Added to all covariances: the first pose is exact, but filters invert its covariance.
 LEAST_COVARIANCE = np.eye(6) * 1e-9
 
 # The seconds of a stamp are an int32.
 _LATEST_NS = 2**31 * 10**9 - 1
 
-# Metres: beyond everything on Earth, and far below where squares lose what drives it.
+# Metres: longer than any drive on Earth, yet squares keep the precision of a vehicle's motion.
 FARTHEST = 1e9
 
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
-# What is said of a frame that may be a keyframe; nothing where none are chosen.
+# Values of 'keyframe' in the status of a frame; empty if no keyframes are chosen.
 KEYFRAME_WORDS = {True: 'true', False: 'false', None: ''}
 IS_KEYFRAME = {word: chosen for chosen, word in KEYFRAME_WORDS.items()}
 
 
 def ns_of_time(time: Any) -> int:
-    """Nanoseconds of a Time; at most what a Time can hold again."""
-    # A sender's nanoseconds may exceed a second, and so lead beyond the last one.
+    """Return the nanoseconds of a Time, at most the latest that a Time can hold."""
+    # A sender's nanoseconds may exceed a second, and so the latest Time.
     return min(int(time.sec) * 10**9 + int(time.nanosec), _LATEST_NS)
 
 
 def stamp_ns(header: Any) -> int:
-    """Nanoseconds of a header's stamp; see ``ns_of_time``."""
+    """Return the nanoseconds of a header's stamp; see ``ns_of_time``."""
     return ns_of_time(header.stamp)
 
 
 def frame_of(header: Any) -> str:
-    """Name the frame of a header; names of ROS 1 have a slash in front, which tf2 refuses."""
+    """Return the frame_id of a header, without the leading slash of ROS 1, which tf2 rejects."""
     return str(header.frame_id).lstrip('/')
 
 
 def seconds_and_rest(stamp: int) -> tuple[int, int]:
-    """Whole seconds of a stamp in nanoseconds, and the nanoseconds beyond them, as in a Time."""
+    """Return whole seconds of a stamp in nanoseconds, and the remaining ones, as in a Time."""
     return divmod(int(stamp), 10**9)
 
 
 def seconds_text(stamp: int) -> str:
-    """Write a stamp in nanoseconds as seconds with all of their nine decimals."""
+    """Return a stamp in nanoseconds as text, in seconds with nine decimals."""
     seconds, rest = divmod(abs(int(stamp)), 10**9)
     return f'{"-" if stamp < 0 else ""}{seconds}.{rest:09d}'
 
 
 def pose_of(message: Any) -> tuple[int, Array]:
     """
-    Stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.
+    Return stamp in ns and pose (4, 4) of a PoseStamped, an Odometry or a TransformStamped.
 
-    The pose is NaN where the message holds none: no unit quaternion, or a place beyond FARTHEST.
+    The pose is NaN if it is invalid: far from a unit quaternion, or beyond FARTHEST.
     """
     if hasattr(message, 'transform'):
         position, orientation = message.transform.translation, message.transform.rotation
@@ -95,10 +95,10 @@ def pose_of(message: Any) -> tuple[int, Array]:
 
 def in_convention(result: OdometryResult, convention: str) -> OdometryResult:
     """
-    Express a result along optical or body axes, ``convention`` being 'optical' or 'body'.
+    Return a result along optical or body axes; convention: 'optical' or 'body'.
 
     The body frame has its origin in the camera, with x forward, y left and z up (REP 103); both
-    ends of every pose are turned.
+    frames of every pose are rotated.
     """
     if convention == 'optical':
         return result
@@ -111,10 +111,10 @@ def in_convention(result: OdometryResult, convention: str) -> OdometryResult:
 
 def camera_frame(config: OdometryConfig, image_frame: str) -> str:
     """
-    Name the frame that poses are of: the configured one, or the image's own.
+    Return the frame of the poses: the configured one, or the image's.
 
-    With the body convention the image's optical frame would be the wrong name:
-    camera_optical_frame becomes camera_frame, and any other name gets the ending _body.
+    With the body convention the image's optical frame is renamed: camera_optical_frame to
+    camera_frame, any other name gets the suffix _body.
     """
     if config.camera_frame or config.frame_convention == 'optical' or not image_frame:
         return config.camera_frame or image_frame
@@ -124,9 +124,9 @@ def camera_frame(config: OdometryConfig, image_frame: str) -> str:
 
 def mounted_frame(config: OdometryConfig, image_frame: str) -> tuple[str, Array]:
     """
-    Name the frame whose place on base_frame is asked for; the images' optical axes in it (4, 4).
+    Return the camera's frame to look up on base_frame, and the optical axes (4, 4) in it.
 
-    That is the configured camera_frame, along the axes of frame_convention, or the image's own.
+    It is the configured camera_frame, with axes of frame_convention, or the image's frame.
     """
     axes = np.eye(4)
     if config.camera_frame and config.frame_convention == 'body':
@@ -135,31 +135,31 @@ def mounted_frame(config: OdometryConfig, image_frame: str) -> tuple[str, Array]
 
 
 class MessageFactory:
-    """Makes messages of arrays; message_type gives the class for a type name."""
+    """Makes messages from arrays; message_type: returns the class for a type name."""
 
     def __init__(self, message_type: MessageType) -> None:
         self._type = message_type
 
     def time(self, stamp: int) -> Any:
-        """Make a Time of nanoseconds."""
+        """Return a Time from nanoseconds."""
         seconds, rest = seconds_and_rest(stamp)
         return self._type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=rest)
 
     def header(self, stamp: int, frame_id: str) -> Any:
-        """Make a Header with a stamp in nanoseconds."""
+        """Return a Header with a stamp in nanoseconds."""
         return self._type('std_msgs/msg/Header')(stamp=self.time(stamp), frame_id=frame_id)
 
     def pose_in(self, stamp: int, frame: str, pose: Array) -> Any:
-        """Make the PoseStamped of a pose (4, 4) in a frame."""
+        """Return a PoseStamped of a pose (4, 4) in a frame."""
         return self._type('geometry_msgs/msg/PoseStamped')(
             header=self.header(stamp, frame), pose=self._pose(pose))
 
     def path(self, poses: Sequence[Any]) -> Any:
-        """Make the Path of at least one PoseStamped."""
+        """Return a Path of at least one PoseStamped."""
         return self._type('nav_msgs/msg/Path')(header=poses[-1].header, poses=list(poses))
 
     def frame(self, stamp: int, parent: str, child: str, pose: Array) -> Any:
-        """Make the TFMessage of one frame in another, pose (4, 4)."""
+        """Return a TFMessage with the pose (4, 4) of the frame child in parent."""
         return self._type('tf2_msgs/msg/TFMessage')(transforms=[
             self._type('geometry_msgs/msg/TransformStamped')(
                 header=self.header(stamp, parent), child_frame_id=child,
@@ -169,7 +169,7 @@ class MessageFactory:
 
     def camera_info(self, stamp: int, frame_id: str, K: Array, size: tuple[int, int],
                     D: Array | None = None, model: str = 'plumb_bob') -> Any:
-        """Make the CameraInfo of images (width, height), with K (3, 3) before and after D (N,)."""
+        """Return a CameraInfo; size: (width, height); K (3, 3) also is P; D: (N,) or None."""
         roi = self._type('sensor_msgs/msg/RegionOfInterest')(
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         return self._type('sensor_msgs/msg/CameraInfo')(
@@ -179,7 +179,7 @@ class MessageFactory:
             binning_x=0, binning_y=0, roi=roi)
 
     def imu(self, stamp: int, frame_id: str, rate: Array, acceleration: Array) -> Any:
-        """Make the Imu of a rate (3,) in rad/s and an acceleration (3,) in m/s², and no more."""
+        """Return an Imu of a rate (3,) in rad/s and an acceleration (3,) in m/s² only."""
         unknown = np.array([-1.0, *[0.0] * 8])
         return self._type('sensor_msgs/msg/Imu')(
             header=self.header(stamp, frame_id),
@@ -190,14 +190,14 @@ class MessageFactory:
             linear_acceleration_covariance=np.zeros(9))
 
     def picture(self, stamp: int, frame_id: str, pixels: NDArray[Any]) -> Any:
-        """Make the Image of an array (H, W), mono8 or mono16, or (H, W, 3), bgr8."""
+        """Return an Image of an array (H, W), mono8 or mono16, or (H, W, 3), bgr8."""
         image_type = self._type('sensor_msgs/msg/Image')
         height, width = pixels.shape[:2]
         gray = 'mono8' if pixels.dtype == np.uint8 else 'mono16'
         little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
         data: Any = little.view(np.uint8).ravel()
         if hasattr(image_type, 'get_fields_and_field_types'):
-            # rclpy would check an array byte by byte, but takes this one as it is.
+            # rclpy checks a NumPy array byte by byte, but not this one.
             data = array('B', data.tobytes())
         return image_type(
             header=self.header(stamp, frame_id), height=height, width=width,
@@ -205,17 +205,17 @@ class MessageFactory:
             step=len(data) // height, data=data)
 
     def compressed(self, stamp: int, frame_id: str, data: bytes) -> Any:
-        """Make the CompressedImage of the bytes of a PNG or JPEG file."""
+        """Return a CompressedImage of the bytes of a PNG or JPEG file."""
         return self._type('sensor_msgs/msg/CompressedImage')(
             header=self.header(stamp, frame_id), format='', data=np.frombuffer(data, np.uint8))
 
     def cloud(self, stamp: int, frame_id: str, places: Array) -> Any:
-        """Make the PointCloud2 of places (M, 3), float32 x, y and z."""
+        """Return a PointCloud2 of points (M, 3), float32 x, y and z."""
         cloud_type = self._type('sensor_msgs/msg/PointCloud2')
         field = self._type('sensor_msgs/msg/PointField')
         data: Any = np.ascontiguousarray(places, '<f4').view(np.uint8).ravel()
         if hasattr(cloud_type, 'get_fields_and_field_types'):
-            # As for pictures.
+            # As for images.
             data = array('B', data.tobytes())
         return cloud_type(
             header=self.header(stamp, frame_id), height=1, width=len(places),
@@ -226,10 +226,10 @@ class MessageFactory:
 
     def diagnostics(self, stamp: int, name: str, level: str, summary: str,
                     values: dict[str, str], hardware: str = '', frame_id: str = '') -> Any:
-        """Make the DiagnosticArray of one status; level is 'OK', 'WARN' or 'ERROR'."""
+        """Return a DiagnosticArray of one status; level: 'OK', 'WARN' or 'ERROR'."""
         status_type = self._type('diagnostic_msgs/msg/DiagnosticStatus')
         pair = self._type('diagnostic_msgs/msg/KeyValue')
-        # The class's own constant is of the type that its field wants: bytes or int.
+        # The class's constant has the type of its field: bytes or int.
         status = status_type(
             level=getattr(status_type, level), name=name, message=summary, hardware_id=hardware,
             values=[pair(key=key, value=value) for key, value in values.items()])
@@ -250,7 +250,7 @@ class MessageFactory:
 
 
 def k1_of(word: str | None) -> float:
-    """Read a radial distortion, none where an older odometry wrote; ValueError for no number."""
+    """Return a radial distortion from text, zero if missing; raises ValueError if not finite."""
     k1 = float(word or 0.0)
     if not np.isfinite(k1):
         raise ValueError(f'k1 is {word}')
@@ -259,12 +259,12 @@ def k1_of(word: str | None) -> float:
 
 class FrameStatus(NamedTuple):
     """
-    What a backend has to know of a frame beside its poses: see ``Messages.status``.
+    What a back end needs of a frame beside its poses; see ``Messages.status``.
 
-    reference_ns: stamp of the frame that it was related to, or None; scale: what the length of
-    the translation is in; stationary: whether the camera stood still, so that the next frame
-    is related to the same reference; keyframe: whether the odometry took the frame for a keyframe,
-    None where it takes none or does not say; k1: radial distortion without which it saw the frame.
+    reference_ns: stamp of the reference frame, or None; scale: unit of the translation's length;
+    stationary: whether the camera stood still, so that the reference frame stays; keyframe:
+    whether it is a keyframe of the odometry, None if that has none or does not say; k1: radial
+    distortion that was removed from its image.
     """
 
     stamp_ns: int
@@ -277,7 +277,7 @@ class FrameStatus(NamedTuple):
 
 
 def frame_status(message: Any) -> FrameStatus:
-    """Read what ``Messages.status`` makes; DjetError where it is something else."""
+    """Return the content of a ``Messages.status``; raises DjetError if it is none."""
     stamp = stamp_ns(message.header)
     try:
         values = {pair.key: pair.value for pair in message.status[0].values}
@@ -291,10 +291,10 @@ def frame_status(message: Any) -> FrameStatus:
 
 class Messages(MessageFactory):
     """
-    Makes the messages of results, too.
+    Makes messages from results.
 
-    node: name of the node that they come from; mounting: (4, 4) the camera in base_frame, needed
-    for whatever is in the odom frame where a base_frame is configured.
+    node: name of the node; mounting: (4, 4) the camera in base_frame, required for poses in the
+    odom frame if a base_frame is configured.
     """
 
     def __init__(self, message_type: MessageType, config: OdometryConfig,
@@ -305,13 +305,13 @@ class Messages(MessageFactory):
         self._node = node
 
     def relative_pose(self, result: OdometryResult) -> Any:
-        """Make the PoseStamped of the current camera in the previous camera's frame."""
+        """Return a PoseStamped of the current camera in the reference camera."""
         turned, frame = self._turned(result)
         return self._type('geometry_msgs/msg/PoseStamped')(
             header=self.header(result.stamp_ns, frame), pose=self._pose(turned.motion))
 
     def relative_pose_cov(self, result: OdometryResult) -> Any:
-        """Make the PoseWithCovarianceStamped of the same."""
+        """Return a PoseWithCovarianceStamped of the same."""
         turned, frame = self._turned(result)
         return self._type('geometry_msgs/msg/PoseWithCovarianceStamped')(
             header=self.header(result.stamp_ns, frame),
@@ -319,14 +319,14 @@ class Messages(MessageFactory):
 
     def status(self, result: OdometryResult) -> Any:
         """
-        Make the DiagnosticArray that says of a frame what its poses do not.
+        Return a DiagnosticArray of what the poses of a frame do not say.
 
         One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
-        frame that the relative poses of the same stamp start from, empty where there is none;
-        'length' is metric, relative (to the first step of the track) or unknown; 'stationary' is
-        true or false, and so is 'keyframe', or empty where none are chosen; 'k1' is the radial
-        distortion that landmarks had shown, without which the image was seen. Level OK: there is
-        a relative pose; WARN: the odometry started or restarted here; ERROR: a bad pair.
+        reference frame of the relative poses with the same stamp, empty without one; 'length' is
+        metric, relative (to the first step of the track) or unknown; 'stationary' is true or
+        false; 'keyframe' too, or empty if none are chosen; 'k1' is the radial distortion,
+        estimated from landmarks, that was removed from the image. Level OK: there is a relative
+        pose; WARN: the odometry (re)started here; ERROR: a bad pair.
         """
         tracked = result.status in TRACKED
         level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
@@ -342,10 +342,10 @@ class Messages(MessageFactory):
 
     def odometry(self, result: OdometryResult) -> Any:
         """
-        Make the Odometry: the integrated pose, and the twist of the last pair.
+        Return an Odometry: the integrated pose, and the twist of the last pair.
 
-        Of the camera, or of base_frame where that is configured. The odom frame is where it
-        began: the first camera's, along optical or body axes as configured, or the first base's.
+        Both are of base_frame if it is configured, otherwise of the camera. The odom frame is its
+        first pose: of the base, or of the camera along optical or body axes as configured.
         """
         pose, pose_covariance, frame = self._integrated(result)
         velocity, covariance = self._twist(result)
@@ -358,21 +358,21 @@ class Messages(MessageFactory):
                 covariance=(covariance + LEAST_COVARIANCE).ravel()))
 
     def landmarks(self, result: OdometryResult, places: Array) -> Any:
-        """Make the PointCloud2 of places (M, 3) along the optical axes of the images' frame."""
+        """Return a PointCloud2 of points (M, 3) along the optical axes of the images' frame."""
         return self.cloud(result.stamp_ns, result.frame_id, places)
 
     def pose_stamped(self, result: OdometryResult) -> Any:
-        """Make the PoseStamped of the integrated pose in the odom frame."""
+        """Return a PoseStamped of the integrated pose in the odom frame."""
         pose, _, _ = self._integrated(result)
         return self.pose_in(result.stamp_ns, self._config.odom_frame, pose)
 
     def transform(self, result: OdometryResult) -> Any:
-        """Make the TFMessage from the odom frame to the camera or to base_frame."""
+        """Return a TFMessage from the odom frame to the camera or to base_frame."""
         pose, _, frame = self._integrated(result)
         return self.frame(result.stamp_ns, self._config.odom_frame, frame, pose)
 
     def _integrated(self, result: OdometryResult) -> tuple[Array, Array, str]:
-        """Pose (4, 4) in the odom frame, its covariance (6, 6), and the frame it is of."""
+        """Return the pose (4, 4) in the odom frame, its covariance (6, 6), and the child frame."""
         if self._mounting is None:
             turned, frame = self._turned(result)
             return turned.pose, turned.pose_covariance, frame
@@ -395,15 +395,14 @@ class Messages(MessageFactory):
 
 def twist(result: OdometryResult) -> tuple[Array, Array]:
     """
-    Mean velocity (6,) of a pair along the current camera's axes, and its covariance (6, 6).
+    Return the mean twist (6,) of a pair along the current camera's axes, and its covariance.
 
-    Linear in metres (or units) per second, angular in radians per second; the mean over the time
-    in which the motion came about, which begins where a standstill ends. Without a pair, or where
-    its motion could not be told, the velocity is zero and nothing is known about it: the
-    covariance is huge.
+    Linear in metres (or units) per second, angular in radians per second, over the time of the
+    motion, which begins where a standstill ends. If no motion was estimated, the twist is zero
+    with a large covariance.
     """
     if result.since_ns is None or result.status not in TRACKED:
-        return twist_of_nothing()
+        return unknown_twist()
     seconds = (result.stamp_ns - result.since_ns) * 1e-9
     R = result.motion[:3, :3]
     velocity = np.concatenate([R.T @ result.motion[:3, 3],
@@ -413,8 +412,8 @@ def twist(result: OdometryResult) -> tuple[Array, Array]:
     return velocity, rotated(R.T, covariance) / seconds**2
 
 
-def twist_of_nothing() -> tuple[Array, Array]:
-    """Velocity (6,) without a pair, which is zero, and its covariance (6, 6), which is huge."""
+def unknown_twist() -> tuple[Array, Array]:
+    """Return a zero twist (6,) with the covariance (6, 6) of an unknown one."""
     return np.zeros(6), np.eye(6) * UNKNOWN_LENGTH_SIGMA**2
 
 
