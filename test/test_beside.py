@@ -165,8 +165,8 @@ def test_an_image_lacks_the_gyro_until_there_is_a_sample_at_its_stamp(drive: Dri
 
 
 @pytest.mark.parametrize(('what', 'name', 'text'), [
-    ('none', 'no imu in time', "asks for 'imu', and no sample has come; publish it"),
-    ('late', 'no imu in time', 'images were worked on without it'),
+    ('none', 'no imu in time', "requires 'imu', and no sample was received; publish it"),
+    ('late', 'no imu in time', 'images were processed without it'),
     ('nan', 'gyro samples of no use', '241 of 241 samples|of .* samples: not a rate'),
     ('unmounted', 'no mounting of imu', "where 'imu' is on 'camera'"),
 ])

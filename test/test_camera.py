@@ -269,7 +269,7 @@ def test_a_camera_matrix_of_no_lens_is_refused_wherever_it_stands(at, value):
     assert reason(p=P, d=DISTORTIONS['plumb_bob']) == 'bad_calibration'
     # Where the CameraInfo has no size, the image tells it.
     open_size = Camera.from_info(camera_info(wrong, (0, 0)), False)
-    with pytest.raises(BadMessage, match='calibrate the camera anew'):
+    with pytest.raises(BadMessage, match='recalibrate the camera'):
         open_size.undistort(np.zeros(SIZE[::-1], np.uint8))
 
 

@@ -423,7 +423,7 @@ def test_a_step_back_is_logged_though_a_gap_was_just_before(live, drive):
     one.send(drive[5:7], first=4)
     one.wait_for_images(7)
     gap, back = one.graph.lines
-    assert 'it goes on at the last pose' in gap
+    assert 'it continues at the last pose' in gap
     assert 'odom jumps to the origin' in back
 
 

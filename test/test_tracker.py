@@ -416,7 +416,7 @@ def test_a_new_beginning_is_explained(drive):
     play(one, drive[:2], start=50.0)
     play(one, drive[:1], start=20.0)
     assert one.remark.startswith('the stamps went back by 30.100 s')
-    assert one.remark.endswith('everything begins anew, and odom jumps to the origin')
+    assert one.remark.endswith('the odometry restarts, and odom jumps to the origin')
     play(one, drive[:1], start=25.0)
     assert one.remark.startswith('5.000 s without an image')
 
@@ -513,7 +513,7 @@ def speed(seconds, metres_per_second=3.0):
 
 
 @pytest.mark.parametrize(('off', 'seen'), [
-    (None, 'no speed has come; publish it on speed or speed_odometry, stamped by the clock'),
+    (None, 'no speed was received; publish it on speed or speed_odometry, stamped by the clock'),
     (100.0, r'the newest speed is stamped 100\.\d s after the newest image'),
     (-100.0, r'the newest speed is stamped 100\.\d s before the newest image')])
 def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(drive, off, seen):

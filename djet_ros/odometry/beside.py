@@ -97,7 +97,7 @@ class Beside:
     def tf(self, message: Any, *, static: bool) -> None:
         """Take a TFMessage."""
         if isinstance(self.guess, FrameGuess):
-            self.guess.hear(message, static=static)
+            self.guess.add_message(message, static=static)
 
     def mask(self, message: Any) -> None:
         """Take the mask of an image."""
@@ -174,20 +174,20 @@ class Beside:
     def _late(self, what: str) -> Complaint | None:
         if len(self._lacking) < _FEW or self._lacking.count(what) * 2 < len(self._lacking):
             return None
-        seen = 'no sample has come' if what == 'imu' and not self._samples else (
-            f'{self._lacking.count(what)} of the newest {len(self._lacking)} images were worked '
-            'on without it')
+        seen = 'no sample was received' if what == 'imu' and not self._samples else (
+            f'{self._lacking.count(what)} of the newest {len(self._lacking)} images were '
+            'processed without it')
         if what == 'guess' and isinstance(self.guess, FrameGuess):
             return Complaint(f'no {what} in time', 'WARN', (
-                f"tf does not tell in time where '{self.guess.camera}' is in "
-                f"'{self.guess.still}' (odometry.guess_frame); have it published, {_CLOCKS}"))
+                f"tf has the transform from '{self.guess.still}' (odometry.guess_frame) to "
+                f"'{self.guess.camera}' too late or not at all; publish it, {_CLOCKS}"))
         return Complaint(f'no {what} in time', 'WARN', (
-            f"odometry asks for '{what}', and {seen}; publish it, {_CLOCKS}"))
+            f"the configuration requires '{what}', and {seen}; publish it, {_CLOCKS}"))
 
     def _mountings(self, image_frame: str) -> list[Complaint]:
         return [Complaint(f'no mounting of {what}', 'WARN', (
-            f"nobody knows where '{child}' is on '{parent}', and '{what}' is of no use until "
-            'somebody does; publish it by robot_state_publisher or by tf2_ros '
+            f"tf does not know where '{child}' is on '{parent}', which '{what}' needs; publish it "
+            'by robot_state_publisher or by tf2_ros '
             f'static_transform_publisher --frame-id {parent} --child-frame-id {child}'
             + (', or set odometry.imu_rotation' if what == 'imu' else '')))
             for what, (parent, child) in self.wanted_mountings(image_frame).items()
@@ -207,7 +207,7 @@ class Beside:
         if self.gyro is None or self.gyro.fits:
             return None
         return Complaint('gyro does not fit', 'WARN', (
-            'most of the newest turns are others than the images tell, and the gyro is not gone '
-            'by; check whether its rates are in rad/s, how the IMU is mounted (odometry.'
-            'imu_rotation or tf) and odometry.imu_offset; the latter two djet lab imu-offset '
-            'finds from a recording'))
+            'most of its newest rotations disagree with the images, and it is not used; check '
+            'that its rates are in rad/s, how the IMU is mounted (odometry.imu_rotation or tf) '
+            'and odometry.imu_offset; djet lab imu-offset estimates the latter two from a '
+            'recording'))

@@ -32,7 +32,7 @@ _SHORTEST, _LONGEST, _FARTHEST = 1e-2, 1e3, 10.0
 _LEAST_SEEN, _GRID = 0.1, 16
 
 # Remedies for a distortion that leaves less.
-_CALIBRATE = 'calibrate the camera anew'
+_CALIBRATE = 'recalibrate the camera'
 _OF_PARAMETER = 'it is odometry.residual_k1; set that to what djet lens finds, or to 0'
 
 # Directions from the optical axis, and points along each, to find where the distortion folds over.
@@ -102,8 +102,8 @@ class Camera:
         if residual_k1:
             raise BadMessage('bad_calibration', (
                 f'odometry.residual_k1 is {residual_k1:g}, but the calibration has a distortion '
-                f'of its own, {_words(D)}; set the parameter to 0 and put what is left into that, '
-                'as lens.yaml of djet lens does, or odometry.rectified to true where images are'))
+                f'of its own, {_words(D)}; set the parameter to 0 and add the residual to that, '
+                'as lens.yaml of djet lens does, or set odometry.rectified to true if images are'))
         pinhole = K
         if projection.any() and not _turned(info):
             _check_camera(projection)
@@ -112,7 +112,7 @@ class Camera:
         return cls(_of_image(K, info), D, size, model, _of_image(pinhole, info))
 
     def undistort(self, gray: Gray) -> Gray:
-        """Return an undistorted image (H, W); raises BadMessage if its size is not the camera's."""
+        """Return an undistorted image (H, W); raises BadMessage if its size is another one."""
         height, width = gray.shape
         if self.size is not None and self.size != (width, height):
             raise BadMessage('size_mismatch', f'image is {width}x{height} pixels, CameraInfo '
@@ -213,7 +213,7 @@ class Camera:
         if inside.mean() < _LEAST_SEEN:
             raise BadMessage('bad_calibration', (
                 f'the distortion {_words(self.distortion[1])} ({self.distortion[0]}) leaves '
-                f'{inside.mean():.0%} of an image of {width}x{height} pixels to be seen; '
+                f'{inside.mean():.0%} of an image of {width}x{height} pixels; '
                 f'{self._remedy}'))
 
 
@@ -261,7 +261,7 @@ def _numbers(info: Any, name: str, count: int | None) -> Array:
     values = np.asarray(getattr(info, name), dtype=np.float64).ravel()
     if count is not None and len(values) != count:
         raise BadMessage('bad_calibration',
-                         f'CameraInfo {name} has {len(values)} numbers, {count} belong there')
+                         f'CameraInfo {name} has {len(values)} numbers, it needs {count}')
     if not np.isfinite(values).all():
         raise BadMessage('bad_calibration', f'CameraInfo {name} has a number that is not finite')
     return values
@@ -294,15 +294,15 @@ def check_lens(K: Array, size: tuple[int, int]) -> None:
     focal, off = np.diag(K)[:2], K[:2, 2] - np.array(size) / 2
     if not ((_SHORTEST * side <= focal) & (focal <= _LONGEST * side)).all():
         raise BadMessage('bad_calibration', (
-            f'focal lengths of {focal[0]:g} and {focal[1]:g} pixels are those of no lens before '
-            f'an image of {size[0]}x{size[1]}; calibrate the camera anew'))
+            f'no lens has focal lengths of {focal[0]:g} and {focal[1]:g} pixels for an image of '
+            f'{size[0]}x{size[1]}; {_CALIBRATE}'))
     if not (np.abs(off) <= _FARTHEST * side).all():
         raise BadMessage('bad_calibration', (
             f'the principal point {K[0, 2]:g}, {K[1, 2]:g} is far off an image of '
-            f'{size[0]}x{size[1]} pixels; calibrate the camera anew'))
+            f'{size[0]}x{size[1]} pixels; {_CALIBRATE}'))
     if abs(K[0, 1]) > focal[0] or K[1, 0]:
         raise BadMessage('bad_calibration', (
-            f'the skew {K[0, 1]:g}, {K[1, 0]:g} is that of no sensor; calibrate the camera anew'))
+            f'no sensor has the skew {K[0, 1]:g}, {K[1, 0]:g}; {_CALIBRATE}'))
 
 
 def _distortion(model: str, D: Array) -> tuple[str, Array]:

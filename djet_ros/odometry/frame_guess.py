@@ -26,7 +26,7 @@ class FrameGuess(Guess):
         """Set the name of the camera's frame; ``mount`` takes the images' axes in it."""
         self.camera = camera
 
-    def hear(self, message: Any, *, static: bool) -> None:
+    def add_message(self, message: Any, *, static: bool) -> None:
         """Take a TFMessage of /tf or of /tf_static."""
         self._frames.add(message, static=static)
 

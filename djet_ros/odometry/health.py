@@ -119,7 +119,7 @@ class Health:
         return Complaint('few gray levels', 'WARN', (
             f'{self._coarse_images} images of 16 bits in a row became {levels} gray levels with '
             f'odometry.gray_range {self._config.gray_range}; their values lie between {low} and '
-            f'{high}: set odometry.gray_range to what the camera can give'))
+            f'{high}: set odometry.gray_range to the range of the camera'))
 
     def _frame(self) -> Complaint | None:
         if self._last is None:
@@ -130,8 +130,8 @@ class Health:
                 f"both are called '{odom}', and no pose goes to tf; set odometry.base_frame"))
         if not self._last.frame_id and not self._config.camera_frame:
             return Complaint('no frame_id', 'WARN', (
-                'the images have no frame_id, so that nobody knows what the poses are of, and '
-                'none goes to tf; set it in the camera driver, or odometry.camera_frame here'))
+                'the images have no frame_id, so the poses have no child frame and none goes to '
+                'tf; set it in the camera driver, or odometry.camera_frame here'))
         if _like_odom(self._config, self._last.frame_id):
             return Complaint('frame_id is odom_frame', 'ERROR', (
                 f"the camera's frame is called '{odom}' like odometry.odom_frame, and no pose "
@@ -144,8 +144,8 @@ class Health:
         base, (camera, _) = self._config.base_frame, mounted_frame(
             self._config, self._last.frame_id)
         return Complaint('no mounting on tf', 'WARN', (
-            f"tf does not know where '{camera}' is on '{base}', and there is no odometry until it "
-            'does; publish it by robot_state_publisher or by tf2_ros static_transform_publisher '
+            f"tf does not know where '{camera}' is on '{base}', which the odometry needs; publish "
+            'it by robot_state_publisher or by tf2_ros static_transform_publisher '
             f'--frame-id {base} --child-frame-id {camera}'))
 
     @property
@@ -180,22 +180,22 @@ class Health:
             return None
         return Complaint('images dropped under load', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were dropped: they come faster '
-            'than they are worked on; lower their rate (that of a player, too), their size or '
+            'than they are processed; lower their rate (also that of a player), their size or '
             'estimator.max_features'))
 
     def _way(self) -> Complaint | None:
         if (share := self._share('lost')) < _SHARE:
             return None
         return Complaint('images lost on the way', 'WARN', (
-            f'{share:.0%} of the newest {len(self._fates)} images were sent and never came; lower '
-            'their rate or send them compressed, and have reliable senders keep more of them'))
+            f'{share:.0%} of the newest {len(self._fates)} images were sent and never received; '
+            'lower their rate or compress them, and increase the depth of reliable publishers'))
 
     def _order(self) -> Complaint | None:
         if (share := self._share('late')) < _SHARE:
             return None
         return Complaint('images out of order', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were older than one before them '
-            'and dropped; do two cameras publish on one topic, or was one image stamped ahead?'))
+            'and dropped; do two cameras publish on one topic, or had one image a late stamp?'))
 
     def two_cameras(self) -> Complaint | None:
         """Return the problem that the frame_id of images alternates."""
@@ -205,7 +205,7 @@ class Health:
         return Complaint('images of two cameras', 'WARN', (
             f'{changes} of the newest {images} images had another frame_id than the one before '
             f"them, the newest of all '{self._image_frame}'; two cameras publish on one topic, "
-            'and poses are of now one, now the other'))
+            'and the poses mix both'))
 
 
 def frame_mismatch(info_frame: str, image_frame: str) -> Complaint | None:
@@ -223,9 +223,9 @@ def residual_distortion(lens: SelfCalibration | None) -> Complaint | None:
     if lens is None:
         return None
     return Complaint('distortion left', 'WARN', (
-        f'by its landmarks the images have a distortion left, of k1 = {lens.k1:.4f} +- '
-        f'{lens.sigma:.4f}; from where it is found on they are seen without it, which is too late '
-        'for what was before: djet lens finds it by all of the recording, and says what to do'))
+        f'landmarks show a residual distortion of k1 = {lens.k1:.4f} +- {lens.sigma:.4f}; it is '
+        'removed from the images from now on, but not from earlier ones: djet lens estimates it '
+        'from the whole recording, and says how to correct the calibration'))
 
 
 def _equal_stamps(images: int, stamp_ns: int) -> Complaint | None:
@@ -253,14 +253,14 @@ def _like_odom(config: OdometryConfig, image_frame: str) -> bool:
 def restart_reason(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:
     """Return a text on why the odometry restarted, an empty one if it did not."""
     if result.status is Status.SIZE_CHANGED:
-        return ('another image size or another camera; it goes on at the last pose, and the '
+        return ('another image size or another camera; it continues at the last pose, and the '
                 'motion in between is unknown')
     if result.status is not Status.TIME_JUMP or before_ns is None:
         return ''
     seconds = (result.stamp_ns - before_ns) * 1e-9
     if seconds < 0:
         return (f'the stamps went back by {-seconds:.3f} s, which is more than '
-                f'odometry.max_backwards ({config.max_backwards:g} s), or stayed back; everything '
-                f'begins anew, and {config.odom_frame} jumps to the origin')
+                f'odometry.max_backwards ({config.max_backwards:g} s), or stayed back; the '
+                f'odometry restarts, and {config.odom_frame} jumps to the origin')
     return (f'{seconds:.3f} s without an image (odometry.max_gap is {config.max_gap:g} s); it '
-            'goes on at the last pose, and the motion in between is unknown')
+            'continues at the last pose, and the motion in between is unknown')

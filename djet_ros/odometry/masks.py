@@ -82,6 +82,6 @@ def _undistorted(mask: NDArray[np.bool_], shape: tuple[int, ...], camera: Camera
                  ) -> NDArray[np.bool_]:
     if mask.shape != shape:
         raise BadMessage('mask_size', f'{what} has {mask.shape[1]}x{mask.shape[0]} pixels, the '
-                         f'image {shape[1]}x{shape[0]}; both must be of one size, as they come')
+                         f'image {shape[1]}x{shape[0]}; both must have the same size')
     # A pixel interpolated from any ignored one is ignored.
     return np.asarray(camera.undistort(np.where(mask, 255, 0).astype(np.uint8)) > 0)

@@ -207,7 +207,7 @@ class SpeedScale(ScaleSource):
     def why_unknown(self, stamp_ns: int) -> str:
         """Return how far the stamp of the newest speed is off."""
         if not self._speeds:
-            return 'no speed has come'
+            return 'no speed was received'
         off = (self._speeds.stamps[-1] - stamp_ns) * 1e-9
         return (f'the newest speed is stamped {abs(off):.1f} s '
                 f'{"after" if off > 0 else "before"} the newest image')
@@ -301,7 +301,7 @@ class CameraHeightScale(ScaleSource):
 
     def why_unknown(self, stamp_ns: int) -> str:
         """Return that no ground was seen."""
-        return 'the images show no level ground as far below as it should be'
+        return 'the images show no level ground at this height below the camera'
 
     def reset(self) -> None:
         """Forget speed, pitch and roll."""
@@ -369,7 +369,7 @@ class GuessScale(ScaleSource):
 
     def why_unknown(self, stamp_ns: int) -> str:
         """Return what is missing: a transform or poses."""
-        return ('nobody says where the camera is in the frame of the guess'
+        return ('the camera has no transform to the frame of the guess'
                 if self.guess.mounting is None else 'no guess covers the time of the newest image')
 
     def between(self, start_ns: int, end_ns: int) -> Length:

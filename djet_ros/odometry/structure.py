@@ -201,7 +201,7 @@ class TrackScale:
 
         If its best hypothesis is consistent with the landmarks' depths, they are tracked on: the
         scale is kept, and later steps correct the motion (4, 4), a rotation at most, that was
-        integrated. Otherwise the track begins anew.
+        integrated. Otherwise the track restarts.
         """
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         if self._speed is None or not relative.t.any() or not self.agrees(
@@ -212,7 +212,7 @@ class TrackScale:
             self._window.tell(motion)
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
-        """Add a frame to the window; if it has no length the track begins anew, returns None."""
+        """Add a frame to the window; return None and restart if it has no length."""
         if not self._window.is_new or relative.t.any():
             try:
                 addition = self._window.add(view, relative, guess)
