@@ -231,13 +231,13 @@ def test_a_gyro_that_never_fits_is_not_gone_by() -> None:
     gyro = mounted()
     for _ in range(60):
         gyro.judge(True)
-    assert gyro.fits
+    assert gyro.trusted
     for _ in range(40):
         gyro.judge(False)
-    assert not gyro.fits
+    assert not gyro.trusted
     for _ in range(30):
         gyro.judge(True)
-    assert gyro.fits
+    assert gyro.trusted
 
 
 # Fusion
@@ -315,6 +315,6 @@ def test_a_bias_that_something_else_has_taught_is_unlearnt() -> None:
         gyro.judge(agreed)
         if agreed:
             gyro.learn(i * PERIOD, (i + 1) * PERIOD, seen.R, sure)
-        fitted.append(gyro.fits)
+        fitted.append(gyro.trusted)
     assert not all(fitted) and fitted[-1]
     assert np.linalg.norm(gyro.bias - biases[-1]) < 0.1 * np.linalg.norm(biases[-1])

@@ -278,7 +278,7 @@ def gyro_of(rate):
 def test_a_gyro_in_degrees_is_found_out_though_no_match_is_found_by_it(cards):
     gyro = gyro_of(np.degrees([0, 0.1, 0]))
     results = drive(VisualOdometry(ESTIMATOR, gyro=gyro), cards, [STEP] * 36)
-    assert not gyro.fits
+    assert not gyro.trusted
     assert results[1].status is not Status.OK
     assert results[-1].status is Status.OK
 

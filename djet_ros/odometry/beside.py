@@ -204,7 +204,7 @@ class Beside:
             f'{number} of {self._samples} samples: {why}; check the driver of the IMU'))
 
     def _misfit(self) -> Complaint | None:
-        if self.gyro is None or self.gyro.fits:
+        if self.gyro is None or self.gyro.trusted:
             return None
         return Complaint('gyro does not fit', 'WARN', (
             'most of its newest rotations disagree with the images, and it is not used; check '

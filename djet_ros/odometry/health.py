@@ -8,7 +8,7 @@ from typing import NamedTuple
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
-from djet_ros.odometry.images import Coarse
+from djet_ros.odometry.images import FewLevels
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
 from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.result import OdometryResult
@@ -54,12 +54,12 @@ class Health:
         # The frame_id of the newest image, and for the newest ones whether it changed.
         self._image_frame: str | None = None
         self._changes: deque[bool] = deque(maxlen=_WINDOW)
-        self._equal = self._unknown_lengths = self._coarse_images = 0
+        self._equal = self._unknown_lengths = self._few_in_a_row = 0
         # Whether there was a translation, and a measured length.
         self._translated, self._measured = False, False
         # The most images in a row with one stamp, and that stamp.
         self._most_equal, self._stood_ns = 0, 0
-        self._coarse: Coarse | None = None
+        self._few_levels: FewLevels | None = None
         self._last: OdometryResult | None = None
 
     def configure(self, config: OdometryConfig) -> None:
@@ -79,10 +79,10 @@ class Health:
         self._changes.append(self._image_frame not in (None, image_frame))
         self._image_frame = image_frame
 
-    def gray(self, coarse: Coarse | None) -> None:
-        """Note an image; coarse: None unless it has few gray levels of its 16 bits."""
-        self._coarse = coarse
-        self._coarse_images = 0 if coarse is None else self._coarse_images + 1
+    def image(self, few_levels: FewLevels | None) -> None:
+        """Note an image; few_levels: None unless it has few gray levels of its 16 bits."""
+        self._few_levels = few_levels
+        self._few_in_a_row = 0 if few_levels is None else self._few_in_a_row + 1
 
     def processed(self, result: OdometryResult) -> None:
         """Take the result of an image."""
@@ -113,11 +113,11 @@ class Health:
 
     def few_levels(self) -> Complaint | None:
         """Return the problem that images of 16 bits become few gray levels."""
-        if self._coarse_images < _IN_A_ROW or self._coarse is None:
+        if self._few_in_a_row < _IN_A_ROW or self._few_levels is None:
             return None
-        levels, low, high = self._coarse
+        levels, low, high = self._few_levels
         return Complaint('few gray levels', 'WARN', (
-            f'{self._coarse_images} images of 16 bits in a row became {levels} gray levels with '
+            f'{self._few_in_a_row} images of 16 bits in a row became {levels} gray levels with '
             f'odometry.gray_range {self._config.gray_range}; their values lie between {low} and '
             f'{high}: set odometry.gray_range to the range of the camera'))
 

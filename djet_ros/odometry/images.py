@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.errors import DjetError
-from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START, whole_png
+from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START, is_complete_png
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,7 +131,7 @@ def _levels_of_values(limits: tuple[int, int]) -> NDArray[np.uint8]:
     return np.clip((np.arange(65536) - low) * 256 // (high - low + 1), 0, 255).astype(np.uint8)
 
 
-class Coarse(NamedTuple):
+class FewLevels(NamedTuple):
     """A 16-bit image with few gray levels: their number, and the range of its values."""
 
     levels: int
@@ -139,7 +139,7 @@ class Coarse(NamedTuple):
     high: int
 
 
-def coarse(message: Any, gray: Gray) -> Coarse | None:
+def few_levels(message: Any, gray: Gray) -> FewLevels | None:
     """
     Return the number of gray levels of a 16-bit image if it is small; otherwise None.
 
@@ -152,7 +152,7 @@ def coarse(message: Any, gray: Gray) -> Coarse | None:
         return None
     values = _raw(message)[1] if hasattr(message, 'encoding') else _compressed(message)
     low, high = np.quantile(values, (0.001, 0.999), method='nearest')
-    return Coarse(levels, int(low), int(high))
+    return FewLevels(levels, int(low), int(high))
 
 
 def _is_wide(message: Any) -> bool:
@@ -244,7 +244,7 @@ def _check_size(width: int, height: int) -> None:
 def _declared_size(raw: bytes) -> tuple[int, int]:
     """Return (width, height) that a PNG or JPEG declares, without decoding it."""
     if raw[:8] == PNG_START and raw[12:16] == b'IHDR' and len(raw) >= 24:
-        if not whole_png(raw):
+        if not is_complete_png(raw):
             raise BadMessage('undecodable', f'PNG image of {len(raw)} bytes is cut short')
         width, height = struct.unpack('>II', raw[16:24])
         return width, height

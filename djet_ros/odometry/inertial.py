@@ -182,26 +182,26 @@ class Gyro:
 
     def judge(self, agreed: bool) -> None:
         """Note whether the rotation of a pair agreed with the gyro's, by both covariances."""
-        fitted = self.fits
+        fitted = self.trusted
         self._verdicts.append(agreed)
-        if fitted and not self.fits:
+        if fitted and not self.trusted:
             # The bias may have been estimated from an object that moved by itself.
             self._reset_bias()
 
     @property
-    def fits(self) -> bool:
+    def trusted(self) -> bool:
         """Return whether most of the newest rotations agreed with the images."""
         return len(self._verdicts) < _FEW or sum(self._verdicts) > len(self._verdicts) / 2
 
     @property
-    def ever_fitted(self) -> bool:
+    def ever_agreed(self) -> bool:
         """Return whether any of the newest rotations agreed with the images."""
         return any(self._verdicts)
 
     @property
-    def bears_alone(self) -> bool:
+    def trusted_alone(self) -> bool:
         """Return whether it may be used without images: at least half of the pairs agreed."""
-        return self.fits and 2 * sum(self._verdicts) >= len(self._verdicts)
+        return self.trusted and 2 * sum(self._verdicts) >= len(self._verdicts)
 
     def _reset_bias(self) -> None:
         """Reset the bias."""

@@ -11,7 +11,7 @@ LARGEST_IMAGE_PIXELS = 1 << 26
 PNG_START = b'\x89PNG\r\n\x1a\n'
 
 
-def whole_png(data: bytes) -> bool:
+def is_complete_png(data: bytes) -> bool:
     """
     Return whether a PNG file has all of its chunks.
 

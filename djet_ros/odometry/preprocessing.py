@@ -10,7 +10,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.parallel import started_beside
 from djet_ros.core.types import View
 from djet_ros.odometry.camera import Camera
-from djet_ros.odometry.images import Coarse, coarse, Gray, gray_image
+from djet_ros.odometry.images import few_levels, FewLevels, Gray, gray_image
 
 # Images that are prepared ahead.
 _AHEAD = 2
@@ -21,13 +21,13 @@ class Preprocessed(NamedTuple):
     An undistorted gray image.
 
     shape: of the image before undistortion; view: without the pixels that the camera does not
-    see, None if it was not prepared; coarse: how few gray levels an image of 16 bits has, if few.
+    see, None if it was not prepared; few_levels: of a 16-bit image with few gray levels.
     """
 
     gray: Gray
     shape: tuple[int, ...]
     view: View | None
-    coarse: Coarse | None
+    few_levels: FewLevels | None
 
 
 class Settings(NamedTuple):
@@ -75,4 +75,4 @@ def _preprocessed(message: Any, settings: Settings, with_view: bool) -> Preproce
     raw = gray_image(message, limits)
     gray = camera.undistort(raw)
     view = estimator.view(gray, camera.K, left_out=camera.unseen(raw.shape)) if with_view else None
-    return Preprocessed(gray, raw.shape, view, coarse(message, raw))
+    return Preprocessed(gray, raw.shape, view, few_levels(message, raw))

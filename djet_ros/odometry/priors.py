@@ -51,7 +51,7 @@ class MotionPriors:
     def of(self, span_ns: Span) -> Known:
         """Return the priors of a pair: of the rotation only while the gyro agrees with images."""
         motion = self.guess.motion(*span_ns) if self.guess else None
-        trusted = self.gyro is not None and self.gyro.fits
+        trusted = self.gyro is not None and self.gyro.trusted
         return Known(self._turn(span_ns) if trusted else None,
                      None if motion is None else initial_pose(motion))
 
@@ -70,7 +70,7 @@ class MotionPriors:
 
         Rates in degrees per second, or those of another robot, lead all matches astray.
         """
-        return (self.gyro is not None and not self.gyro.ever_fitted
+        return (self.gyro is not None and not self.gyro.ever_agreed
                 and relative.status not in TRACKED)
 
     def judge(self, turn: Turn, relative: RelativePose) -> bool:
@@ -120,7 +120,7 @@ class MotionPriors:
         The covariance is (6, 6). None unless the gyro can be trusted without the images.
         """
         turn = self._turn(span_ns)
-        if self.gyro is None or turn is None or not self.gyro.bears_alone:
+        if self.gyro is None or turn is None or not self.gyro.trusted_alone:
             return None
         motion, covariance = np.eye(4), UNKNOWN_MOTION.copy()
         motion[:3, :3] = turn.R.T

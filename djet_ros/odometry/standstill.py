@@ -29,8 +29,8 @@ class Standstill:
     Detects a standstill from pairs with one reference view.
 
     Remembers features of the reference view that were still while the camera stood, identified by
-    their pixels. The parameter most is the standstill threshold: a match is still if its
-    displacement in pixels is below it.
+    their pixels. A match is still if its
+    displacement in pixels is below the threshold.
     """
 
     def __init__(self) -> None:
@@ -45,14 +45,14 @@ class Standstill:
         """Note that the camera moved."""
         self._stood = False
 
-    def stay(self, relative: RelativePose, most: float) -> None:
+    def stay(self, relative: RelativePose, threshold: float) -> None:
         """Note that the camera stood still in a pair, and which features did."""
         self._stood = True
         features = _identifiers(relative.x)
-        still = _displacements(relative.x, relative.y) < most
+        still = _displacements(relative.x, relative.y) < threshold
         self._static = np.union1d(np.setdiff1d(self._static, features), features[still])
 
-    def detect(self, relative: RelativePose, most: float, at_rest: bool) -> bool:
+    def detect(self, relative: RelativePose, threshold: float, at_rest: bool) -> bool:
         """
         Return whether the camera stands still in a pair.
 
@@ -60,15 +60,15 @@ class Standstill:
         """
         if not len(relative.x):
             return False
-        if _nothing_moves(relative, most):
+        if _nothing_moves(relative, threshold):
             return True
         if not at_rest:
             return False
-        still, slightly = _still_and_slightly(relative, most)
+        still, slightly = _still_and_slightly(relative, threshold)
         return (self._only_others_move(relative, still, slightly)
                 or self._static_features_are_still(relative, still, slightly))
 
-    def is_likely(self, relative: RelativePose, most: float) -> bool:
+    def is_likely(self, relative: RelativePose, threshold: float) -> bool:
         """
         Return whether a camera with a gyro at rest is more likely to stand than to have started.
 
@@ -76,18 +76,18 @@ class Standstill:
         """
         if self._stood is not None:
             return self._stood
-        still, slightly = _still_and_slightly(relative, most)
+        still, slightly = _still_and_slightly(relative, threshold)
         return bool(still.sum() >= max(_LEAST_STILL, slightly.sum()))
 
-    def creeps(self, relative: RelativePose, most: float) -> bool:
+    def creeps(self, relative: RelativePose, threshold: float) -> bool:
         """
         Return whether the camera in a standstill is no longer quite at the reference view.
 
         The threshold also excludes the matches of other objects that move.
         """
         y = _refined(relative)
-        still = _displacements(relative.x, y) < most
-        return _drifted(relative.x[still], y[still], _CREEP * most)
+        still = _displacements(relative.x, y) < threshold
+        return _drifted(relative.x[still], y[still], _CREEP * threshold)
 
     def _only_others_move(self, relative: RelativePose, still: NDArray[np.bool_],
                           slightly: NDArray[np.bool_]) -> bool:
@@ -122,11 +122,11 @@ class Standstill:
                     and standing > (static & moving).sum())
 
 
-def _nothing_moves(relative: RelativePose, most: float) -> bool:
+def _nothing_moves(relative: RelativePose, threshold: float) -> bool:
     # Most methods report two equal images as DEGENERATE, as all residuals are zero.
     if relative.status not in (*TRACKED, Status.DEGENERATE):
         return False
-    return float(np.median(_displacements(relative.x, _refined(relative)))) < most
+    return float(np.median(_displacements(relative.x, _refined(relative)))) < threshold
 
 
 def _refined(relative: RelativePose) -> Array:
@@ -153,11 +153,11 @@ def _drifted(x: Array, y: Array, least: float) -> bool:
                 and fdtrc(6, freedom, drift / max(6 * noise, 1e-12)) < _SIGNIFICANCE)
 
 
-def _still_and_slightly(relative: RelativePose, most: float
+def _still_and_slightly(relative: RelativePose, threshold: float
                         ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks (N,) of the matches that are still, and of those that move slightly."""
     shift = _displacements(relative.x, relative.y)
-    return shift < most, (shift >= most) & (shift < _SLIGHTLY * most)
+    return shift < threshold, (shift >= threshold) & (shift < _SLIGHTLY * threshold)
 
 
 def _displacements(x: Array, y: Array) -> Array:

@@ -229,7 +229,7 @@ class Tracker:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
-        self._health.gray(prepared.coarse)
+        self._health.image(prepared.few_levels)
         # A view that was prepared ahead is without the pixels that the camera does not see only.
         usable = left_out is self._camera.unseen(prepared.shape)
         return self._process(Frame(prepared.gray, self._camera.K, stamp, frame_of(message.header),
