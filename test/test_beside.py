@@ -448,7 +448,7 @@ def test_masks_are_undistorted_with_their_images() -> None:
     mask[:, :60] = 0
     one.mask(image(mask, stamp_ns=START))
     assert one._camera is not None
-    left_out = one._beside.left_out(START, 'camera', mask.shape, one._camera)
+    left_out = one._inputs.left_out(START, 'camera', mask.shape, one._camera)
     assert left_out is not None
     # The edge of a barrel image is pulled in at its middle less than at its corners.
     ends = [int(np.flatnonzero(row)[-1]) for row in left_out[[0, 119]]]
@@ -588,7 +588,7 @@ def test_a_frame_that_tf_does_not_know_is_said_with_its_names(drive: Drive) -> N
     one = tracker(**{'odometry.guess': True, 'odometry.guess_frame': 'wheels'})
     for i in range(6):
         one.image(drive.image(i))
-    assert "where 'camera' is in 'wheels' (odometry.guess_frame)" in said(one)['no guess in time']
+    assert "from 'wheels' (odometry.guess_frame) to 'camera'" in said(one)['no guess in time']
 
 
 def test_our_own_echo_is_refused_as_a_guess() -> None:

@@ -290,7 +290,7 @@ def test_what_a_gyro_tells_against_all_images_is_not_said_to_be_known(cards):
         assert np.trace(result.motion_covariance[3:, 3:]) > 1
 
 
-def test_a_step_back_in_time_begins_everything_anew(cards):
+def test_a_step_back_in_time_resets_everything(cards):
     vo = odometry()
     drive(vo, cards, [np.eye(4), STEP], start=100.0)
     again = vo.process(cards.frame(1.0))

@@ -29,7 +29,7 @@ _CLOCKS = ('stamped by the clock of the images (use_sim_time on both sides or on
            'later than 0.1 s after them')
 
 
-class Beside:
+class AuxiliaryInputs:
     """
     Passes messages on to the gyro, the other odometry and the masks.
 

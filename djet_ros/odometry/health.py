@@ -180,7 +180,7 @@ class Health:
             return None
         return Complaint('images dropped under load', 'WARN', (
             f'{share:.0%} of the newest {len(self._fates)} images were dropped: they come faster '
-            'than they are processed; lower their rate (also that of a player), their size or '
+            'than they are processed; lower their rate (that of a player, too), their size or '
             'estimator.max_features'))
 
     def _way(self) -> Complaint | None:

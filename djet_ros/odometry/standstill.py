@@ -29,8 +29,7 @@ class Standstill:
     Detects a standstill from pairs with one reference view.
 
     Remembers features of the reference view that were still while the camera stood, identified by
-    their pixels. A match is still if its
-    displacement in pixels is below the threshold.
+    their pixels. A match is still if its displacement in pixels is below the threshold.
     """
 
     def __init__(self) -> None:

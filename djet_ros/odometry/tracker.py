@@ -15,7 +15,7 @@ from djet_ros import compiled
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 
 from djet_ros.core.types import Array, STARTED, TRACKED, View
-from djet_ros.odometry.beside import Beside
+from djet_ros.odometry.beside import AuxiliaryInputs
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
@@ -81,9 +81,9 @@ class Tracker:
         self._image_topic = image_topic
         self._speed_topics = speed_topics
         self._scale = scale or scale_source(config.odometry)
-        self._beside = Beside(config.odometry, self._scale, still_mask)
+        self._inputs = AuxiliaryInputs(config.odometry, self._scale, still_mask)
         self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale,
-                                        self._beside.gyro, self._beside.guess)
+                                        self._inputs.gyro, self._inputs.guess)
         self._node = node
         self._mounting: Array | None = None
         self._messages = Messages(message_type, config.odometry, node)
@@ -103,7 +103,7 @@ class Tracker:
         """
         self._odometry.reset()
         self._scale.reset()
-        self._beside.reset()
+        self._inputs.reset()
         self._forget()
 
     def _forget(self) -> None:
@@ -140,8 +140,8 @@ class Tracker:
             self._scale = scale_source(after)
         self.config = config
         self._odometry.configure(config.estimator, after, self._scale)
-        self._beside.configure(after, self._scale)
-        self._odometry.set_priors(self._beside.gyro, self._beside.guess)
+        self._inputs.configure(after, self._scale)
+        self._odometry.set_priors(self._inputs.gyro, self._inputs.guess)
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
         self._order.configure(after.max_backwards, after.max_gap)
@@ -223,7 +223,7 @@ class Tracker:
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
             prepared = self._preprocessor.image(message, self._settings(self._camera))
-            left_out = self._beside.left_out(stamp, frame_of(message.header), prepared.shape,
+            left_out = self._inputs.left_out(stamp, frame_of(message.header), prepared.shape,
                                              self._camera)
         except BadMessage as problem:
             self.counts.rejected[problem.reason] += 1
@@ -287,23 +287,23 @@ class Tracker:
 
     def imu(self, message: Any) -> None:
         """Take an Imu, for odometry.imu."""
-        self._beside.imu(message)
+        self._inputs.imu(message)
 
     def guess(self, message: Any) -> None:
         """Take an Odometry as a guess, for odometry.guess and odometry.scale 'guess'."""
-        self._beside.other_odometry(message)
+        self._inputs.other_odometry(message)
 
     def tf(self, message: Any) -> None:
         """Take a TFMessage of /tf, for odometry.guess_frame."""
-        self._beside.tf(message, static=False)
+        self._inputs.tf(message, static=False)
 
     def tf_static(self, message: Any) -> None:
         """Take a TFMessage of /tf_static, for odometry.guess_frame."""
-        self._beside.tf(message, static=True)
+        self._inputs.tf(message, static=True)
 
     def mask(self, message: Any) -> None:
         """Take the mask of an image, for odometry.mask."""
-        self._beside.mask(message)
+        self._inputs.mask(message)
 
     def lacks(self, image: Any) -> str:
         """
@@ -311,20 +311,20 @@ class Tracker:
 
         A front end should wait for it for a moment; later it is of no use to the image.
         """
-        return self._beside.lacks(stamp_ns(image.header), frame_of(image.header))
+        return self._inputs.lacks(stamp_ns(image.header), frame_of(image.header))
 
     def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
         """Return frames (parent, child) with an unknown transform, keyed by 'imu' or 'guess'."""
-        return self._beside.wanted_mountings(image_frame)
+        return self._inputs.wanted_mountings(image_frame)
 
     @property
     def wants_frames(self) -> bool:
         """Return whether transforms are still to be looked up on tf."""
-        return not self.mounted or self._beside.wants_mountings
+        return not self.mounted or self._inputs.wants_mountings
 
     def mount_beside(self, what: str, mounting: Array) -> None:
         """Take a transform (4, 4) of ``wanted_mountings``."""
-        self._beside.mount(what, mounting)
+        self._inputs.mount(what, mounting)
 
     def count_dropped(self, reason: str, number: int = 1) -> None:
         """Count images that a front end received and dropped."""
@@ -360,7 +360,7 @@ class Tracker:
     @property
     def complaints_beside(self) -> list[Complaint]:
         """Return the problems of the inputs other than images."""
-        return self._beside.complaints(self.last.frame_id if self.last else '')
+        return self._inputs.complaints(self.last.frame_id if self.last else '')
 
     def diagnosis(self) -> Diagnosis:
         """Return the content of a diagnostics message."""
@@ -370,7 +370,7 @@ class Tracker:
         diagnosis.values['inner loops'] = compiled.in_use()
         if (lens := self._odometry.lens) is not None:
             diagnosis.values['distortion left (k1)'] = f'{lens.k1:.4f} +- {lens.sigma:.4f}'
-        diagnosis.values.update(self._beside.values())
+        diagnosis.values.update(self._inputs.values())
         diagnosis.values.update(self.face_values)
         return diagnosis
 
