@@ -79,7 +79,7 @@ def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
     """Near things move by a little at first, as far ones do later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
     told = [after_a_stand().detect(seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST,
-                                 at_rest=True) for way in (1, 20, 40, 80)]
+                                   at_rest=True) for way in (1, 20, 40, 80)]
     assert told == [True, False, False, False]
 
 

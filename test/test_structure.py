@@ -18,11 +18,11 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import (
     ConstantScale,
     Length,
+    RelativeScale,
     Scale,
     scale_source,
     ScaleSource,
     SpeedScale,
-    RelativeScale,
 )
 from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance

@@ -18,11 +18,11 @@ from djet_ros.odometry.scale import (
     GroundTruthScale,
     GuessScale,
     Length,
+    RelativeScale,
     Scale,
     scale_source,
     SpeedScale,
     UnitScale,
-    RelativeScale,
 )
 from djet_ros.odometry.uncertainty import compose, motion_covariance
 from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry

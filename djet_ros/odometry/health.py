@@ -10,8 +10,8 @@ from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.images import FewLevels
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
-from djet_ros.odometry.scale import Scale, ScaleSource
 from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.scale import Scale, ScaleSource
 
 # Newest images over which shares are taken, and the number below which they are zero.
 _WINDOW, _FEW = 100, 20

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import cv2
 from djet_ros.errors import DjetError
-from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START, is_complete_png
+from djet_ros.odometry.png import is_complete_png, LARGEST_IMAGE_PIXELS, PNG_START
 import numpy as np
 from numpy.typing import NDArray
 

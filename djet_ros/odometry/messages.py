@@ -18,9 +18,9 @@ from djet_ros.config.sections import NODE_NAME, OdometryConfig
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import Scale, UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, rotated
-from djet_ros.odometry.result import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -395,7 +395,7 @@ class Messages(MessageFactory):
 
 def twist(result: OdometryResult) -> tuple[Array, Array]:
     """
-    Return the mean twist (6,) of a pair along the current camera's axes, and its covariance.
+    Return the mean velocity (6,) of a pair along the current camera's axes, and its covariance.
 
     Linear in metres (or units) per second, angular in radians per second, over the time of the
     motion, which begins where a standstill ends. If no motion was estimated, the twist is zero

@@ -70,7 +70,7 @@ class MovingFrames:
             for frame in set(above[0]) ^ set(above[1]) if frame in self._moving)
 
     def poses(self, parent: str, child: str, stamps_ns: Stamps) -> Array:
-        """Return poses (N, 4, 4) of a frame in another at stamps (N,), NaN if unknown."""
+        """Return a frame's (N, 4, 4) poses in another one at stamps (N,), NaN if unknown."""
         above = dict(self._upwards(parent, stamps_ns))
         for frame, poses in self._upwards(child, stamps_ns):
             if frame in above and np.isfinite(above[frame]).all():

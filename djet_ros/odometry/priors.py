@@ -12,7 +12,7 @@ from dataclasses import replace
 from djet_ros.core.fusion import agrees, fused, Turn
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
-from djet_ros.odometry.guess import initial_pose, Guess
+from djet_ros.odometry.guess import Guess, initial_pose
 from djet_ros.odometry.inertial import Gyro
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 import numpy as np

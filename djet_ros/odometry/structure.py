@@ -97,7 +97,7 @@ class TrackScale:
 
     def landmarks(self, settled: bool = False) -> Array:
         """
-        Return the landmarks (M, 3) in the camera of the newest step, in the unit of its length.
+        Return points (M, 3), the landmarks in the newest camera, in the unit of its length.
 
         settled: instead return those that it was the last step to refine.
         """

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 from djet_ros import compiled
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
-
 from djet_ros.core.types import Array, STARTED, TRACKED, View
 from djet_ros.odometry.beside import AuxiliaryInputs
 from djet_ros.odometry.camera import Camera, means_rectified, same_camera
@@ -21,11 +20,11 @@ from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import (
-    frame_mismatch,
-    residual_distortion,
     Complaint,
+    frame_mismatch,
     has_frame,
     Health,
+    residual_distortion,
     restart_reason,
 )
 from djet_ros.odometry.images import BadMessage
@@ -38,9 +37,9 @@ from djet_ros.odometry.messages import (
 )
 from djet_ros.odometry.order import Order
 from djet_ros.odometry.preprocessing import Preprocessor, Settings
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
 from djet_ros.odometry.static_frames import Transform
-from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 from numpy.typing import NDArray
@@ -453,7 +452,7 @@ class Tracker:
             self._path_stamp = None
         result = self._odometry.process(frame, view)
         self.remark = restart_reason(result, self._frame.stamp_ns if self._frame else None,
-                                    self.config.odometry)
+                                     self.config.odometry)
         self.last, self._frame, self.problem = result, frame, None
         self._order.take(frame.stamp_ns)
         self._health.processed(result)

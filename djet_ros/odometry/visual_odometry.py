@@ -124,7 +124,7 @@ class VisualOdometry:
 
     def landmarks(self, settled: bool = False) -> Array:
         """
-        Return the landmarks (M, 3) that carry the scale, in the newest tracked camera.
+        Return points (M, 3), the landmarks of the scale in the newest tracked camera.
 
         settled: instead return those that are not refined any more after that frame.
         """
