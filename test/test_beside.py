@@ -1,4 +1,4 @@
-"""What comes beside the images: gyro, another odometry, masks; by messages, live and offline."""
+"""Inputs other than images: gyro, another odometry and masks, live and offline."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def tracker(**values: Any) -> Tracker:
 
 
 class Drive:
-    """A drive to and fro past cards, and what a gyro with the axes of a robot felt on it."""
+    """A drive back and forth past cards, with a gyro along the axes of a robot."""
 
     def __init__(self, frames: int = 12, standing: int = 0) -> None:
         cards, here, self.poses = Cards(), np.eye(4), []
@@ -67,7 +67,7 @@ class Drive:
                      stamp_ns=START + index * PERIOD)
 
     def errors(self, index: int, motion: Array) -> tuple[float, float]:
-        """Rotation and direction in rad by which the motion (4, 4) to a frame is off."""
+        """Return the errors in rad of rotation and direction of the motion (4, 4) to a frame."""
         true = np.linalg.inv(self.poses[index - 1]) @ self.poses[index]
         return (float(rotation_angle(true[:3, :3], motion[:3, :3])),
                 float(direction_angle(true[:3, 3], motion[:3, 3])))
@@ -86,7 +86,7 @@ def stamp_of(message: Any) -> int:
 
 
 def played(one: Tracker, drive: Drive, imu: list[Any], black: tuple[int, ...] = ()) -> list[Any]:
-    """Play images with the samples up to them, and give what comes of them."""
+    """Play images with the samples up to them, return the messages."""
     waiting, outgoing = list(imu), []
     for i in range(len(drive.images)):
         while waiting and one.lacks(drive.image(i)):
@@ -126,7 +126,7 @@ def test_a_gyro_whose_clock_is_ahead_is_heard_by_that_of_the_images(drive: Drive
 
 
 def test_orientation_goes_on_through_darkness() -> None:
-    """A camera that has stood for three seconds, drives off, and sees nothing for another two."""
+    """A camera stands for three seconds, starts, and sees nothing for another two."""
     drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
     one = tracker(**IMU)
     angles = {}
@@ -193,7 +193,7 @@ def test_a_gyro_that_is_mounted_otherwise_is_said_and_not_gone_by() -> None:
     long = Drive(frames=45)
     one = tracker(**{**IMU, 'odometry.imu_rotation': '0 0 0 1'})
     for message in long.imu():
-        # Something to be seen of which axis is which.
+        # Rotations about all axes, to distinguish them.
         message.angular_velocity.x += 1.0
         one.imu(message)
     for i in range(len(long.images)):
@@ -211,7 +211,7 @@ def test_a_rotation_that_is_none_is_refused(text: str) -> None:
 # Live
 
 class Graph:
-    """Writes down what a session publishes; knows one frame."""
+    """Records what a session publishes, and knows one transform."""
 
     def __init__(self) -> None:
         self.published: list[Any] = []
@@ -257,7 +257,7 @@ def wait_for(one: Tracker, images: int) -> None:
     end = monotonic() + 30
     while one.counts.received < images:
         assert monotonic() < end
-        sleep(0.005)  # to the thread that works
+        sleep(0.005)  # for the worker thread
 
 
 def mounting(drive: Drive) -> Any:
@@ -269,7 +269,7 @@ def mounting(drive: Drive) -> Any:
 @pytest.mark.parametrize('order', ['before', 'after'])
 def test_live_gives_the_poses_of_the_tracker_to_the_last_bit(
         live: Any, drive: Drive, order: str) -> None:
-    """Whether the samples come before their images, or a little after them."""
+    """Samples come before their images, or shortly after them."""
     expected = played(tracker(**IMU), drive, drive.imu())
     session, one, graph = live(**{'odometry.imu': True})
     graph.frames.add(mounting(drive))
@@ -314,7 +314,7 @@ def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Driv
     end = monotonic() + 30
     while one.counts.processed < 2:
         assert monotonic() < end
-        sleep(0.005)  # to the thread that works
+        sleep(0.005)  # for the worker thread
     assert monotonic() - start < 3
 
 
@@ -395,7 +395,7 @@ def test_what_is_masked_does_not_matter(drive: Drive, kind: str) -> None:
                             for pair in (masked.last.relative, clean.last.relative))
             assert len(seen & shared) > 0.9 * len(shared)
             assert max(y for _, y in seen) < 120 - 12
-    # What lies under the mask makes no difference of a degree, and much without the mask.
+    # Masked pixels change the pose by less than a degree; without the mask by much more.
     apart = np.abs(np.subtract(off[masked], off[clean]))
     assert (apart.max(0) < np.radians((0.1, 1))).all()
     assert (np.median(off[clean], axis=0) < np.radians((0.1, 1))).all()
@@ -450,7 +450,7 @@ def test_masks_are_undistorted_with_their_images() -> None:
     assert one._camera is not None
     left_out = one._inputs.left_out(START, 'camera', mask.shape, one._camera)
     assert left_out is not None
-    # The edge of a barrel image is pulled in at its middle less than at its corners.
+    # Barrel distortion moves the middle of an edge less than its corners.
     ends = [int(np.flatnonzero(row)[-1]) for row in left_out[[0, 119]]]
     assert ends[0] != ends[1]
 
@@ -458,7 +458,7 @@ def test_masks_are_undistorted_with_their_images() -> None:
 # Another odometry
 
 def odometry(drive: Drive, index: int, T: Array, frame: str = 'base_link') -> Any:
-    """Word the true pose of a base that carries the camera at T (4, 4)."""
+    """Return the true pose of a base with the camera at T (4, 4), as Odometry."""
     base = T @ drive.poses[index] @ np.linalg.inv(T)
     stamped = MAKE.pose_in(START + index * PERIOD, 'wheels', base)
     with_covariance = message_type('geometry_msgs/msg/PoseWithCovariance')
@@ -486,12 +486,12 @@ def test_another_odometry_gives_the_length_through_its_mounting(drive: Drive) ->
         if i:
             assert one.last is not None and one.last.scale_known
             true = np.linalg.norm(drive.poses[i][:3, 3] - drive.poses[i - 1][:3, 3])
-            # Weighed with what landmarks tell of the lengths.
+            # Fused with the lengths by landmarks.
             assert one.last.scale == pytest.approx(true, rel=0.01)
 
 
 def test_a_guess_finds_what_is_too_far_to_be_sought() -> None:
-    """Frames 0.35 rad apart: half of the image is gone, and the rest is elsewhere."""
+    """At 0.35 rad a frame half of the image leaves the view, and the rest moves far."""
     cards = Cards()
     far = Drive(frames=3)
     far.poses = [np.eye(4), pose(x=0.4, z=0.1, yaw=0.35), pose(x=0.8, z=0.2, yaw=0.0)]
@@ -538,7 +538,7 @@ def test_frames_that_move_are_chained_between_their_stamps() -> None:
     assert np.allclose(found[1][:3, 3], (a @ pose(z=0.5, yaw=-0.05) @ pose(yaw=0.2) @ c)[:3, 3],
                        atol=0.01)
     assert np.isnan(found[4]).all()
-    # Downwards, and of another tree.
+    # Down the tree, and of another tree.
     down = frames.poses('camera', 'odom', np.array([0]))
     assert np.allclose(down[0], np.linalg.inv(a @ c))
     assert np.isnan(frames.poses('map', 'camera', np.array([0]))).all()
@@ -546,7 +546,7 @@ def test_frames_that_move_are_chained_between_their_stamps() -> None:
     assert frames.covers('base_link', 'camera', 300) and not frames.covers('map', 'camera', 0)
     frames.forget_before(200)
     assert np.isfinite(frames.poses('odom', 'camera', np.array([200]))).all()
-    # What is mounted stays where it is.
+    # Static transforms are kept.
     frames.reset()
     assert not frames.covers('odom', 'base_link', 0)
     assert np.allclose(frames.poses('mast', 'camera', np.array([200])), c)
@@ -607,7 +607,7 @@ def test_live_follows_tf_to_the_last_bit(live: Any, drive: Drive) -> None:
         alone.tf(tf_of(drive, i, T))
         expected += [serialised(message.message) for message in alone.image(drive.image(i))
                      if message.topic in POSES]
-        session.image(drive.image(i))  # before what belongs to it
+        session.image(drive.image(i))  # before its transforms
         session.tf(tf_of(drive, i, T))
     wait_for(one, len(drive.images))
     session.configure(one.config)

@@ -1,4 +1,4 @@
-"""CameraInfo: what holds for raw and for rectified images, and what is refused."""
+"""CameraInfo of raw and of rectified images, and unusable ones."""
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
@@ -152,7 +152,7 @@ def test_a_camera_of_matrices_brings_nothing_black_in_from_the_rim(model, outwar
 
 
 def beyond(camera, shape):
-    """(H, W) bool, where the image as it comes shows no point, or a second one."""
+    """Return pixels (H, W) bool that the raw image does not show, or beyond the fold."""
     rows, columns = np.indices(shape)
     rays = np.linalg.inv(camera.K) @ np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
     seen, slopes = camera.pixels(rays[:2].T, camera.k1)
@@ -160,7 +160,7 @@ def beyond(camera, shape):
     return (outside | (np.linalg.det(slopes) <= 0)).reshape(shape)
 
 
-# By model: beyond the sides, beyond the fold, beyond a fold that tangential coefficients bend.
+# By model: outside the image, beyond the fold, beyond one bent by tangential coefficients.
 BEYOND = [('plumb_bob', [0.4, 0.1, 0, 0, 0], 130.0), ('plumb_bob', [-0.35, 0, 0, 0, 0], 70.0),
           ('plumb_bob', [-0.35, 0, 3e-3, -5e-3, 0], 70.0),
           ('rational_polynomial', [-0.4, 0, 0, 0, 0, 0.02, 0, 0], 70.0),
@@ -174,7 +174,7 @@ def test_pixels_that_the_image_does_not_show_are_unseen(model, D, focal):
     unseen, truth = camera.unseen(SIZE[::-1]), beyond(camera, SIZE[::-1])
     assert unseen is not None
     assert truth.mean() > 0.02
-    # A twentieth of a pixel is within how OpenCV rounds.
+    # OpenCV rounds to within a twentieth of a pixel.
     assert (truth & ~unseen).sum() == 0
     assert (unseen & ~truth).mean() < 0.03
 
@@ -193,7 +193,7 @@ def test_no_feature_stands_where_the_distortion_mirrors_the_image():
     assert mirrored.mean() == pytest.approx(0.2, abs=0.02)
 
     def there(mask):
-        """Count features that stand where the image is mirrored."""
+        """Count features where the image is mirrored."""
         points = TwoViewEstimator().view(gray, focal, left_out=mask).features.points
         assert len(points) > 500
         columns, rows = np.rint(points).astype(int).T
@@ -255,7 +255,7 @@ def with_number(at, value):
     return matrix
 
 
-# Of an image of 160 x 120: a focal length, the optical axis off the middle, a skew.
+# For an image of 160 x 120: a focal length, a principal point, a skew.
 NO_LENS = [((0, 0), 1.0), ((0, 0), 1e-300), ((1, 1), 2e5), ((0, 0), 1e300), ((0, 2), 1.8e3),
            ((0, 2), -1e300), ((1, 2), 1e4), ((0, 1), 200.0), ((0, 1), -1e300)]
 
@@ -267,7 +267,7 @@ def test_a_camera_matrix_of_no_lens_is_refused_wherever_it_stands(at, value):
     assert reason(k=wrong.ravel()) == 'bad_calibration'
     assert reason(True, p=P) == 'bad_calibration'
     assert reason(p=P, d=DISTORTIONS['plumb_bob']) == 'bad_calibration'
-    # Where the CameraInfo has no size, the image tells it.
+    # Without a size in the CameraInfo, that of the image counts.
     open_size = Camera.from_info(camera_info(wrong, (0, 0)), False)
     with pytest.raises(BadMessage, match='recalibrate the camera'):
         open_size.undistort(np.zeros(SIZE[::-1], np.uint8))

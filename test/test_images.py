@@ -1,4 +1,4 @@
-"""Images of every encoding become the same gray; broken ones become a reason."""
+"""Images of every encoding give the same gray image; broken ones give a reason."""
 
 from array import array
 import contextlib
@@ -18,13 +18,13 @@ GRAY = cv2.cvtColor(SCENE, cv2.COLOR_BGR2GRAY)
 
 
 def wide(pixels, big_endian=False):
-    """Sixteen bits whose upper byte is the pixel and whose lower byte is anything."""
+    """Return 16 bits whose upper byte is the pixel and whose lower byte is random."""
     noise = rng.integers(0, 256, pixels.shape).astype(np.uint16)
     return (pixels.astype(np.uint16) * 256 + noise).astype('>u2' if big_endian else '<u2')
 
 
 def mosaic(pattern):
-    """See the scene (BGR) through a colour filter array, named by its first row's begin."""
+    """Return the Bayer mosaic of a scene (BGR), named by its first row."""
     channel = {'b': 0, 'g': 1, 'r': 2}
     result = np.empty(SCENE.shape[:2], np.uint8)
     for k, colour in enumerate(pattern):
@@ -104,7 +104,7 @@ def test_big_endian_numbers_are_read_as_such(encoding):
 
 
 def small(pixels, gain=16, offset=0):
-    """Sixteen bits of which a camera uses few: gain for each gray level, from an offset on."""
+    """Return few of 16 bits: gain times the gray level, plus an offset."""
     return (pixels.astype(np.uint16) * gain + offset).astype('<u2')
 
 
@@ -224,7 +224,7 @@ def test_a_mosaic_that_was_compressed_as_it_is_gives_the_gray_of_the_raw_one(pat
     pixels = mosaic(pattern) if bits == 8 else wide(mosaic(pattern))
     data = encoded('.png', pixels.astype(f'u{bits // 8}'))
     expected = gray_image(image(pixels, encoding))
-    # compressed_image_transport's words for PNG, and for JPEG with its parameter for mosaics
+    # formats of compressed_image_transport for PNG, and for JPEG of mosaics
     for said in (f'{encoding}; png compressed ', f'{encoding}; jpeg compressed {encoding}'):
         assert np.array_equal(gray_image(compressed(data, said)), expected)
 
@@ -241,7 +241,7 @@ def test_trailing_zeros_after_a_jpeg_are_usual():
 
 def test_an_orientation_tag_does_not_turn_the_camera():
     data = encoded('.jpg')
-    # EXIF with one entry: orientation 6, a quarter turn.
+    # EXIF with one entry: orientation 6, a rotation by 90 degrees.
     exif = (b'Exif\0\0MM\0*\0\0\0\x08\0\x01' + struct.pack('>HHIHH', 0x112, 3, 1, 6, 0)
             + bytes(4))
     tagged = data[:2] + b'\xff\xe1' + struct.pack('>H', len(exif) + 2) + exif + data[2:]
@@ -302,7 +302,7 @@ def with_png_chunk_length(kind, length):
 @pytest.mark.parametrize('kind', [b'IDAT', b'IEND'])
 @pytest.mark.parametrize('length', [2**32 - 1, 2**31 - 1, 400_000_000])
 def test_a_png_chunk_that_declares_more_than_there_is_is_not_decoded(kind, length):
-    # OpenCV makes room for it first: seconds, and gigabytes.
+    # OpenCV would first allocate gigabytes, for seconds.
     assert reason(compressed(with_png_chunk_length(kind, length))) == 'undecodable'
 
 

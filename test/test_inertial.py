@@ -1,4 +1,4 @@
-"""A gyro beside the camera, against ways that are known exactly."""
+"""Gyro integration and its bias estimate, against exactly known trajectories."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def way(frames: int = 60, seed: int = 0) -> Array:
 
 
 def relative(poses: Array, start: int, end: int) -> Array:
-    """Rotation x_end = R x_start."""
+    """Return the rotation R of x_end = R x_start."""
     return np.asarray((np.linalg.inv(poses[start]) @ poses[end])[:3, :3].T)
 
 
 def felt_by(poses: Array, mems: Mems, seed: int = 0) -> tuple[Gyro, Array]:
-    """Give a gyro that went that way, and its true biases at the samples."""
+    """Return a gyro that was moved along poses, and its true biases at the samples."""
     felt = feel(poses, PERIOD * 1e-9, mems, seed)
     gyro = mounted(to_camera=felt.to_camera)
     for stamp, rate in zip(felt.stamps_ns.tolist(), felt.rates, strict=True):
@@ -91,7 +91,7 @@ def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
     off = []
     for _ in range(300):
         gyro = mounted(GyroNoise(0.01, 0.0))
-        bias = rng.normal(0, 0.02, 3)  # as nobody has measured it
+        bias = rng.normal(0, 0.02, 3)  # not estimated yet
         for i in range(41):
             gyro.add(i * 5_000_000, bias + 0.01 * np.sqrt(200) * rng.standard_normal(3))
         turn = gyro.turn(2_000_000, 198_000_000)
@@ -101,7 +101,7 @@ def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
     assert scatter / np.diag(turn.covariance).mean() == pytest.approx(1, abs=0.25)
 
 
-# What is wrong with samples
+# Invalid samples
 
 def test_without_a_mounting_or_with_a_hole_there_is_no_turn() -> None:
     unmounted = Gyro(NOISE)
@@ -113,8 +113,8 @@ def test_without_a_mounting_or_with_a_hole_there_is_no_turn() -> None:
         gyro.add(i * 5_000_000, np.zeros(3))
     assert gyro.turn(0, 450_000_000) is not None
     assert gyro.turn(450_000_000, 1_050_000_000) is None
-    assert gyro.turn(1_000_000_000, 1_600_000_000) is None  # not there yet
-    assert gyro.turn(-1, PERIOD) is None  # nor any more
+    assert gyro.turn(1_000_000_000, 1_600_000_000) is None  # too late
+    assert gyro.turn(-1, PERIOD) is None  # too early
 
 
 def test_samples_may_come_out_of_order_and_twice() -> None:
@@ -152,7 +152,7 @@ def test_a_gyro_at_the_end_of_its_range_tells_no_turn() -> None:
 
 
 def test_late_samples_neither_hide_nor_feign_the_end_of_a_gyro_s_range() -> None:
-    """A bus delivers some samples after later ones."""
+    """Some samples come after later ones."""
     fast, slow, ms = np.array([0, 0, 9.0]), np.array([0, 0, 8.0]), 1_000_000
     at_its_end = mounted()
     for stamp in (0, 10, 20, 30, 40, 50, 35, 60, 70):
@@ -193,7 +193,7 @@ def test_memory_is_bounded() -> None:
 
 @pytest.mark.parametrize('seed', range(5))
 def test_after_30_s_of_pairs_the_bias_is_known_to_a_tenth_of_it(seed: int) -> None:
-    """Visual rotations as a street gives them: 0.004 degrees, mean of what is measured."""
+    """Visual rotations as in a street: 0.004 degrees, the mean of measured errors."""
     poses, rng = way(301, seed), np.random.default_rng(seed)
     gyro, biases = felt_by(poses, Mems(), seed)
     sigma = np.radians(0.004)
@@ -295,11 +295,11 @@ def test_a_turn_decides_between_two_motions_only_as_far_as_it_is_known() -> None
         right = np.mean([turn.prefers(one, other) for turn in told])
         assert right == 1 if sigma < 1e-3 else right < 1
     assert max(wrong.values()) < 0.01
-    assert right == 0  # by what is known to a degree
+    assert right == 0  # with a sigma of a degree
 
 
 def test_a_bias_that_something_else_has_taught_is_unlearnt() -> None:
-    """At first the images tell the turn of a lorry for a second, and then that of the world."""
+    """The images show the rotation of a lorry for a second, and then that of the world."""
     poses = way(frames=160)
     gyro, biases = felt_by(poses, Mems(), 6)
     sure, lorry = np.eye(3) * np.radians(0.01)**2, rotation_exp(np.radians([0, 0.2, 0.1]))

@@ -1,4 +1,4 @@
-"""Messages: their frames, their signs, and that both families of classes take them."""
+"""Messages: frames and signs, for both families of classes."""
 
 from importlib import import_module
 
@@ -31,7 +31,7 @@ def ros_message_type(name):
 
 @pytest.fixture(params=['rosbags', pytest.param('rclpy', marks=pytest.mark.ros)])
 def family(request):
-    """Class for a type name, and function that writes a message to the wire."""
+    """Return the class for a type name, and a function that serialises a message."""
     if request.param == 'rosbags':
         return ros_messages.message_type, ros_messages.serialised
     serialization = pytest.importorskip('rclpy.serialization', reason='rclpy is not installed')
@@ -44,7 +44,7 @@ def covariance(rng, size):
 
 
 def a_result(seed=0, **changes):
-    """Make a result in which everything is different from everything."""
+    """Return a result in which all values differ."""
     rng = np.random.default_rng(seed)
     relative = RelativePose(Status.OK, rotation_exp(rng.normal(size=3) * 0.3),
                             unit(rng.normal(size=3)))
@@ -61,7 +61,7 @@ def a_result(seed=0, **changes):
 
 
 def matrix(pose):
-    """Read a pose message, (4, 4)."""
+    """Return the pose (4, 4) of a message."""
     result = np.eye(4)
     q, p = pose.orientation, pose.position
     result[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
@@ -97,7 +97,7 @@ def test_a_relative_pose_is_the_current_camera_in_the_previous_one(family):
     expected = np.eye(4)
     expected[:3, :3], expected[:3, 3] = R.T, -0.7 * R.T @ t
     assert np.allclose(matrix(message.pose), expected, atol=1e-15)
-    # A point at rest: seen from the current camera it is R X + t of where it was seen before.
+    # A static point X in the previous camera is R X + t in the current one.
     before = np.array([1.0, 2, 5, 1])
     now = np.append(R @ before[:3] + 0.7 * t, 1)
     assert np.allclose(matrix(message.pose) @ now, before)
@@ -120,7 +120,7 @@ def test_body_axes_are_forward_left_up_at_both_ends_of_a_pose(family):
 
 def test_as_it_stands_whoever_drives_ahead_goes_along_x_and_stays_level(family):
     ahead = np.eye(4)
-    # a camera that looks ahead, 2 m on and turned to the left
+    # a camera that looks ahead, after 2 m and a turn to the left
     ahead[:3, :3], ahead[:3, 3] = rotation_exp(np.array([0, -0.1, 0])), (0.0, 0.0, 2.0)
     message = Messages(family[0], OdometryConfig()).odometry(a_result(motion=ahead, pose=ahead))
     pose = matrix(message.pose.pose)

@@ -1,4 +1,4 @@
-"""The vehicle's pose and velocity, out of those of the camera that it carries."""
+"""Pose and velocity of a vehicle by those of its camera, and static transforms."""
 
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
@@ -32,7 +32,7 @@ def test_a_vehicle_that_turns_on_the_spot_stays_where_it_is():
     assert np.linalg.norm(camera[:3, 3]) > 0.1
     pose, _ = pose_of_base(camera, np.eye(6), AHEAD)
     assert np.allclose(pose, turned)
-    # the camera goes sideways as it turns, the base does not
+    # the camera moves sideways in a turn, the base does not
     omega = np.array([0, 0, 0.5])
     at_camera = np.concatenate([AHEAD[:3, :3].T @ np.cross(omega, AHEAD[:3, 3]),
                                 AHEAD[:3, :3].T @ omega])
@@ -61,7 +61,7 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
 
 
 def told(*frames):
-    """Make the frames of (parent, child, pose)."""
+    """Return the transforms of (parent, child, pose)."""
     known = StaticFrames()
     for parent, child, pose in frames:
         known.add(MAKE.frame(0, parent, child, pose))
@@ -76,7 +76,7 @@ def test_a_frame_is_found_along_the_tree_upwards_and_downwards():
     assert np.allclose(frames.transform('wheel', 'head'), np.linalg.inv(wheel) @ mast @ head)
     assert np.allclose(frames.transform('/head', 'base'), np.linalg.inv(mast @ head))
     assert frames.transform('base', 'antenna') is None
-    # one step is what was told, to the last bit of its message
+    # a single transform is exactly that of its message
     assert np.array_equal(told(('base', 'cam', AHEAD)).transform('base', 'cam'), AHEAD)
 
 

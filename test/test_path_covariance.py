@@ -1,4 +1,4 @@
-"""An integrated pose is as sure as its steps leave it that have errors in common."""
+"""Covariance of an integrated pose whose steps have correlated errors."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 
-# A way that turns, by steps of a metre; what errs in a step, and its root.
+# A step of a metre with a rotation; the root of its covariance; steps and samples.
 STEP = np.eye(4)
 STEP[:3, :3], STEP[:3, 3] = rotation_exp(np.array([0.01, 0.08, 0.0])), (0.05, 0.0, 1.0)
 ROOT = np.diag([2e-3, 1e-3, 4e-3, 2e-3, 1e-3, 5e-4])
@@ -27,10 +27,10 @@ COUNT, SAMPLES = 24, 4000
 
 def sampled(scales, own):
     """
-    Covariance (6, 6) of what becomes of samples of the way: their poses against the true one.
+    Return the sample covariance (6, 6) of the last pose of a path of steps with errors.
 
-    scales: (COUNT, SAMPLES) logarithms of how much too long steps are; own: (COUNT, SAMPLES, 6)
-    what else errs in them, along the axes of the camera before.
+    scales: (COUNT, SAMPLES) logarithms of the relative errors of lengths; own: (COUNT, SAMPLES, 6)
+    further errors, along the axes of the previous camera.
     """
     true, R, p = np.eye(4), np.tile(np.eye(3), (SAMPLES, 1, 1)), np.zeros((SAMPLES, 3))
     for scale, error in zip(scales, own):
@@ -42,7 +42,8 @@ def sampled(scales, own):
     return off.T @ off / SAMPLES
 
 
-def told(covariance, commons, by_pairs):
+def integrated(covariance, commons, by_pairs):
+    """Return the covariance (6, 6) of the last pose of a path."""
     path, here = PathCovariance(), np.eye(4)
     for common in commons:
         moved = path.moved_by_pair if by_pairs else path.moved
@@ -51,7 +52,7 @@ def told(covariance, commons, by_pairs):
 
 
 def same(one, other):
-    """Hold two covariances against one another: no direction differs by more than chance."""
+    """Assert that two covariances agree in all directions, within their sampling errors."""
     ratios = np.linalg.eigvals(np.linalg.solve(one, other)).real
     assert ratios == pytest.approx(np.ones(6), abs=0.15)
 
@@ -67,7 +68,7 @@ def test_a_scale_that_wanders_and_is_measured_again_swings_the_whole_way():
         scales.append(factor + share)
         commons.append(Common(np.array([variance, 0.02**2]), np.array([kept, 1.0])))
     own = rng.normal(size=(COUNT, SAMPLES, 6)) @ ROOT
-    same(told(ROOT**2, commons, by_pairs=False), sampled(scales, own))
+    same(integrated(ROOT**2, commons, by_pairs=False), sampled(scales, own))
 
 
 def test_pairs_that_see_the_same_err_alike():
@@ -79,8 +80,8 @@ def test_pairs_that_see_the_same_err_alike():
         rest = np.sqrt(1 - _CORRELATED) * rng.normal(size=(SAMPLES, 6))
         own.append((lasting + rest) @ ROOT)
     found = sampled(np.zeros((COUNT, SAMPLES)), np.array(own))
-    same(told(ROOT**2, [None] * COUNT, by_pairs=True), found)
-    alone = told(ROOT**2, [None] * COUNT, by_pairs=False)
+    same(integrated(ROOT**2, [None] * COUNT, by_pairs=True), found)
+    alone = integrated(ROOT**2, [None] * COUNT, by_pairs=False)
     assert np.trace(found[3:, 3:]) > 2 * np.trace(alone[3:, 3:])
 
 
@@ -116,7 +117,7 @@ def test_a_path_of_metres_of_a_wrong_share_is_wrong_by_that_share():
     back[2, 3] = -1.0
     for _ in range(100):
         path, here = path.moved_by_pair(here, back, np.eye(6) * 1e-12, common), here @ back
-    assert np.sqrt(path.pose[2, 2]) < 0.01  # back at the start, of whatever size the way was
+    assert np.sqrt(path.pose[2, 2]) < 0.01  # a closed loop, of whatever scale
 
 
 def test_the_covariance_that_is_published_is_that_of_its_steps():

@@ -1,4 +1,4 @@
-"""A camera that stands while most of what it sees moves, and one that sets off."""
+"""Standstill of a camera while most of the image moves, and its start."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ WORLD = np.random.default_rng(3).uniform((0, 0), (1240, 376), (400, 2))
 
 
 def seen(x: Array, y: Array, follow: NDArray[np.bool_] | None = None) -> RelativePose:
-    """Pair whose motion those matches agree with that follow it."""
+    """Return a pair whose inliers follow its motion."""
     return RelativePose(Status.OK, t=np.array([1.0, 0, 0]), x=x, y=y,
                         inliers=np.zeros(len(x), bool) if follow is None else follow)
 
 
 def scattered(x: Array) -> Array:
-    """Match falsely, anywhere in a search radius of 186 pixels."""
+    """Return false matches, anywhere in a search radius of 186 pixels."""
     rng = np.random.default_rng(5)
     angle, radius = rng.uniform(0, 2 * np.pi, len(x)), 186 * np.sqrt(rng.uniform(size=len(x)))
     return x + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def behind_a_lorry(stand: int, lorry: int = 1000) -> RelativePose:
-    """See so many features as they were, falsely those that are hidden, and a lorry."""
+    """Return a pair with static features, false matches of hidden ones, and a lorry."""
     panel = np.random.default_rng(4).uniform((0, 0), (1240, 376), (lorry, 2))
     y = np.vstack([WORLD[:stand], scattered(WORLD[stand:]), panel + RIGHT * 60])
     return seen(np.vstack([WORLD, panel]), y, np.arange(len(y)) >= len(WORLD))
@@ -40,8 +40,8 @@ def after_a_stand() -> Standstill:
 
 
 def test_what_stood_tells_that_the_camera_stands_however_little_of_it_is_left() -> None:
-    for stand, told in ((200, True), (15, True), (3, False)):
-        assert after_a_stand().detect(behind_a_lorry(stand), MOST, at_rest=True) is told
+    for stand, stationary in ((200, True), (15, True), (3, False)):
+        assert after_a_stand().detect(behind_a_lorry(stand), MOST, at_rest=True) is stationary
 
 
 def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
@@ -53,22 +53,21 @@ def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
 
 
 def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_is_known() -> None:
-    for share, told_at_first, told_after in ((0.3, True, True), (0.1, True, False),
-                                             (0.03, False, False)):
+    for share, first, later in ((0.3, True, True), (0.1, True, False), (0.03, False, False)):
         pair = seen(WORLD, WORLD + np.where(np.arange(400) < 400 * share, 0, 60)[:, None] * RIGHT)
         standstill = Standstill()
-        assert standstill.detect(pair, MOST, at_rest=True) is told_at_first
+        assert standstill.detect(pair, MOST, at_rest=True) is first
         standstill.moved()
-        assert standstill.detect(pair, MOST, at_rest=True) is told_after
+        assert standstill.detect(pair, MOST, at_rest=True) is later
 
 
 def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> None:
-    """A few of those that stood go with the sky, and all others with the camera's motion."""
+    """A few static features are in the sky, all others follow the motion of the camera."""
     y = WORLD + np.random.default_rng(6).uniform(2, 40, (400, 1)) * RIGHT
     y[:15] = WORLD[:15]
     away = seen(WORLD, y, np.ones(400, bool))
     assert not after_a_stand().detect(away, MOST, at_rest=True)
-    # Where few of them are left in sight they decide alike.
+    # The same for few static features.
     new = np.random.default_rng(8).uniform((0, 0), (1240, 376), (500, 2))
     few = seen(np.vstack([WORLD[:60], new]), np.vstack([y[:60], new + RIGHT * 20]),
                np.ones(560, bool))
@@ -76,11 +75,12 @@ def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> N
 
 
 def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
-    """Near things move by a little at first, as far ones do later."""
+    """Near features move slightly at first, far ones later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
-    told = [after_a_stand().detect(seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST,
-                                   at_rest=True) for way in (1, 20, 40, 80)]
-    assert told == [True, False, False, False]
+    stationary = [after_a_stand().detect(
+        seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST, at_rest=True)
+        for way in (1, 20, 40, 80)]
+    assert stationary == [True, False, False, False]
 
 
 def test_a_lorry_that_stood_as_well_tells_nothing_once_it_drove_on() -> None:
@@ -88,7 +88,7 @@ def test_a_lorry_that_stood_as_well_tells_nothing_once_it_drove_on() -> None:
     away = seen(WORLD, WORLD + np.where(lorry[:, None], (30.0, 0), (0.0, 0)), lorry)
     assert standstill.detect(away, MOST, at_rest=True)
     standstill.stay(away, MOST)
-    # Another stops where it stood, and hides what else there was.
+    # Another one stops there, and hides the rest.
     beside = np.random.default_rng(9).uniform((0, 0), (1240, 376), (4000, 2))
     x = np.vstack([WORLD, beside])
     y = np.vstack([WORLD[:150], scattered(WORLD[150:]), beside + RIGHT * 40])

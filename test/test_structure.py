@@ -1,4 +1,4 @@
-"""One scale along a track: lengths by shared landmarks, and metres by whatever measures them."""
+"""Scale along a track: lengths by shared landmarks, and metres by a scale source."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ import pytest
 
 ESTIMATOR = EstimatorConfig(max_features=800)
 
-# A camera that speeds up, slows down and turns: metres and radians a tenth of a second.
+# A camera that accelerates, brakes and turns: metres and radians in a tenth of a second.
 WAYS = [0.2, 0.2, 0.25, 0.3, 0.36, 0.36, 0.3, 0.22, 0.16, 0.16, 0.2, 0.26]
 
 
@@ -80,8 +80,8 @@ def test_the_first_step_is_the_unit_of_all_that_follow(cards):
 def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
     drive = Drive(cards)
     before = drive.go(steps(WAYS[:4]))
-    # Half of the landmarks are out of sight, for long enough that a window of keyframes would have
-    # gone by, were each frame one.
+    # Half of the landmarks are out of view for so many frames that, were each one a keyframe, all
+    # keyframes of the window would be replaced.
     still = drive.go([pose(yaw=turn) for turn in (
         *[0.06] * 6, *[0.015 * (-1)**i for i in range(2 * WINDOW_TUNING.keyframes)],
         *[-0.06] * 5)])
@@ -113,7 +113,7 @@ def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards)
         lengths_of.append(result.scale)
         sigmas.append(np.sqrt(along @ result.motion_covariance[:3, :3] @ along) / result.scale)
     assert all(1e-4 < sigma < 0.1 for sigma in sigmas)
-    # What the first step is off is in all of them.
+    # The error of the first step is in all of them.
     ratios = np.array(lengths_of) / WAYS[1:]
     off = ratios / np.average(ratios, weights=np.array(sigmas)**-2) - 1
     assert np.all(np.abs(off) < 3.5 * np.array(sigmas))
@@ -128,7 +128,7 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
         views.append(estimator.view(frame.gray, frame.K))
     pairs = [estimator.estimate(*views[n:n + 2]) for n in range(len(ways))]
     doubtful = pairs[-2]
-    # What is far goes as far as what is near, and the other way round.
+    # Far points move as much as near ones, and the other way round.
     moved = doubtful.y_opt - doubtful.x
     by_way = np.argsort(moved[:, 0], kind='stable')
     moved[by_way] = moved[by_way[::-1]]
@@ -143,7 +143,7 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
         scale.bridge((7 * 10**8, 8 * 10**8), views[8], pair, np.eye(4))
         found.append(scale.of_step((8 * 10**8, 9 * 10**8), views[9], pairs[-1]).length.value)
     assert found[0] == pytest.approx(1, abs=0.04)
-    assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # torn: the last speed goes on
+    assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # interrupted: at the last speed
 
 
 def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
@@ -176,12 +176,11 @@ def test_a_turn_beyond_all_that_was_seen_leaves_the_scale_to_one_guess():
     results = [odometry.process(Frame(scene.render(there, i), scene.K, 10**9 + i * 10**8))
                for i, there in enumerate(poses)]
     assert all(result.scale_known for result in results[1:])
-    # Landmarks come into sight one after the other, and carry it on by more than the camera sees
-    # at once.
+    # Landmarks come into view one after the other, and carry the scale beyond the field of view.
     factors = [result.common.variances[0] for result in results[1:23] if result.common]
     assert len(factors) == 22 and max(factors) < 0.01
-    # Before a blank corner there are too few: the last of them may tell nothing, and then a usual
-    # step is a guess, once for all frames without any.
+    # At a blank corner there are too few landmarks to determine a length, and a usual step is the
+    # guess, once for all frames without any.
     assert any(result.status not in TRACKED for result in results[23:])
     assert odometry._scale._filter.variance < 0.36 + 0.25 + 0.02
 
@@ -300,14 +299,14 @@ def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards)
         here = result.pose[:3, :3] @ drive.odometry.landmarks(settled=True).T
         depths.append((here.T + result.pose[:3, 3])[:, 2] * np.hypot(0.32, 0.03))
     left = [part for part in depths if len(part)]
-    assert 2 <= len(left) < 30  # not with each frame, but as they go out of sight
+    assert 2 <= len(left) < 30  # not in each frame, but as they leave the view
     off = np.abs(np.concatenate(left)[:, None] / DEPTHS - 1).min(1)
     assert len(off) > 50
     assert np.median(off) < 0.03
 
 
 def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_them(cards):
-    """Seen from the side any depth fits two frames: there the epipolar lines are level."""
+    """Sideways any depth fits two frames, as the epipolar lines are horizontal."""
     ways = [pose(x=0.32)] * 8
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
@@ -315,7 +314,7 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
     scale = drive.odometry._scale  # as it was before the last frame
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     assert scale.agrees(aside, pair.x, pair.y_opt)
-    assert scale.agrees(Pose(aside.R, -aside.t), pair.x, pair.y_opt)  # chirality is for others
+    assert scale.agrees(Pose(aside.R, -aside.t), pair.x, pair.y_opt)  # chirality is not tested
     nearer = np.random.default_rng(6).uniform(0.2, 3, len(pair.x))[:, None]
     wrong = pair.x + nearer * (pair.y_opt - pair.x)
     assert scale.agrees(aside, pair.x, wrong) is False
@@ -324,7 +323,7 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
 
 
 def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_too(cards):
-    """On a slow way no frame but the first two stays, though many confirmed what these told."""
+    """In slow motion only the first two frames are kept, though many confirmed their depths."""
     ways = [pose(x=0.04)] * 7
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
@@ -337,7 +336,7 @@ def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_
 
 
 def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
-    """What a blurred turn shows beside it has any size and sign, wherever landmarks are."""
+    """The residual of a blurred rotation has any size and sign, wherever landmarks are."""
     ways = [pose(x=0.16, z=0.12)] * 8
     pair = Drive(cards).go(ways)[-1].relative
     drive = Drive(cards)
@@ -351,7 +350,7 @@ def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
         any_way = rng.normal(0, 1, len(pair.x))[:, None]
         none += scale.lacks_parallax(replace(pair, y_opt=pair.x + any_way * (pair.y_opt - pair.x)))
     assert none >= 19
-    # Without landmarks nobody knows.
+    # Without landmarks it is unknown.
     scale.reset()
     scale.begin(drive.odometry._reference.view)
     assert not scale.lacks_parallax(pair)
@@ -411,7 +410,7 @@ def test_near_is_told_by_what_is_beyond_a_patch():
 @pytest.mark.slow
 @pytest.mark.parametrize('seed', [1, 3])
 def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(seed: int) -> None:
-    """In the hand it rests, and what landmarks there are is told by next to no parallax."""
+    """A hand-held camera pauses, and new landmarks have hardly any parallax."""
     scene = make_scene('handheld', seed, (480, 360))
     poses, odometry = scene.trajectory(80), VisualOdometry(EstimatorConfig(max_features=1000))
     told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
@@ -423,7 +422,7 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
 
 @pytest.mark.parametrize('seed', [0, 1, 4, 6])
 def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
-    """It turns by 15 degrees a frame: landmarks are gone after a few, at times all at once."""
+    """At 15 degrees a frame landmarks leave the view after a few, at times all at once."""
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
     poses = scene.trajectory(36)
     told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
@@ -456,7 +455,7 @@ def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     speeds.add_speed(0, 0.0)
-    for _ in range(4):  # something fills the image, and moves
+    for _ in range(4):  # an object fills the image, and moves
         speeds.add_speed(drive.ns + 10**8, 0.0)
         result, = drive.go([pose(x=0.16, z=0.12)])
         assert result.scale_kind is Scale.METRIC and result.scale < 1e-3
@@ -503,7 +502,7 @@ def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
 
 @pytest.mark.parametrize('source', [RelativeScale(), ConstantScale(1.2)])
 def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(source):
-    """A window that sees none of them has its newest frame wherever rounding puts it."""
+    """Without landmarks the newest frame in the window is determined by rounding only."""
     ahead = np.array([0, 0, -1.0])
     added = [Addition(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
              for length, sigma in ((1.0, 1e-3), (0.02, 800.0))]
@@ -517,7 +516,7 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
     step = scale.of_step((10**8, 2 * 10**8), None, RelativePose(Status.NO_PARALLAX, **known))
     usual = 1.2 if isinstance(source, ConstantScale) else 1.0
-    # It is no reason to expect the next step to be otherwise, either.
+    # The expected length of the next step stays the same, too.
     assert scale._speed == pytest.approx(10)
     assert step.length.value == pytest.approx(usual)
     assert step.length.sigma >= 0.99 * usual
@@ -539,14 +538,14 @@ def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariance
     pair = scale.of_step((10**8, 2 * 10**8), None,
                          RelativePose(Status.NO_PARALLAX, **known)).relative
     assert np.allclose(pair.t, [1, 0, 0])
-    # Radians of a direction aside, by what half a unit is off along the other axes.
+    # Radians of a direction of half a unit, by errors along the other axes.
     assert np.allclose(pair.covariance_6, np.diag([1, 2, 3, 0, 20, 24]) * 1e-6)
     basis = lift(sphere_tangents(pair.t))
     assert np.allclose(basis @ pair.covariance_5 @ basis.T, pair.covariance_6)
 
 
 class Ground(ScaleSource):
-    """A source that tells given lengths in metres, one for each second, each to two per cent."""
+    """A source of given lengths in metres, one for each second, each with a sigma of 2 %."""
 
     def __init__(self, metres, alike):
         self.metres, self.correlation_length = metres, alike
@@ -558,23 +557,23 @@ class Ground(ScaleSource):
 
 def factors(metres, alike):
     """
-    Logarithms of the metres of a unit after each of some lengths (N,), and their variances.
+    Return log factors (N,) after each of some lengths (N,), their variances and kept shares.
 
-    And the shares of their errors that were in those before.
+    alike: correlation length in metres.
     """
     step = Addition(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
     scale = TrackScale()
     scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
-    # A window by which each step is as long as the one before, to two thousandths.
+    # A window with steps of constant length, with a sigma of 0.2 %.
     scale._window = SimpleNamespace(
         is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)), tell=lambda motion: None,
         add=lambda view, relative, guess: step)
     ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
-    told = []
+    found = []
     for number in range(len(metres)):
         length = scale.of_step((number * 10**9, (number + 1) * 10**9), None, ahead).length
-        told.append((scale._filter.log, scale._filter.variance, length.common.kept[0]))
-    return np.array(told).T
+        found.append((scale._filter.log, scale._filter.variance, length.common.kept[0]))
+    return np.array(found).T
 
 
 def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_says():
@@ -585,7 +584,7 @@ def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_sa
             logs, variances, _ = factors(metres, alike)
             ended.append(logs[-1]**2 / variances[-1])
     assert 0.5 < np.mean(squares[8]) < 1.5
-    # Were each taken for itself, it would be far too sure.
+    # As independent measurements they would give far too small a variance.
     assert np.mean(squares[0]) > 3
 
 
@@ -604,7 +603,7 @@ def test_a_lawn_as_long_as_the_ground_in_sight_does_not_make_another_scale():
     metres[80:95] = 0.8
     logs, *_ = factors(metres, alike=8)
     assert np.abs(logs).max() < 0.01
-    # What lasts is believed.
+    # Longer ones do change it.
     metres[80:] = 0.8
     logs, *_ = factors(metres, alike=8)
     assert logs[-1] == pytest.approx(np.log(0.8), abs=0.02)

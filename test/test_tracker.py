@@ -1,4 +1,4 @@
-"""The tracker: messages in, messages out, and every image accounted for."""
+"""The tracker from messages to messages, and the counts of all images."""
 
 import gc
 import re
@@ -35,7 +35,7 @@ FAST = {'estimator.max_features': 600}
 
 @pytest.fixture(scope='module')
 def drive():
-    """Give the images of a drive of 12 frames."""
+    """Return the images of a drive of 12 frames."""
     cards, here, images = Cards(), np.eye(4), []
     for _ in range(12):
         images.append(cards.gray(here))
@@ -55,7 +55,7 @@ def ns(seconds):
 
 
 def play(tracker, images, start=0.0, period=0.1):
-    """Send images; gives what came out of each, by topic."""
+    """Process images, return the messages of each by topic."""
     return [by_topic(tracker.image(image(gray, stamp_ns=ns(start + i * period))))
             for i, gray in enumerate(images)]
 
@@ -113,7 +113,7 @@ def threads(request):
 
 
 def meddle(one, number):
-    """Do to a tracker, before an image, what may make what was begun of it useless."""
+    """Change a tracker before an image, so that its preparation may be invalid."""
     if number == 2:
         one.camera_info(camera_info(K * [[1.01], [1.01], [1]], SIZE))
     elif number == 4:
@@ -126,7 +126,7 @@ def meddle(one, number):
 
 def test_images_that_are_expected_come_out_as_if_they_were_not(drive, threads):
     def results(ahead):
-        """Give all that comes of images, of which so many are told before."""
+        """Return all messages of images, of which so many are prepared ahead."""
         one = tracker()
         messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive)]
         messages[9].height += 1  # than there are rows
@@ -283,7 +283,7 @@ def test_a_residual_distortion_gives_what_the_same_one_of_the_calibration_gives(
     assert told[0] == told[1] == told[2]
 
 
-# What a backend needs
+# The status for a back end
 
 def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
     one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant',
@@ -300,7 +300,7 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
         (0, Status.FIRST_FRAME, None, False, False),
         (1, Status.OK, 0, True, False),
         (2, Status.NO_PARALLAX, 1, True, True),
-        # the camera stood, so that this one is from before it stood
+        # after a standstill, so the reference is from before it
         (3, Status.OK, 1, True, False),
         (4, bad, None, False, False),
         # bridged
@@ -308,7 +308,7 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
         (6, bad, None, False, False),
         (7, bad, None, False, False),
         (8, bad, None, False, False),
-        # the hole: it starts from a frame to which no relative pose leads
+        # a gap: the reference has no relative pose itself
         (9, Status.OK, 8, True, False)]]
 
 
@@ -357,7 +357,7 @@ def test_a_late_image_is_dropped_and_counted_and_changes_no_pose(drive, late):
 
 
 def in_a_row(one, stamped):
-    """Send pairs of an image and its seconds, each with the one after it."""
+    """Process pairs of an image and its seconds, each with the following one."""
     messages = [image(gray, stamp_ns=ns(seconds)) for gray, seconds in stamped]
     for message, following in zip(messages, [*messages[1:], None]):
         one.image(message, following)
@@ -433,10 +433,10 @@ def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
     assert covariance[0, 0] > 1e5
 
 
-# What would go wrong in silence
+# Problems that would go unnoticed
 
 def mended(one):
-    """Give level and summary of the diagnosis, and what it says there is to mend."""
+    """Return level and summary of the diagnosis, and its problems."""
     said = one.diagnosis()
     return said.level, said.summary, {name.removeprefix('to mend: '): text for name, text
                                       in said.values.items() if name.startswith('to mend: ')}
@@ -456,7 +456,7 @@ def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp
     assert (level, summary) == ('ERROR', 'started; stamps stand still')
     assert f'have the stamp {stamp // 10**9}.{stamp % 10**9:09d}' in found['stamps stand still']
     assert 'the camera driver has to stamp each image' in found['stamps stand still']
-    # said when it is found, and not with each image
+    # reported once, not with each image
     assert sum('/diagnostics' in messages for messages in out) == 2
     play(one, drive[:2], start=20.0)
     assert mended(one)[2] == {}
@@ -669,7 +669,7 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
     said = [o['/diagnostics'].status[0] for o in out[:2]]
     assert [(s.level, s.message) for s in said] == [
         (1, 'bad pair: TOO_FEW_MATCHES'), (2, 'lost: TOO_FEW_MATCHES')]
-    # the pose is held, and nobody is to believe in it or in a velocity
+    # the pose is held, with a large covariance, as is the velocity's
     for message in (o['odometry'] for o in out):
         held = in_convention(one.last, 'body').pose
         assert np.allclose(pose_of(message)[1], held, rtol=0, atol=1e-12)
@@ -682,7 +682,7 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
     assert one.last.status is Status.OK
 
 
-# What is published when
+# When messages are published
 
 def test_diagnostics_come_on_a_change_of_state_and_once_per_second_of_stamps(drive):
     one = tracker()

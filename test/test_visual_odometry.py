@@ -1,4 +1,4 @@
-"""The odometry: what it does with good, bad, still and missing frames, and how sure it is."""
+"""Odometry of good, bad, stationary and missing frames, and the covariances of its poses."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def test_poses_are_the_current_camera_in_the_first_and_in_the_previous_one(cards
 
 
 def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
-    """Else the next pair has two steps in it, over which what the smaller body shows is gone."""
+    """Otherwise the next pair spans two steps, over which the smaller body leaves the image."""
     world, body = Cards(), Cards(seed=6)
 
     def image(number):
@@ -86,13 +86,13 @@ def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
     results = [vo.process(image(number)) for number in range(4)]
     assert [r.status for r in results[1:]] == [Status.TWO_MOTIONS] * 3
     assert [r.previous_stamp_ns for r in results[1:]] == [0, 10**8, 2 * 10**8]
-    # … and what was between them is unknown from then on.
+    # The motion in between stays unknown.
     assert (np.diag(results[2].pose_covariance) >= np.diag(results[1].pose_covariance)).all()
     assert results[3].pose_covariance[0, 0] > 1e5
 
 
 def test_what_was_seen_before_an_image_in_doubt_is_not_looked_for_in_it():
-    """The camera may go on as it did, but where things were in an older image tells nothing."""
+    """The motion may continue, but the matches are of an older image."""
     world, body, estimator = Cards(), Cards(seed=6), TwoViewEstimator(ESTIMATOR)
     vo, here, there, views, results = odometry(ConstantScale(1.0)), np.eye(4), np.eye(4), [], []
     alike, apart = (pose(x=0.2), pose(x=0.2)), (pose(z=0.12), pose(x=0.1, z=-0.25))
@@ -115,7 +115,7 @@ def test_a_compromise_between_two_bodies_is_not_carried_on():
     vo = VisualOdometry()
     results = [vo.process(Frame(scene.render(pose, i), scene.K, (i + 1) * 10**8))
                for i, pose in enumerate(poses)]
-    # Nobody tells the first pair's from a motion that fits; all after it are right, or unsure.
+    # The first pair alone may fit a compromise; all later ones are correct or uncertain.
     for i, result in enumerate(results[2:], 2):
         if result.status is Status.OK:
             truth = np.linalg.inv(poses[i - 1]) @ poses[i]
@@ -149,19 +149,19 @@ def test_a_pair_whose_direction_is_in_doubt_still_turns_the_pose():
         if result.status is not Status.AMBIGUOUS:
             continue
         off = Rotation.from_matrix(result.pose[:3, :3] @ R).as_rotvec()
-        # Which way it went nobody knows, but how far it turned at most.
-        sure = result.pose_covariance[3:, 3:]
-        assert off @ np.linalg.solve(sure, off) < chi2.ppf(0.999, 3)
+        # The direction is unknown, but the rotation is bounded.
+        covariance = result.pose_covariance[3:, 3:]
+        assert off @ np.linalg.solve(covariance, off) < chi2.ppf(0.999, 3)
         assert np.array_equal(result.pose[:3, 3], np.zeros(3))
         assert np.linalg.eigvalsh(result.pose_covariance[:3, :3])[0] > 1e5
         doubted.append((np.linalg.norm(off), rotation_angle(R, np.eye(3))))
     assert len(doubted) >= 6
-    # Nearly always that is nearer than where it was last seen.
+    # Nearly always that is closer to the truth than no rotation.
     assert np.mean([off < turn for off, turn in doubted]) > 0.8
 
 
 def drive_past(pictures):
-    """Process pictures of the wide camera."""
+    """Process images of the wide-angle camera."""
     vo = VisualOdometry()
     return [vo.process(Frame(gray, CLOSE_UP, (i + 1) * 10**8)) for i, gray in enumerate(pictures)]
 
@@ -194,11 +194,11 @@ def test_a_camera_that_stands_still_has_no_motion_and_keeps_its_reference(cards)
 def test_the_velocity_after_a_standstill_is_that_of_the_motion_and_not_of_the_wait(cards):
     scale, step = SpeedScale(), pose(x=0.25)
     for i in range(-1, 60):
-        # 0.25 m from frame to frame once it drives off
+        # 0.25 m from frame to frame once it starts
         scale.add_speed(i * 100_000_000, 0.0 if i < 30 else 2.5)
     results = drive(odometry(scale), cards, [np.eye(4)] * 31 + [step] * 2)
     assert all(result.stationary for result in results[1:31])
-    # as soon as it stands, it is known to: within 0.3 m/s, and no surer the longer it waits
+    # a standstill is known at once, within 0.3 m/s, and its sigma does not shrink with time
     for result in results[1:31]:
         velocity, covariance = twist(result)
         assert not velocity.any()
@@ -237,7 +237,7 @@ def test_pure_rotation_turns_the_pose_and_does_not_move_it(cards):
 
 def test_the_reference_stays_in_sight_while_nothing_tells_the_way(cards):
     results = drive(odometry(), cards, [np.eye(4), *[pose(yaw=0.018)] * 8])
-    # 4.7 pixels a step, of which a view 320 wide bears 16
+    # 4.7 pixels a step; the limit in an image of width 320 is 16
     stamps = [result.stamp_ns for result in results]
     references = [stamps.index(result.previous_stamp_ns) for result in results[1:]]
     assert references == [0, 0, 0, 0, 4, 4, 4, 4]
@@ -248,10 +248,10 @@ def test_a_motion_that_was_crept_into_came_about_since_it_was_none(cards):
     results = drive(odometry(ConstantScale(1.0)), cards, [*[np.eye(4)] * 10, *creeping])
     resting = results[9].stamp_ns
     assert all(result.stationary for result in results[1:12])
-    told = next(result for result in results[1:] if not result.stationary)
-    # a tenth of what counts as standing is crept within a frame
-    assert told.since_ns in (resting, resting + 10**8)
-    assert told.previous_stamp_ns == 0
+    moving = next(result for result in results[1:] if not result.stationary)
+    # creep exceeds a tenth of the standstill threshold within a frame
+    assert moving.since_ns in (resting, resting + 10**8)
+    assert moving.previous_stamp_ns == 0
 
 
 def test_a_slow_pan_is_not_taken_for_the_bias_of_a_gyro(cards):
@@ -267,7 +267,7 @@ def test_a_slow_pan_is_not_taken_for_the_bias_of_a_gyro(cards):
 
 
 def gyro_of(rate):
-    """Give a gyro that feels nearly the same rate (3,) all along, within its range."""
+    """Return a gyro that measures a nearly constant rate (3,), without saturation."""
     gyro = Gyro(GyroNoise(2e-4, 2e-5))
     gyro.mount(np.eye(3))
     for i in range(-5, 50 * 20):
@@ -300,8 +300,8 @@ def test_a_step_back_in_time_resets_everything(cards):
     assert vo.process(cards.frame(1.1, STEP)).status is Status.OK
 
 
-def told_of(scale, stamp_ns, way):
-    """Tell a scale how far the camera is, or how fast that makes it."""
+def measure(scale, stamp_ns, way):
+    """Give a scale source a measurement: the position along x, or its speed."""
     if isinstance(scale, SpeedScale):
         scale.add_speed(stamp_ns, 4 * way)
     else:
@@ -316,13 +316,13 @@ def by_guess():
 
 @pytest.mark.parametrize('source', [SpeedScale, by_guess])
 def test_what_has_told_of_the_new_time_before_its_first_image_counts(cards, source):
-    """A bag that begins again brings its speeds with its images, or before them."""
+    """A looping bag has its speeds with its images, or before them."""
     scale = source()
     vo, lengths = odometry(scale), []
     for start in (100.0, 1.0):
         for i in range(3):
             frame = cards.frame(start + 0.1 * i, pose(x=0.25 * i))
-            told_of(scale, frame.stamp_ns, 0.25 * (1 + i))
+            measure(scale, frame.stamp_ns, 0.25 * (1 + i))
             result = vo.process(frame)
             if i:
                 assert result.scale_kind is Scale.METRIC
@@ -332,10 +332,10 @@ def test_what_has_told_of_the_new_time_before_its_first_image_counts(cards, sour
 
 @pytest.mark.parametrize('source', [SpeedScale, by_guess])
 def test_what_was_told_of_the_time_before_does_not_count_in_the_new_one(cards, source):
-    """A bag that is played anew from its middle; its speeds do not come this time."""
+    """A bag is played again from its middle, without its speeds."""
     scale = source()
     for i in range(30):
-        told_of(scale, i * 10**8, 0.25 * i)
+        measure(scale, i * 10**8, 0.25 * i)
     vo = odometry(scale)
     drive(vo, cards, [np.eye(4), STEP], start=2.8)
     assert scale.between(2_800_000_000, 2_900_000_000).known
