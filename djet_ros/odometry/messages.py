@@ -259,7 +259,7 @@ def k1_of(word: str | None) -> float:
 
 class FrameStatus(NamedTuple):
     """
-    What a back end needs of a frame beside its poses; see ``Messages.status``.
+    What a back end needs of a frame, other than its poses; see ``Messages.status``.
 
     reference_ns: stamp of the reference frame, or None; scale: unit of the translation's length;
     stationary: whether the camera stood still, so that the reference frame stays; keyframe:

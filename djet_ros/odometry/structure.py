@@ -143,7 +143,7 @@ class TrackScale:
             self._interrupted = True
 
     def expected_length(self, span_ns: tuple[int, int]) -> Length:
-        """Return the length at the last speed, or as measured: where none can be estimated."""
+        """Return the measured length, or that at the last speed, of a pair without an estimate."""
         measured = self._source.between(*span_ns)
         if measured.known or not self._uses_landmarks or self._speed is None:
             return measured
@@ -248,8 +248,8 @@ class TrackScale:
         """
         Return the pair with the status that the depths of landmarks give it; K: (3, 3).
 
-        A motion that they contradict is AMBIGUOUS, an ambiguous one is OK if they contradict all
-        its rivals but not itself, and one without significant parallax is a rotation.
+        A motion that they contradict is AMBIGUOUS; an AMBIGUOUS one is OK if they agree with it
+        and contradict all its rivals; one without significant parallax is a rotation.
         """
         if relative.status not in (Status.OK, Status.AMBIGUOUS):
             return relative

@@ -96,7 +96,7 @@ class VisualOdometry:
     def recalibrated(self) -> None:
         """Forget the estimated distortion, as the next images have another one."""
         if self._last is not None and self._forget_distortion():
-            self._see_reference_anew()
+            self._renew_reference_view()
             self._scale.begin(self._reference.view)
 
     def reset(self) -> None:
@@ -171,7 +171,7 @@ class VisualOdometry:
 
     def _verified(self, view: View, pair: RelativePose, priors: Known,
                   span: Span) -> RelativePose:
-        """Return the pair fused with the gyro's rotation, not tracked if others contradict it."""
+        """Return the pair fused with the gyro's rotation, not tracked if other evidence contradicts it."""
         # A gyro that has never agreed may be why the pair is bad: judge it by images alone.
         if priors.turn is not None and self._priors.may_mislead(pair):
             alone = self._estimator.estimate(self._reference.view, view, self._last_pair,
@@ -211,9 +211,10 @@ class VisualOdometry:
 
     def _stationary(self, frame: Frame, pair: RelativePose, span: Span) -> OdometryResult:
         """Keep the pose and the reference."""
-        covariance = standstill_covariance(pair, self._scale.expected_length(span))
+        length = self._scale.expected_length(span)
+        covariance = standstill_covariance(pair, length)
         result = replace(
-            self._result(frame, pair, self._scale.expected_length(span), np.eye(4), covariance,
+            self._result(frame, pair, length, np.eye(4), covariance,
                          self._trajectory.stayed(covariance), keyframe=False),
             status=Status.NO_PARALLAX, stationary=True)
         self._standstill.stay(pair, self._config.standstill)
@@ -289,10 +290,10 @@ class VisualOdometry:
         remains.
         """
         self._estimator = TwoViewEstimator(self._estimator.config, k1)
-        self._see_reference_anew()
+        self._renew_reference_view()
         self._scale.straighten(self._reference.view)
 
-    def _see_reference_anew(self) -> None:
+    def _renew_reference_view(self) -> None:
         """Prepare the reference's view by the present estimator; its old matches are void."""
         self._reference = self._reference.seen_by(self._estimator)
         self._last_pair = _motion_alone(self._last_pair)
