@@ -171,7 +171,7 @@ class VisualOdometry:
 
     def _verified(self, view: View, pair: RelativePose, priors: Known,
                   span: Span) -> RelativePose:
-        """Return the pair fused with the gyro's rotation, not tracked if other evidence contradicts it."""
+        """Return the pair fused with the gyro's rotation; other evidence may reject it."""
         # A gyro that has never agreed may be why the pair is bad: judge it by images alone.
         if priors.turn is not None and self._priors.may_mislead(pair):
             alone = self._estimator.estimate(self._reference.view, view, self._last_pair,
