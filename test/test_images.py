@@ -6,7 +6,7 @@ import struct
 import zlib
 
 import cv2
-from djet_ros.odometry.images import BadMessage, coarse, ENCODINGS, gray_image
+from djet_ros.odometry.images import BadMessage, ENCODINGS, few_levels, gray_image
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -132,7 +132,7 @@ def test_what_is_outside_the_range_is_black_or_white_and_all_else_in_equal_steps
 def test_a_range_changes_no_image_of_8_bits():
     for message in (image(GRAY), compressed(encoded('.png'), 'png')):
         assert np.array_equal(gray_image(message, (0, 4095)), GRAY)
-        assert coarse(message, gray_image(message, (0, 4095)) // 128) is None
+        assert few_levels(message, gray_image(message, (0, 4095)) // 128) is None
 
 
 @pytest.mark.parametrize('message', [
@@ -141,17 +141,17 @@ def test_a_range_changes_no_image_of_8_bits():
     lambda pixels: compressed(encoded('.png', pixels), 'png')])
 def test_16_bits_that_become_few_levels_are_told_with_the_values_they_had(message):
     dark = message(small(GRAY, 2, 8000))
-    levels, low, high = coarse(dark, gray_image(dark))
+    levels, low, high = few_levels(dark, gray_image(dark))
     assert levels <= 3
     assert 8000 <= low < high <= 8510
-    assert coarse(dark, gray_image(dark, (8000, 8511))) is None
+    assert few_levels(dark, gray_image(dark, (8000, 8511))) is None
 
 
 def test_a_few_broken_pixels_hide_no_lack_of_gray_levels():
     values = np.full((480, 640), 100, '<u2')
     values.ravel()[:40_000:1000] = np.arange(40) * 1600
     message = image(values, 'mono16')
-    assert coarse(message, gray_image(message)) == (1, 100, 100)
+    assert few_levels(message, gray_image(message)) == (1, 100, 100)
 
 
 @pytest.mark.parametrize('kind', [lambda d: array('B', d.tobytes()), lambda d: d.tobytes(),

@@ -557,7 +557,7 @@ class Ground(ScaleSource):
 
 def factors(metres, alike):
     """
-    Return log factors (N,) after each of some lengths (N,), their variances and kept shares.
+    Return log factors after each of N lengths, their variances and kept shares (3, N).
 
     alike: correlation length in metres.
     """
