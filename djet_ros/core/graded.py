@@ -1,10 +1,10 @@
 """
-Graded binary tests: by how much, and not only which of, two places is the brighter one.
+Graded binary tests: soft comparisons of two intensities in place of descriptor bits.
 
-A bit of a descriptor flips where its two places are equally bright, so most of what a Hamming
-surface says hangs on tests that a little noise would turn. A graded test passes by degrees from
-one outcome to the other, g = clip(I(p) - I(q), -s, s) with s the grading. The distance of two
-graded descriptors, the sum of |g - g'| / 2s, is the Hamming distance where all tests are decided.
+A descriptor bit flips where its two intensities are equal, so most of a Hamming surface depends on
+tests that a little noise decides. A graded test saturates instead of jumping: g = clip(I(p) -
+I(q), -s, s), with s the grading. The distance of two graded descriptors, the sum of |g - g'| / 2s,
+equals the Hamming distance where all tests are saturated.
 """
 
 from __future__ import annotations
@@ -35,25 +35,26 @@ from numpy.typing import NDArray
 
 Grades = NDArray[np.int16]
 
-# Steps in a gray level: whole gray levels draw the minima of weak surfaces to whole pixels.
-_STEPS = 4
+# Quantisation steps per gray level: whole gray levels would bias the minima of weak surfaces
+# towards whole pixels.
+_PER_LEVEL = 4
 
 
 def smooth_finely(gray: Image, scale: float = 1.0) -> Grades:
     """Smooth an (H, W) uint8 image as `smooth` does, to quarters of a gray level."""
     kernel = cv2.getGaussianKernel(7, 2 * scale)
-    return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _STEPS * kernel, kernel), np.int16)
+    return np.asarray(cv2.sepFilter2D(gray, cv2.CV_16S, _PER_LEVEL * kernel, kernel), np.int16)
 
 
 def grades(p: NDArray[Any], q: NDArray[Any], grading: float,
            contrast: float | Array = 1.0) -> Grades:
     """
-    Grades of tests with fine intensities p and q, both (T, N), in quarters of a gray level.
+    Return the grades of tests from fine intensities p and q (T, N), in quarters of a gray level.
 
-    contrast: of the image that they are to be compared with, over that of their own, (N,) where
-    they are of several. Between pixels p and q are float32.
+    contrast: ratio of the contrast of the image to compare with over that of their own, one for
+    all or (N,). Between pixels p and q are float32.
     """
-    reach = _reach(grading)
+    reach = _largest_grade(grading)
     differences = p - q
     if differences.dtype != np.int16 or np.any(contrast != 1):
         differences = np.rint(differences * np.asarray(contrast, np.float32))
@@ -63,7 +64,7 @@ def grades(p: NDArray[Any], q: NDArray[Any], grading: float,
 def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading: float,
                    contrast: float | Array, tests: Tests = TESTS) -> Grades:
     """
-    Grades (T, N) of tests on patches seen through a warp, see `hamming.intensities_through`.
+    Return grades (T, N) of tests on patches seen through warps, see `hamming.intensities_through`.
 
     contrast: as in `grades`.
     """
@@ -78,7 +79,7 @@ def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading:
         seen, some = task
         return compiled.grades_through(
             seen, (inverse[some], nearer[some]), places[some], of_each[some], ends,
-            _reach(grading), MOST_NEARER)
+            _largest_grade(grading), MOST_NEARER)
 
     none = np.empty((len(tests), 0), np.int16)
     return np.concatenate([none, *each(look, passes(images))], axis=1)
@@ -87,13 +88,13 @@ def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading:
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,
                     grading: float, tests: Tests = TESTS) -> NDArray[np.float32]:
     """
-    Graded match residual, in bits, for all |v_x|, |v_y| <= radius around centres y_k.
+    Return the graded match residual, in bits, for all |v_x|, |v_y| <= radius around centres y_k.
 
-    reference: (T, N) grades at x_k by T tests; centres: (N, 2) whole pixels in the
-    finely smoothed image B; grading in gray levels. Gives (P, P, N) with P = 2 radius + 1, indexed
-    [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
+    reference: (T, N) grades at x_k by T tests; centres: (N, 2) whole pixels in the finely smoothed
+    image B; grading in gray levels. Returns (P, P, N) with P = 2 radius + 1, indexed [v_y +
+    radius, v_x + radius, k]. Raises ValueError if a window does not fit into the image.
     """
-    reach = _reach(grading)
+    reach = _largest_grade(grading)
     if compiled.library is not None:
         require_describable(centres, fine, radius, tests)
         return compiled.graded_surfaces(reference, fine, centres, radius, tests, reach_of(tests),
@@ -110,6 +111,6 @@ def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: in
     return np.divide(sums, 2 * reach, dtype=np.float32)
 
 
-def _reach(grading: float) -> int:
-    """Largest grade: the grading in quarters of a gray level."""
-    return max(1, round(_STEPS * grading))
+def _largest_grade(grading: float) -> int:
+    """Return the largest grade: the grading in quarters of a gray level."""
+    return max(1, round(_PER_LEVEL * grading))

@@ -1,9 +1,9 @@
 """
 Dense unrotated descriptors on pyramid level 0, and the Hamming match residual Q_k around a point.
 
-Paper: section "Locally differentiable descriptor residual" and "Descriptor". Descriptors are taken
-at whole pixels of the smoothed image, exactly as ``cv2.ORB.compute`` does with angle 0; only
-patches that are seen through a warp are tested between pixels.
+Paper: sections "Locally differentiable descriptor residual" and "Descriptor". Descriptors are
+computed at whole pixels of the smoothed image, exactly as ``cv2.ORB.compute`` does for angle 0;
+only patches seen through a warp are tested between pixels.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]
 Tests = NDArray[np.int64]
-# An image, and how many of the points that come one after the other are in it.
+# An image, and the number of points in it, of points that are ordered by image.
 Shown = tuple[NDArray[Any], int]
 
-# Points per pass of the 256 tests: bounds the memory that their patches take (2 MB).
+# Points per pass of the 256 tests, which bounds the memory of their patches (2 MB).
 _BLOCK = 2048
 
-# Points per pass of warped patches, which take up to 512 places in the image each (2 MB); and of
-# what takes one after the other, where a pass is but a share for one of two threads.
-_WARPED_BLOCK, _SHARE = 256, 512
+# Points per pass over warped patches, each with up to 512 sample positions (2 MB); and per pass of
+# loops over patches one by one, small enough to share passes between two threads.
+_WARPED_BLOCK, _PASS = 256, 512
 
-# Pixels by which the farthest ends of tests may be off, for when driving, a warp's derivative will
-# do. All of a patch is off by a seventh of that, a twentieth of the noise of a match.
-_BENT = 0.02
+# Pixels of error at the outermost test points up to which a warp is taken as affine. On average
+# over the patch the error is a seventh of that, a twentieth of the noise of a match.
+_AFFINE_TOLERANCE = 0.02
 
-# chosen: no part of a patch is nearer, or farther, than its middle by a larger factor.
+# chosen: limit of the depth ratio between a part of a patch and its centre.
 MOST_NEARER = 2.0
 
-# Tests times points below which it takes longer to gather patches than to look where tests do.
-_FEW = 20_000
+# Tests times points below which indexing each test point is faster than gathering patches.
+_GATHER_FROM = 20_000
 
-# Tests per pass over the points at most: enough to spare calls, few enough to stay in the cache.
+# Most tests per pass over the points: enough to save calls, few enough to stay in the cache.
 _TESTS_AT_ONCE = 16
 
 
@@ -52,8 +52,8 @@ def smooth(gray: Image, scale: float = 1.0) -> Image:
     """
     Smooth an (H, W) image the way ORB does before its binary tests, bit for bit.
 
-    scale: of the tests, and with them of the smoothing. ``cv2.GaussianBlur`` rounds differently,
-    which flips 0.07 % of the descriptor bits.
+    scale: of the tests, which also scales the smoothing. ``cv2.GaussianBlur`` rounds differently
+    and flips 0.07 % of the descriptor bits.
     """
     kernel = cv2.getGaussianKernel(7, 2 * scale)
     return np.asarray(cv2.sepFilter2D(gray, -1, kernel, kernel), np.uint8)
@@ -61,7 +61,7 @@ def smooth(gray: Image, scale: float = 1.0) -> Image:
 
 def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0,
                 tests: Tests = TESTS) -> NDArray[np.bool_]:
-    """(N,) bool mask of the points with a descriptor at every pixel within `radius`."""
+    """Return a mask (N,) of the points with a descriptor at every pixel within `radius`."""
     margin = reach(tests) + radius
     height, width = shape[:2]
     return np.asarray((points[:, 0] >= margin) & (points[:, 0] < width - margin)
@@ -70,9 +70,9 @@ def describable(points: Pixels, shape: tuple[int, ...], radius: int = 0,
 
 def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
     """
-    Unrotated descriptors d(x), as (256, N) bits, at (N, 2) whole pixels (x, y).
+    Return unrotated descriptors d(x), as (256, N) bits, at (N, 2) whole pixels (x, y).
 
-    Raises ValueError where a point is too close to the border for a descriptor.
+    Raises ValueError if a point is too close to the border for a descriptor.
     """
     p, q = intensities(smoothed, points)
     return p < q
@@ -81,12 +81,12 @@ def descriptor_bits(smoothed: Image, points: Pixels) -> NDArray[np.bool_]:
 def intensities(smoothed: NDArray[Any], points: Pixels,
                 tests: Tests = TESTS) -> tuple[NDArray[Any], NDArray[Any]]:
     """
-    Intensities at both ends p and q of T tests around (N, 2) whole pixels, (T, N).
+    Sample both ends p and q of T tests around whole pixels (N, 2); each (T, N).
 
-    Raises ValueError where a point is too close to the border for a descriptor.
+    Raises ValueError if a point is too close to the border for a descriptor.
     """
     require_describable(points, smoothed, 0, tests)
-    if len(points) * len(tests) < _FEW:
+    if len(points) * len(tests) < _GATHER_FROM:
         width, pixels = smoothed.shape[1], np.ravel(smoothed)
         first, (px, py, qx, qy) = points[:, 1] * width + points[:, 0], tests.T[:, :, None]
         return pixels.take(py * width + px + first), pixels.take(qy * width + qx + first)
@@ -99,12 +99,12 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
                         tests: Tests = TESTS
                         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """
-    Intensities (T, N) float32 at both ends of T tests, on patches seen through a warp.
+    Return intensities (T, N) float32 at both ends of T tests, on patches seen through warps.
 
-    warp: (N, 3, 2) W and c of `geometry.patch_warp`, W not singular; images: in whose order the
-    points are; points: (N, 2) pixels. The tests look between pixels, at the dx from the point that
-    is seen at their dy: of dy = W dx / (1 + c^T dx), that is dx = u / (1 - c^T u) with
-    u = W^-1 dy. Beyond the image its border goes on.
+    warp: (N, 3, 2) W and c of `geometry.patch_warp`, W not singular; images: of the points, in
+    their order; points: (N, 2) pixels. A test point dy of the other image is sampled at the offset
+    dx that the warp dy = W dx / (1 + c^T dx) takes to it: dx = u / (1 - c^T u) with u = W^-1 dy.
+    Beyond the image, border pixels are replicated.
     """
     inverse, nearer, is_bent = looks_through(warp, tests)
     ends, of_tests = ends_of(tests)
@@ -112,7 +112,7 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
     def look(task: tuple[NDArray[np.float32], slice]) -> None:
-        # Points first: what is near one another in the image comes one after the other.
+        # Points first, so that neighbours in the image are neighbours in memory.
         image, block = task
         away = [inverse[block, axis] @ ends for axis in (0, 1)]
         bent = np.flatnonzero(is_bent[block])
@@ -131,21 +131,21 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
 def looks_through(warp: Array, tests: Tests
                   ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """
-    Tell how tests look through warps (N, 3, 2): W^-1 (N, 2, 2), c^T W^-1 (N, 2).
+    Invert warps (N, 3, 2): return W^-1 (N, 2, 2), c^T W^-1 (N, 2), and a mask (N,).
 
-    And (N,) whether the latter matters.
+    The mask tells for which warps the projective part matters.
     """
     inverse = inverses(warp[:, :2])
     nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
-    # The ends of tests are up to sqrt(2) times their reach from the point.
+    # Test points are up to sqrt(2) times their reach from the centre.
     bend = 2 * reach(tests)**2 * np.sqrt(np.einsum('nij,nij->n', inverse, inverse)
                                          * np.einsum('nj,nj->n', nearer, nearer))
-    return inverse.astype(np.float32), nearer.astype(np.float32), bend > _BENT
+    return inverse.astype(np.float32), nearer.astype(np.float32), bend > _AFFINE_TOLERANCE
 
 
 def blocks(images: Sequence[Shown], most: int = _WARPED_BLOCK
            ) -> list[tuple[NDArray[Any], slice]]:
-    """Give passes over the points of some images: each an image, and which points."""
+    """Split the points of images into passes: tuples of an image and a slice of its points."""
     parts, end = [], 0
     for image, count in images:
         begin, end = end, end + count
@@ -155,17 +155,17 @@ def blocks(images: Sequence[Shown], most: int = _WARPED_BLOCK
 
 
 def floating(images: Sequence[Shown]) -> list[Shown]:
-    """Give images in float32, as OpenCV reads them between pixels, three times as fast."""
+    """Return images in float32, which OpenCV interpolates three times as fast."""
     return [(image.astype(np.float32, copy=False), count) for image, count in images]
 
 
 def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
-    """Give the same for what takes several images of a size at once: few, where points are."""
+    """Split points into passes, each over one or more images of the same size."""
     found: list[tuple[list[Shown], slice]] = []
-    for image, some in blocks(images, _SHARE):
+    for image, some in blocks(images, _PASS):
         part = image, some.stop - some.start
         seen, begun = found[-1] if found else ([], some)
-        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _SHARE:
+        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _PASS:
             found[-1] = [*seen, part], slice(begun.start, some.stop)
         else:
             found.append(([part], some))
@@ -173,7 +173,7 @@ def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
 
 
 def ends_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Places (2, E) at which tests (T, 4) look, each of them once, and which (2, T) a test has."""
+    """Return the distinct points (2, E) of tests (T, 4), and the indices (2, T) of their ends."""
     return _ends(tests.tobytes())
 
 
@@ -185,13 +185,13 @@ def _ends(tests: bytes) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 
 
 def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
-    """Unrotated descriptors, packed as (N, 32) uint8 like those of ``cv2.ORB.compute``."""
+    """Return unrotated descriptors, packed as (N, 32) uint8 like those of ``cv2.ORB.compute``."""
     if not len(points):
         return np.empty((0, 32), np.uint8)
     if compiled.library is not None:
         require_describable(points, smoothed, 0)
         return compiled.describe(smoothed, points, TESTS)
-    # Points first, one byte after the other, they are packed in a third of the time.
+    # Packing is three times as fast with points first.
     bits = np.asarray(cv2.transpose(descriptor_bits(smoothed, points).view(np.uint8)), np.uint8)
     return np.packbits(bits, axis=1, bitorder='little')
 
@@ -199,11 +199,11 @@ def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
 def hamming_surfaces(bits: NDArray[np.bool_], smoothed: Image, centres: Pixels,
                      radius: int, tests: Tests = TESTS) -> NDArray[np.uint16]:
     """
-    Hamming match residual Q_k(v) = H(d(x_k), d(y_k + v)) for all |v_x|, |v_y| <= radius.
+    Return Hamming residuals Q_k(v) = H(d(x_k), d(y_k + v)) for all |v_x|, |v_y| <= radius.
 
-    bits: (T, N) reference descriptors d(x_k) by T tests; centres: (N, 2) whole pixels
-    y_k in the smoothed image B. Gives (P, P, N) with P = 2 radius + 1, indexed
-    [v_y + radius, v_x + radius, k]. Raises ValueError where a window does not fit into the image.
+    bits: (T, N) reference descriptors d(x_k) by T tests; centres: (N, 2) whole pixels y_k in the
+    smoothed image B. Returns (P, P, N) with P = 2 radius + 1, indexed [v_y + radius, v_x + radius,
+    k]. Raises ValueError if a window does not fit into the image.
     """
     def differ(outcomes: NDArray[Any], reference: NDArray[Any]) -> NDArray[np.uint8]:
         np.not_equal(outcomes, reference, out=outcomes)
@@ -217,22 +217,22 @@ def sum_over_tests(reference: NDArray[Any], image: NDArray[Any], centres: Pixels
                    tests: Tests, outcome: np.ufunc, differ: Callable[..., NDArray[Any]],
                    most: int) -> NDArray[np.uint32]:
     """
-    Sum up, at every pixel of a window, by how much the tests differ from those at a reference.
+    Sum the differences of all tests from a reference, at every pixel of a window.
 
-    reference: (T, N) of T tests; image: (H, W); centres: (N, 2) whole pixels in it.
-    outcome(I(p), I(q)) is a test, of the type of the reference; differ(outcomes, reference), which
-    may write over the outcomes, is unsigned, as wide, and at most `most`. Gives (P, P, N) with
-    P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k]. Raises ValueError where a window
+    reference: (T, N) of T tests; image: (H, W); centres: (N, 2) whole pixels in it. outcome(I(p),
+    I(q)) is a test, of the dtype of the reference; differ(outcomes, reference), which may
+    overwrite the outcomes, is unsigned, of the same width, and at most `most`. Returns (P, P, N)
+    with P = 2 radius + 1, indexed [v_y + radius, v_x + radius, k]. Raises ValueError if a window
     does not fit into the image.
     """
     require_describable(centres, image, radius, tests)
     sums = np.empty((2 * radius + 1, 2 * radius + 1, len(centres)), np.uint32)
-    # As many at once as can be summed in the type of the differences.
+    # As many tests at once as can be summed without overflow.
     at_once = min(_TESTS_AT_ONCE, np.iinfo(f'u{reference.itemsize}').max // most)
     for start in range(0, len(centres), _BLOCK):
         block = slice(start, start + _BLOCK)
         patches = gather_patches(image, centres[block], reach(tests) + radius)
-        # What a mask has chosen comes points first, which is three times slower to compare.
+        # Masking returns arrays with points first, which are three times slower to compare.
         chosen = np.ascontiguousarray(reference[:, block])
         sums[:, :, block] = _summed(chosen, patches, radius, tests, outcome, differ, at_once)
     return sums
@@ -259,10 +259,10 @@ def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, tests: 
 def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
                     known: tuple[Array, Array] | None = None) -> Array:
     """
-    Hamming match residuals H(d(x), d(y)), (N,) bits, at the whole pixels next to x, y (N, 2).
+    Return Hamming distances H(d(x), d(y)), (N,) bits, at the whole pixels nearest to x, y (N, 2).
 
-    known: other places y' (N, 2) with their distances, which most y share the pixel with. NaN
-    where one of the two is too close to the border for a descriptor.
+    known: earlier places y' (N, 2) and their distances, reused if y has the same pixel. NaN if one
+    of the two is too close to the border for a descriptor.
     """
     if known is not None:
         anew = ~(np.rint(known[0]) == np.rint(y)).all(1)
@@ -282,12 +282,12 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
 
 
 def gather_patches(image: NDArray[Any], centres: Pixels, reach: int) -> NDArray[Any]:
-    """Square patches as (S, S, N): points last, so that every test runs over contiguous memory."""
+    """Return square patches (S, S, N), points last: each test runs over contiguous memory."""
     side = 2 * reach + 1
     if not len(centres):
         # The image may be smaller than a window.
         return np.empty((side, side, 0), image.dtype)
-    # All patches there are, by their first pixels. A row as one item is copied in half the time.
+    # A view of all patches, by their first pixels. A row as one item is copied in half the time.
     image, (height, width) = np.ascontiguousarray(image), image.shape
     down, right = image.strides
     windows = np.ndarray((height - side + 1, width - side + 1, side),

@@ -1,14 +1,15 @@
 """
-Joint epipolar tracking: one optimiser over (R, t) for every residual surface.
+Joint epipolar tracking (JET): one least-squares optimiser over (R, t) for every residual surface.
 
-With y* = y - A'^-1 b the minimum of a paraboloid and l = (g, l_3) = F x its epipolar line, the
+With y* = y - A'^-1 b the minimum of a paraboloid and l = (g, l_3) = F x the epipolar line, the
 least value of the paraboloid on the line is
 
     Q(v_opt) = Q(y*) + (y*^T l)^2 / (g^T A'^-1 g),
 
-so the summed loss of "Joint Epipolar Tracking" is a least-squares problem with one residual per
-match: the distance of y* to its epipolar line, weighed by the match's own 2x2 precision.
-R is moved on SO(3) from the left, t on the unit sphere.
+so the summed loss of the paper is a least-squares problem with one residual per match: the
+distance of y* from its epipolar line, divided by its standard deviation under the covariance A'^-1
+(the Sampson distance with an anisotropic covariance). R is updated on SO(3) from the left, t on
+the unit sphere.
 """
 
 from __future__ import annotations
@@ -31,27 +32,29 @@ from numpy.typing import NDArray
 
 MAX_STEPS = 30
 DAMPING_AT_FIRST = 1e-4
-_STEP_TOLERANCE = 1e-6  # rad, a hundredth of what the best camera pose is good for
+_STEP_TOLERANCE = 1e-6  # rad; the best poses are accurate to a hundred times as much
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
 
-# chosen: by its weight alone, as if all others were right, a match makes steps too short; by the
-# bend of its loss, too long where many are false. Half way takes three steps of four.
+# chosen: least curvature of a match in the Hessian, as a share of its IRLS weight. With the
+# weights alone (as in iteratively reweighted least squares) steps are too short; with the second
+# derivative of the robust loss alone they are too long where many matches are outliers. 0.3 takes
+# three steps in place of four.
 LEAST_CURVED = 0.3
 
-# As those of it that are compiled take them.
+# In the order of the arguments of djet_minimise.
 _LIMITS = np.array([_STEP_TOLERANCE, _GAIN_TOLERANCE, _MAX_DAMPING, LEAST_CURVED])
 _LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
 
-# Robust standard deviations beyond which residuals do not belong together; chosen: rounds in which
-# these are left out.
-_CORE, _CORE_ROUNDS = 2.5, 8
+# Cut-off of `core_scale` in robust standard deviations, and its rounds (chosen).
+_CLIPPING, _CLIPPING_ROUNDS = 2.5, 8
 
-# Standard deviation of normal residuals over the median of their absolute values.
-_NORMAL = 1.4826
+# Standard deviation over median absolute deviation of a normal distribution.
+_SIGMA_OVER_MAD = 1.4826
 
-# What is left over at a minimum is noise itself: a match has at least this share of the usual.
-_LEAST_LEFT = 0.25
+# Floor of a surface's value at its minimum, as a share of the median: the value is a noisy
+# estimate of the variance of the match.
+_LEAST_VALUE = 0.25
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,10 @@ class JetProblem:
     """
     Matches as the optimiser sees them; the last axis runs over the N matches.
 
-    rays_x, rays_y: (3, N) viewing rays of x and of the paraboloids' minima y*;
-    spread: (3, N) the entries 11, 12, 22 of K^-1 A'^-1 K^-T, so that g^T A'^-1 g is taken in
-    viewing-ray units. Residuals are in pixels for a surface of typical sharpness.
-    blur: (N,) added to that variance, so that matches around the epipole count for little.
+    rays_x, rays_y: (3, N) viewing rays of x and of the minima y* of the paraboloids; spread: (3,
+    N) entries 11, 12, 22 of K^-1 A'^-1 K^-T, the covariance of y* up to scale, in units of rays.
+    Residuals are in pixels for a surface of median curvature. blur: (N,) variance added to g^T
+    A'^-1 g, which down-weights matches near the epipole.
     """
 
     rays_x: Array
@@ -71,13 +74,14 @@ class JetProblem:
     blur: Array
 
     def subset(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice) -> JetProblem:
-        """Give the same problem on some of the matches."""
-        # Indexed, they would come points first, and all that is done with them take longer.
+        """Return the problem with some of the matches only."""
+        # Fancy indexing would return arrays with points first in memory, and slow down all that
+        # follows.
         places = np.arange(len(self.blur))[chosen]
         return JetProblem(*(values.take(places, axis=-1) for values in self.matches))
 
     def seen_with(self, K: Array, other: Array) -> JetProblem:
-        """Give the same pixels as a camera has them whose matrix is another one, not K."""
+        """Return the problem with the same pixels under another camera matrix than K."""
         A = inverse_of(other) @ K
         return JetProblem(A @ self.rays_x, A @ self.rays_y,
                           spread_of_rays(inverse_of(K) @ other, self.spread),
@@ -85,17 +89,17 @@ class JetProblem:
 
     @property
     def matches(self) -> tuple[Array, Array, Array, Array]:
-        """Give all of its arrays."""
+        """Return all arrays of the problem."""
         return self.rays_x, self.rays_y, self.spread, self.blur
 
 
 @dataclass(frozen=True)
 class Residuals:
     """
-    Weighed epipolar distances r (N,), their signs of curvature (N,) and Jacobian (5, N).
+    Whitened epipolar distances r (N,), signs of their curvature (N,), and the Jacobian (5, N).
 
-    The match's loss is ``sign * r^2``; sign is -1 only for indefinite surfaces kept as printed.
-    tangents: (3, 2) the basis in which the last two parameters move t.
+    The loss of a match is ``sign * r^2``; sign is -1 only for indefinite surfaces under the policy
+    'keep'. tangents: (3, 2) basis of the tangent plane in which the last two parameters move t.
     """
 
     r: Array
@@ -106,7 +110,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Solution:
-    """A pose (R, t), and the residuals there."""
+    """Estimated pose (R, t) with the residuals there."""
 
     R: Array
     t: Array
@@ -114,19 +118,19 @@ class Solution:
 
     @property
     def pose(self) -> Pose:
-        """Give (R, t) by itself."""
+        """Return (R, t) without the residuals."""
         return Pose(self.R, self.t)
 
 
 @dataclass(frozen=True)
 class Loss:
-    """Robust loss rho(r) by name, with its bend at `scale` (in the unit of the residuals)."""
+    """Robust loss rho(r), by name; `scale` is its tuning constant in units of the residuals."""
 
     name: str = 'none'
     scale: float = 1.0
 
     def __call__(self, squared: Array) -> tuple[Array, Array]:
-        """Give rho(r) and the weight rho'(r) / 2r, both (N,), for squared residuals."""
+        """Return rho(r) and the IRLS weight rho'(r) / 2r, both (N,), of squared residuals."""
         u = squared / self.scale**2
         if self.name == 'none':
             return squared, np.ones_like(squared)
@@ -142,11 +146,11 @@ class Loss:
 
     @property
     def numbers(self) -> tuple[int, float]:
-        """Give its number among all of them, and its bend."""
+        """Return the index of the loss, as compiled code takes it, and its scale."""
         return _LOSSES.index(self.name), self.scale
 
     def curvature(self, squared: Array) -> Array:
-        """Give the second derivative rho''(r) / 2, (N,): what a residual adds to the Hessian."""
+        """Return rho''(r) / 2 (N,), the contribution of each residual to the Hessian."""
         u = squared / self.scale**2
         if self.name == 'cauchy':
             return (1 - u) / (1 + u)**2
@@ -159,62 +163,62 @@ class Loss:
 def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: float = 0.0,
                 by_fit: bool = False) -> JetProblem:
     """
-    Pose the problem for matches x (N, 2) with their paraboloids around y.
+    Set up the problem for matches x (N, 2) and the paraboloids around their y.
 
-    Paraboloids are divided by their typical (median) curvature, which leaves the optimum where
-    it is and gives residuals in pixels, so that losses compare across surfaces. epipole_blur:
-    distance from the epipole, in pixels, within which lines are not trusted; 0 is as printed.
-    by_fit: take the variance of a match to be in proportion to what is left at its minimum.
+    Paraboloids are divided by their median curvature; this keeps the optimum and gives residuals
+    in pixels, so that losses of different surfaces can be compared. epipole_blur: distance from
+    the epipole, in pixels, within which epipolar lines are uncertain; 0 is the paper's loss.
+    by_fit: scale the variance of each match by the value of its surface at the minimum.
     """
     minima, spread = paraboloids.minima(), entries(paraboloids.inverses)
     if by_fit and len(minima):
-        spread *= _left_over(paraboloids, minima)
+        spread *= _floored_minimum_values(paraboloids, minima)
     widths = np.abs(spread[0] + spread[2]) / 2
     spread /= max(median(widths), 1e-12) if len(minima) else 1.0
     spread = spread_of_rays(K, spread)
-    # |g| grows like the sine of the angle from the epipole, so that a distance is an angle there.
+    # |g| grows with the sine of the angle from the epipole, so that a distance there is an angle.
     pixel = np.linalg.det(inverse_of(K)[:2, :2])
     blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
     return JetProblem(rays(K, x).T, rays(K, minima).T, spread, blur)
 
 
 def entries(S: Array) -> Array:
-    """Give the entries 11, 12, 22 (3, N) of symmetric matrices (N, 2, 2)."""
+    """Return the entries 11, 12, 22 (3, N) of symmetric matrices (N, 2, 2)."""
     return np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
 
 
 def spread_of_rays(K: Array, spread: Array) -> Array:
-    """Give covariances of rays by those of their pixels, both by entries 11, 12, 22 (3, N)."""
+    """Convert covariances of pixels to covariances of rays, both as entries 11, 12, 22 (3, N)."""
     (a, b), (c, d) = inverse_of(K)[:2, :2]
     return np.asarray(np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
                                 [c * c, 2 * c * d, d * d]]) @ spread)
 
 
-def _left_over(paraboloids: Paraboloids, minima: Array) -> Array:
+def _floored_minimum_values(paraboloids: Paraboloids, minima: Array) -> Array:
     """
-    Give the values (N,) at the minima, none of them much less than is usual.
+    Return the surface values (N,) at the minima, floored at a share of their median.
 
-    As in any least squares, what the best fit leaves over tells the noise.
+    The residual of a least-squares fit estimates its noise variance.
     """
     values = paraboloids.values(minima)
     usual = median(values)
-    return np.maximum(values, _LEAST_LEFT * usual) if usual > 0 else np.ones(len(values))
+    return np.maximum(values, _LEAST_VALUE * usual) if usual > 0 else np.ones(len(values))
 
 
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
-    """Residuals at the pose (R, t) with their analytic Jacobian over 3 + 2 parameters."""
+    """Return the residuals at (R, t) with their analytic Jacobian over 3 + 2 parameters."""
     if compiled.library is not None:
         return Residuals(*compiled.minimise(problem.matches, Loss().numbers, 0, DAMPING_AT_FIRST,
                                             _LIMITS, R, t)[2])
     tangents = sphere_tangents(t)
-    # Of t, and of the two directions in which it moves.
+    # t and the two tangent directions in which it moves.
     frame = np.empty((3, 3))
     frame[0], frame[1:] = t, tangents.T
     by_direction = skew(frame) @ R
     x, y, spread = problem.rays_x, problem.rays_y, problem.spread
     lines = by_direction[0] @ x
     e = (y * lines).sum(0)
-    # The first two components of the lines, times the covariances of their points.
+    # Covariance of y* times the line's normal g.
     M = spread[:2] * lines[0] + spread[1:] * lines[1]
     variance = (lines[:2] * M).sum(0)  # g^T A'^-1 g
     sign = np.where(variance < 0, -1.0, 1.0)
@@ -222,7 +226,7 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     size += problem.blur
     np.maximum(size, 1e-24, out=size)
     root = np.sqrt(size)
-    # dr = w^T dE x, with the variance's own change in w.
+    # dr = w^T dE x; w includes the derivative of the variance.
     w = y / root
     r = e / root
     w[:2] -= r * sign / size * M
@@ -235,10 +239,10 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
 def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
              max_steps: int = MAX_STEPS, residuals: Residuals | None = None) -> Solution:
     """
-    Minimise the summed loss from a starting pose by Levenberg-Marquardt steps.
+    Minimise the summed loss from an initial pose by Levenberg-Marquardt.
 
-    Never ends above the cost of the start. t must have unit length; residuals: those at the start,
-    where they are known.
+    The result never costs more than the initial pose. t must have unit length; residuals: those at
+    the initial pose, if they have been computed already.
     """
     if compiled.library is not None:
         R, t, left = compiled.minimise(problem.matches, loss.numbers, max_steps,
@@ -268,53 +272,54 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
 
 
 def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
-    """Move a pose by a step (5,): rotation vector in rad from the left, then along the sphere."""
-    t = t + tangents @ step[3:]  # not shorter than before
+    """Apply a step (5,) to a pose: a rotation vector from the left, in rad; t along the sphere."""
+    t = t + tangents @ step[3:]  # a tangential step never shortens t
     return rotation_exp(step[:3]) @ R, t / np.sqrt(t @ t)
 
 
 def robust_scale(residuals: Array) -> float:
-    """Give the standard deviation of the inliers, from the median absolute residual."""
-    return _NORMAL * median(np.abs(residuals)) if len(residuals) else 1.0
+    """Return the standard deviation of the inliers, from the median absolute residual."""
+    return _SIGMA_OVER_MAD * median(np.abs(residuals)) if len(residuals) else 1.0
 
 
 def robust_scales(residuals: Array) -> Array:
-    """Give the same (S,) of each row of (S, N)."""
+    """Return `robust_scale` (S,) of each row of residuals (S, N)."""
     if not residuals.shape[1]:
         return np.ones(len(residuals))
-    return _NORMAL * medians(np.abs(residuals))
+    return _SIGMA_OVER_MAD * medians(np.abs(residuals))
 
 
 def core_scale(residuals: Array) -> float:
     """
-    Give the standard deviation of the residuals that belong together, which may be few.
+    Return the standard deviation of the inliers by iterated clipping, even if they are a minority.
 
-    The median tells it where most are right. Over wide baselines most matches are false, and far
-    from their epipolar lines; they are left out round by round. Where more than half of what is
-    left fits exactly it is 0.
+    The median absolute residual suffices where most matches are inliers. Over wide baselines most
+    are outliers, far from their epipolar lines; each round drops residuals beyond a multiple of
+    the current scale. Returns 0 where more than half of the remaining residuals are exactly zero.
     """
-    # Of ordered ones, those that belong together come first.
+    # After sorting, the inliers come first.
     ordered = np.sort(np.abs(residuals))
     count = len(ordered)
-    for _ in range(1 + _CORE_ROUNDS):
-        scale = _NORMAL * middle_of(ordered, count) if count else 1.0
-        before, count = count, int(ordered.searchsorted(_CORE * scale))
+    for _ in range(1 + _CLIPPING_ROUNDS):
+        scale = _SIGMA_OVER_MAD * middle_of(ordered, count) if count else 1.0
+        before, count = count, int(ordered.searchsorted(_CLIPPING * scale))
         if count == before or not scale:
             break
     return scale
 
 
 def _cost(residuals: Residuals, loss: Loss) -> tuple[float, Array]:
-    """Sum up the loss, and give the weights (N,)."""
+    """Return the summed loss and the weights (N,)."""
     values, weights = loss(residuals.r**2)
     return float(residuals.sign @ values), weights
 
 
 def _step(residuals: Residuals, weights: Array, loss: Loss, damping: float) -> Array | None:
     """
-    Damped Newton step; indefinite surfaces pull with their sign, but curve upwards.
+    Return a damped Newton step, or None if the Hessian is zero or not finite.
 
-    A match curves as much as its robust loss does, or as a share of what its weight makes it.
+    Indefinite surfaces contribute their sign to the gradient, but always positive curvature: that
+    of the robust loss, or a share of the match's weight if that is more.
     """
     J, r = residuals.jacobian, residuals.r
     H = (J * np.maximum(loss.curvature(r * r), LEAST_CURVED * weights)) @ J.T

@@ -2,10 +2,10 @@
 The 256 binary tests of ORB (Rublee et al., ICCV 2011) in the order of OpenCV's descriptor bits.
 
 Bit i is ``I(p_i) < I(q_i)`` on the smoothed image. The table was recovered from ``cv2.ORB`` by
-finding, for each bit, the one pair of pixels that explains its descriptors of random images;
-a test holds it against ``cv2.ORB.compute`` bit for bit. Its values are those of OpenCV's table
+finding, for each bit, the one pair of pixels that explains its descriptors of random images; a
+test compares it with ``cv2.ORB.compute`` bit for bit. Its values are those of OpenCV's table
 ``bit_pattern_31_`` (features2d/src/orb.cpp, by E. Rublee, V. Rabaud and G. Bradski; copyright 2009
-Willow Garage, Inc., BSD licence, which stands in NOTICE).
+Willow Garage, Inc., BSD licence, reproduced in NOTICE).
 """
 
 from __future__ import annotations
@@ -65,16 +65,16 @@ _COORDINATES = (
 # (256, 4): p_x, p_y, q_x, q_y in pixels relative to the keypoint.
 TESTS = np.array(_COORDINATES, dtype=np.int64).reshape(256, 4)
 
-# No test reaches further than this from the keypoint, in x or y.
+# Largest coordinate of a test point relative to the keypoint, in x or y.
 REACH = int(np.abs(TESTS).max())
 
 
 @lru_cache(maxsize=8)
 def pattern(count: int, scale: float) -> NDArray[np.int64]:
     """
-    Give the first of ORB's tests (count, 4), which it ranks by how much they add, made smaller.
+    Return the first `count` of ORB's tests (count, 4), scaled and rounded to whole pixels.
 
-    Their ends lie on whole pixels again; the order stays.
+    OpenCV's order ranks tests by the information that each adds.
     """
     tests: NDArray[np.int64] = np.rint(TESTS[:count] * scale).astype(np.int64)
     tests.setflags(write=False)
@@ -82,5 +82,5 @@ def pattern(count: int, scale: float) -> NDArray[np.int64]:
 
 
 def reach(tests: NDArray[np.int64]) -> int:
-    """Tell how far the ends of tests (T, 4) are from the keypoint at most, in x or y."""
+    """Return the largest coordinate of tests (T, 4) relative to the keypoint, in x or y."""
     return REACH if tests is TESTS else int(np.abs(tests).max(initial=0))

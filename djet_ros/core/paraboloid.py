@@ -1,5 +1,5 @@
 """
-Local paraboloids: the quadratic fit of the Appendix, and their minima on epipolar lines.
+Local paraboloids: the quadratic fit of the paper's Appendix, and their minima on epipolar lines.
 
 A paraboloid is Q(v) = v^T A' v + 2 v^T b + c with v relative to its centre, in pixels.
 """
@@ -15,8 +15,8 @@ from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
-# Least curvature of a projected paraboloid, as a share of the median curvature of all of them:
-# keeps a flat direction weak, and the algebra finite.
+# Floor of the eigenvalues of projected paraboloids, as a share of the median of all: a flat
+# direction stays weak but invertible.
 _CURVATURE_FLOOR = 0.02
 
 
@@ -25,8 +25,8 @@ class Paraboloids:
     """
     One paraboloid per match: v^T A' v + 2 v^T b + c with v = y - centre.
 
-    centres: (N, 2) pixels; A: (N, 2, 2) per square pixel; b: (N, 2) per pixel; c: (N,).
-    usable: (N,) bool, False where no paraboloid could be had and A, b, c mean nothing.
+    centres: (N, 2) pixels; A: (N, 2, 2) per square pixel; b: (N, 2) per pixel; c: (N,). usable:
+    (N,) bool, False if there is no paraboloid, and A, b, c are meaningless.
     """
 
     centres: Array
@@ -36,36 +36,36 @@ class Paraboloids:
     usable: NDArray[np.bool_]
 
     def minima(self) -> Array:
-        """Places y* = centre - A'^-1 b (N, 2) where the gradient vanishes."""
+        """Return the stationary points y* = centre - A'^-1 b (N, 2)."""
         return np.asarray(self.centres + self.ways)
 
     @cached_property
     def inverses(self) -> Array:
-        """Inverse matrices of all A, (N, 2, 2)."""
+        """Return the inverse of each A, (N, 2, 2)."""
         return inverse_2x2(self.A)
 
     @cached_property
     def ways(self) -> Array:
-        """Ways (N, 2) from the centres to the minima."""
+        """Return the displacements (N, 2) from the centres to the minima."""
         return -times(self.inverses, self.b)
 
     def of(self, chosen: NDArray[Any]) -> Paraboloids:
-        """Give those at some places, a mask (N,) bool or indices."""
-        # To take is three to six times as fast as to index, of whatever has several axes.
+        """Return a subset, by a mask (N,) bool or indices."""
+        # np.take is three to six times as fast as indexing for arrays of several axes.
         places = np.arange(len(self.c))[chosen]
         some = Paraboloids(*(values.take(places, axis=0) for values in (
             self.centres, self.A, self.b, self.c, self.usable)))
-        # What has been told of all need not be told again.
+        # Cached properties are kept.
         vars(some).update((name, value.take(places, axis=0)) for name, value in vars(self).items()
                           if name in ('inverses', 'ways'))
         return some
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
-        """(N,) bool mask of those whose minimum lies at most so far off, along either axis."""
+        """Return a mask (N,) of those with a minimum within `radius` along either axis."""
         return np.asarray(largest(self.ways) <= radius)
 
     def values(self, y: Array) -> Array:
-        """Values (N,) of the paraboloids at pixels y (N, 2)."""
+        """Evaluate the paraboloids at pixels y (N, 2); returns (N,)."""
         v = y - self.centres
         return np.asarray(np.einsum('ni,ni->n', v, times(self.A, v) + 2 * self.b) + self.c)
 
@@ -73,10 +73,10 @@ class Paraboloids:
 @lru_cache(maxsize=32)
 def fit_operator(window: int, sigma: float) -> Array:
     """
-    Least-squares solution (6, window^2) of z = D a (Appendix), row-major samples of a square.
+    Return the least-squares operator (6, window^2) of z = D a (Appendix), samples row-major.
 
-    Rows of the answer: a_11, a_22, a_12, a_1, a_2, a_0. With sigma > 0 pixels, samples are weighed
-    by a Gaussian: the outer part of a Hamming surface is not quadratic.
+    The coefficients a are a_11, a_22, a_12, a_1, a_2, a_0. With sigma > 0 pixels, samples have
+    Gaussian weights: the outer part of a Hamming surface is not quadratic.
     """
     radius = window // 2
     x2, x1 = np.mgrid[-radius:radius + 1, -radius:radius + 1].reshape(2, -1).astype(float)
@@ -88,7 +88,7 @@ def fit_operator(window: int, sigma: float) -> Array:
 
 
 def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Paraboloids:
-    """Fit sampled surfaces (P, P, N), indexed [v_y, v_x, k], around centres (N, 2)."""
+    """Fit paraboloids to sampled surfaces (P, P, N), indexed [v_y, v_x, k], at centres (N, 2)."""
     window, _, count = surfaces.shape
     a = fit_operator(window, sigma) @ surfaces.reshape(window**2, count).astype(float)
     a11, a22, a12, a1, a2, a0 = a
@@ -97,25 +97,25 @@ def fit_paraboloids(surfaces: NDArray[Any], centres: Array, sigma: float) -> Par
 
 
 def median(values: Array) -> float:
-    """Median of (N,) values, at a third of the price of ``np.median``."""
+    """Return the median of (N,) values, three times as fast as ``np.median``."""
     return float(medians(values))
 
 
 def medians(values: Array) -> Array:
-    """Medians (...,) of (..., N) values."""
+    """Return the median of each of (..., N) values, (...,)."""
     half, odd = divmod(values.shape[-1], 2)
     return middles(np.partition(values, half if odd else (half - 1, half)))
 
 
 def medians_of_parts(values: Array, counts: NDArray[np.int64]) -> Array:
-    """Medians (P,) of parts of (N,) values, so many of each in turn, and at least one."""
+    """Return the medians (P,) of consecutive parts of (N,) values, with `counts` >= 1 of each."""
     ordered = values[np.lexsort((values, np.repeat(np.arange(len(counts)), counts)))]
     first = np.cumsum(counts) - counts
     return np.asarray((ordered[first + (counts - 1) // 2] + ordered[first + counts // 2]) / 2)
 
 
 def quantile(values: Array, share: float) -> float:
-    """Value below which a share of (N,) values lie, as `np.quantile`, at a third of its price."""
+    """Return a quantile of (N,) values, as `np.quantile` does, three times as fast."""
     place = share * (len(values) - 1)
     below, above = int(place), min(int(place) + 1, len(values) - 1)
     ordered = np.partition(values, (below, above))
@@ -123,19 +123,19 @@ def quantile(values: Array, share: float) -> float:
 
 
 def middles(ordered: Array) -> Array:
-    """Medians (...,) of (..., N) values that are ordered, at least at their middle."""
+    """Return medians (...,) of (..., N) values that are sorted, or partitioned at the middle."""
     half, odd = divmod(ordered.shape[-1], 2)
     return np.asarray(
         ordered[..., half] if odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
 
 
 def middle_of(ordered: Array, count: int) -> float:
-    """Median of the first of (N,) values that are ordered."""
+    """Return the median of the first `count` of (N,) sorted values."""
     return (ordered.item((count - 1) // 2) + ordered.item(count // 2)) / 2
 
 
 def indefinite(paraboloids: Paraboloids) -> NDArray[np.bool_]:
-    """(N,) bool mask of the paraboloids that have no minimum."""
+    """Return a mask (N,) of the paraboloids without a minimum."""
     A = paraboloids.A
     determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1]**2
     return np.asarray((determinant <= 0) | (A[:, 0, 0] + A[:, 1, 1] <= 0))
@@ -146,7 +146,7 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
     A = paraboloids.A
     mean = (A[:, 0, 0] + A[:, 1, 1]) / 2
     spread = np.hypot((A[:, 0, 0] - A[:, 1, 1]) / 2, A[:, 0, 1])
-    # What stands where there is no surface has a curvature of its own.
+    # The entries of unusable paraboloids are left out.
     eigenvalues = np.concatenate([mean - spread, mean + spread])[np.tile(paraboloids.usable, 2)]
     positive = eigenvalues[eigenvalues > 0]
     floor = _CURVATURE_FLOOR * (median(positive) if len(positive) else 1.0)
@@ -164,21 +164,21 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
 
 
 def times(A: Array, v: Array) -> Array:
-    """Products (N, 2) of matrices (N, 2, 2) and vectors (N, 2)."""
+    """Return the products (N, 2) of matrices (N, 2, 2) and vectors (N, 2)."""
     return np.asarray(np.einsum('nij,nj->ni', A, v))
 
 
 def largest(values: Array) -> Array:
-    """Give the largest absolute value (N,) of each of (N, ...), cheaper than ``max``."""
+    """Return the largest absolute value (N,) of each of (N, ...), faster than ``max``."""
     return np.asarray(reduce(np.maximum, np.abs(values).reshape(len(values), -1).T))
 
 
 def inverse_2x2(A: Array) -> Array:
-    """Inverses of (N, 2, 2) symmetric matrices; singular ones get a huge, finite inverse."""
+    """Invert (N, 2, 2) symmetric matrices; singular ones get a huge, finite inverse."""
     a, b, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 1]
     flat = np.abs(a * d - b * b) < 1e-12
     if flat.any():
-        # a trace of curvature where there is none, so that a flat surface weighs nothing
+        # a small curvature where there is none, so that a flat surface has next to no weight
         trace = np.where(flat, np.copysign(1e-6, a + d), 0.0)
         A = A + trace[:, None, None] * np.eye(2)
     return inverses(A)
@@ -186,21 +186,21 @@ def inverse_2x2(A: Array) -> Array:
 
 def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
     """
-    Optimum v_opt (N, 2) of v^T A' v + 2 v^T b + c on the epipolar lines g . v = h.
+    Return the minima v_opt (N, 2) of v^T A' v + 2 v^T b + c on the epipolar lines g . v = h.
 
     Paper: the closed form of "Epipolar Constrained Tracking". Its v_2 divides by g_2, which
-    vanishes for vertical lines; walking from the foot point along the line has no such hole.
-    g: (N, 2) first components of the lines; h: (N,) equals -(y, 1) F (x, 1)^T.
+    vanishes for vertical lines; here the minimum is found along the line, from the foot of the
+    perpendicular. g: (N, 2) first components of the lines; h: (N,) equals -(y, 1) F (x, 1)^T.
     """
     # Components first: a third of the time.
     (g1, g2), (a, c, d) = g.T, (A[:, 0, 0], A[:, 0, 1], A[:, 1, 1])
     norm = np.maximum(np.sqrt(g1 * g1 + g2 * g2), 1e-300)
     n1, n2, away = g1 / norm, g2 / norm, h / norm
     foot1, foot2 = n1 * away, n2 * away
-    # The line leads along (-n2, n1).
+    # The line runs along (-n2, n1).
     slope = n1 * (c * foot1 + d * foot2 + b[:, 1]) - n2 * (a * foot1 + c * foot2 + b[:, 0])
     curvature = a * n2 * n2 - 2 * c * n1 * n2 + d * n1 * n1
-    # A surface that is flat along its line gives no reason to move along it.
+    # A surface that is flat along the line does not move the point along it.
     flat = np.abs(curvature) < 1e-12
     walk = np.where(flat, 0.0, -slope / np.where(flat, 1.0, curvature))
     return np.stack([foot1 - walk * n2, foot2 + walk * n1], axis=1)

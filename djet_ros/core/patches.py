@@ -1,9 +1,9 @@
 """
-Where patches are, as they are seen through their warps (Lucas and Kanade, with a known shape).
+Patch alignment: sub-pixel positions of patches seen through known warps (Lucas and Kanade).
 
-The flow of the image takes it to shift as a whole within a window. Where it grows or leans too,
-the flow says where the slopes of the window went, and not its middle: a tenth of a pixel beside
-that ahead of a car. Once depths are known, so is the shape.
+Optical flow assumes that a window only translates. Where the image of a surface also grows or
+slants, the flow is biased: by a tenth of a pixel ahead of a car. Once depths are known, the warp
+is too.
 """
 
 from __future__ import annotations
@@ -24,46 +24,47 @@ from numpy.typing import NDArray
 
 Gray = NDArray[Any]
 
-# Pixels from the middle of a patch to its side.
+# Pixels from the centre of a patch to its side.
 _RADIUS = 5
 
-# The side of a patch with what its slopes take beside it, and the offsets of all of that with a
-# one, (3, P).
+# Side of a patch with the border that its gradients need, and the homogeneous offsets of its
+# pixels (3, P).
 _SIDE = 2 * _RADIUS + 3
 _SQUARE = np.concatenate([np.mgrid[:_SIDE, :_SIDE][::-1].reshape(2, -1) - (_RADIUS + 1),
                           np.ones((1, _SIDE**2))]).astype(np.float32)
 
-# Steps, which cost little after the first, and pixels that they come to at most: farther off is
-# something else.
-_STEPS, _FARTHEST = 3, 1
+# Gauss-Newton steps, cheap after the first, and their limit in pixels: a larger displacement is a
+# false alignment.
+_STEPS, _MAX_SHIFT = 3, 1
 
-# Pixels from the border of an image where a patch has room for that.
-_MARGIN = _RADIUS + 1 + _FARTHEST
+# Pixels from the image border that a patch and its steps need.
+_MARGIN = _RADIUS + 1 + _MAX_SHIFT
 
-# Square gray levels; where a patch has no more slope than this, nothing tells where it is.
+# Regularisation of the gradients' normal matrix, in square gray levels: without gradient a
+# position is undetermined.
 _LEAST_SLOPE = 1e-3
 
-# Square gray levels: two images are rounded to whole ones.
+# Variance of the quantisation to whole gray levels in two images.
 _LEAST_NOISE = 2 / 12
 
-# Pixels; chosen: what interpolation between pixels and the shape of a warp err, however sharp a
-# patch is. Landmarks, which are looked at many times, would be taken for far surer than they are.
+# Pixels; chosen: error of interpolation and of the warp's shape, however sharp a patch is.
+# Landmarks, which are observed many times, would otherwise be far overconfident.
 _LEAST_ERROR = 0.01
 
-# What is fitted to a patch: its place, brightness and contrast.
-_FITTED = 4
+# Parameters fitted to a patch: its position (2), brightness and contrast.
+_PARAMETERS = 4
 
-# Patches per pass, where NumPy takes them side by side: bounds their memory (4 MB).
+# Patches per pass of the NumPy implementation, which bounds its memory (4 MB).
 _BLOCK = 1024
 
 
 class Placed(NamedTuple):
     """
-    Where N patches are: places (N, 2), and the covariances (N, 2, 2) of these in square pixels.
+    Positions (N, 2) of patches, and their covariances (N, 2, 2) in square pixels.
 
-    By what is left over of each patch and by its slopes, as in any least squares. They tell how
-    matches differ, and little of their common size: what a patch does not look like differs in
-    whole regions, so that errors are up to three times as large, alike in all of a pair.
+    Covariances follow from the residual and the gradients of each patch, as in any least squares.
+    They compare matches well, but not their absolute size: model errors are correlated over whole
+    regions, so that errors are up to three times as large, with one common factor in a pair.
     """
 
     places: Array
@@ -71,20 +72,20 @@ class Placed(NamedTuple):
 
 
 def as_matched(y: Array) -> Placed:
-    """Take places (N, 2) as they were matched, all alike."""
+    """Return positions y (N, 2) as they are, with unit covariances."""
     return Placed(y.copy(), np.tile(np.eye(2), (len(y), 1, 1)))
 
 
 def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Placed:
     """
-    Give where patches around x (N, 2) of one gray image are in another, next to y (N, 2).
+    Align patches around x (N, 2) of one gray image with another, starting from y (N, 2).
 
-    there, here: (H, W) uint8;
-    warp: (N, 3, 2) how they are seen there, see `geometry.patch_warp`; so small a patch needs but
-    the derivatives dy/dx, its first two rows, which must not be singular. By Gauss-Newton steps on
-    the differences of gray levels under the slopes of the warped patch ("inverse compositional",
-    Baker and Matthews, IJCV 2004), whose brightness and contrast are free: haze and clouds change
-    them. What would go far, or lies at the border, stays at y.
+    there, here: (H, W) uint8; warp: (N, 3, 2) from the former to the latter, see
+    `geometry.patch_warp`; only the derivatives dy/dx, the first two rows, are used for so small a
+    patch, and must not be singular. Gauss-Newton on gray levels with the gradients of the warped
+    patch ("inverse compositional", Baker and Matthews, IJCV 2004), with free brightness and
+    contrast: haze and clouds change them. Patches that would move far, or are near the border,
+    stay at y.
     """
     if compiled.library is not None and len(y):
         return place_all([(there, len(x))], x, warp, here, y)
@@ -100,9 +101,9 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
 
 
 def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Array) -> Placed:
-    """Do the same with patches around x (N, 2) of several gray images, in whose order x are."""
+    """Align patches as `place_exactly`, with x (N, 2) ordered by several gray images."""
     inside = within(y, here.shape, _MARGIN)
-    # Those at the border are looked for elsewhere, to no end.
+    # Patches near the border are aligned elsewhere, and their result is discarded.
     began = np.where(inside[:, None], y, _MARGIN)
     if compiled.library is None or min(here.shape) <= 2 * _MARGIN or not len(x):
         places, noise, spread = expect(images, x, warp).stepped(here, began, inside)
@@ -114,9 +115,9 @@ def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Ar
 
 def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began: Array,
              inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Take the steps of `Expected.stepped`, compiled."""
+    """Run `Expected.stepped` compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
-    tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _FARTHEST], float)
+    tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _MAX_SHIFT], float)
 
     def step(task: tuple[list[Shown], slice]) -> tuple[Array, Array, Array]:
         seen, some = task
@@ -130,11 +131,11 @@ def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began:
 
 class Expected(NamedTuple):
     """
-    N patches of P pixels as they are expected: what tells where they are.
+    N templates of P pixels: patches warped into the current image.
 
-    slopes: (2, P, N) float32 along x and y, but for what a brighter patch or one of more contrast
-    would look like; inverses: (N, 2, 2) of the sums of their products; gray: (P, N) float32 their
-    gray levels about the mean; contrasts: (N,) the sums of the squares of these.
+    slopes: (2, P, N) float32 gradients along x and y, orthogonal to a change of brightness and
+    contrast; inverses: (N, 2, 2) of their normal matrices; gray: (P, N) float32 gray levels minus
+    their mean; contrasts: (N,) sums of their squares.
     """
 
     slopes: Gray
@@ -145,22 +146,22 @@ class Expected(NamedTuple):
     def stepped(self, here: Image, began: Array, inside: NDArray[np.bool_]
                 ) -> tuple[Array, Array, Array]:
         """
-        Give where they are in an image, next to where they began (N, 2).
+        Align the templates with an image by Gauss-Newton, starting from `began` (N, 2).
 
-        inside: (N,) those that may move. Gives places (N, 2), the variances (N,) of a pixel, and
-        the covariances (N, 2, 2) of places by such noise.
+        inside: (N,) those that may move. Returns positions (N, 2), the variances (N,) of a pixel,
+        and the covariances (N, 2, 2) of positions for unit variance.
         """
-        seen, places = _Seen(self, here, began), began
+        seen, places = _CurrentPatches(self, here, began), began
         for _ in range(_STEPS):
             step = -times(self.inverses, seen.along_slopes(places).T)
-            places = np.clip(places + step, began - _FARTHEST, began + _FARTHEST)
-        near = inside & (np.abs(places - began).max(1, initial=0) < _FARTHEST)
+            places = np.clip(places + step, began - _MAX_SHIFT, began + _MAX_SHIFT)
+        near = inside & (np.abs(places - began).max(1, initial=0) < _MAX_SHIFT)
         places = np.where(near[:, None], places, began)
         return places, seen.noise(places), self.inverses
 
 
-class _Seen:
-    """What is seen of an image around places that move a little, beside what is expected."""
+class _CurrentPatches:
+    """Patches of the current image around moving positions, and products with templates."""
 
     def __init__(self, expected: Expected, image: Image, places: Array) -> None:
         self._expected, self._image, self._whole = expected, image, np.floor(places)
@@ -168,28 +169,28 @@ class _Seen:
         self._products = _products(expected.slopes, self._patches)
 
     def along_slopes(self, places: Array) -> Array:
-        """Sum up products (2, N) of slopes and patches around places (N, 2)."""
-        return _between(self._products, self._parts(places))
+        """Return the sums of products (2, N) of gradients and patches at positions (N, 2)."""
+        return _between(self._products, self._fractions(places))
 
     def noise(self, places: Array) -> Array:
-        """Variances (N,) of a pixel: what is left of patches around places (N, 2), once fitted."""
-        gray, parts = self._expected.gray, self._parts(places)
-        patches = _between(_at_four(self._patches), parts.astype(np.float32))
+        """Return the variances (N,) of a pixel: the residuals of templates at positions (N, 2)."""
+        gray, parts = self._expected.gray, self._fractions(places)
+        patches = _between(_at_four_pixels(self._patches), parts.astype(np.float32))
         patches -= patches.mean((0, 1))
         patches = patches.reshape(gray.shape)
         left = (np.einsum('pn,pn->n', patches, patches)
                 - np.einsum('pn,pn->n', patches, gray)**2 / self._expected.contrasts)
-        return np.asarray(np.maximum(left / (len(gray) - _FITTED), _LEAST_NOISE))
+        return np.asarray(np.maximum(left / (len(gray) - _PARAMETERS), _LEAST_NOISE))
 
-    def _parts(self, places: Array) -> Array:
-        """Give how far places (N, 2) are from whole pixels, the patches around which are known."""
-        # Few cross over to other pixels.
+    def _fractions(self, places: Array) -> Array:
+        """Return the fractions of positions (N, 2), and update patches that changed pixel."""
+        # Few move to another pixel.
         across = np.flatnonzero((np.floor(places) != self._whole).any(1))
         if len(across):
             self._whole[across] = np.floor(places[across])
             patches = _around(self._image, self._whole[across])
             self._patches[..., across] = patches
-            # Points last in memory too, which indexing does not give.
+            # Points last in memory too, unlike after fancy indexing.
             slopes = self._expected.slopes.take(across, axis=2)
             self._products[..., across] = _products(slopes, patches)
         return places - self._whole
@@ -197,13 +198,13 @@ class _Seen:
 
 def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
     """
-    Tell how patches around points (N, 2) look through a warp (N, 3, 2).
+    Return templates: the patches around points (N, 2) as they look through warps (N, 3, 2).
 
-    images: in whose order the points are.
+    images: of the points, in their order.
     """
     back = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2, dtype=np.float32)
     x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
-    # Points first: what is near one another in the image comes one after the other.
+    # Points first, so that neighbours in the image are neighbours in memory.
     by_point = np.empty_like(x)
     for image, these in blocks(floating(images)):
         cv2.remap(image, x[these], y[these], cv2.INTER_LINEAR, by_point[these],
@@ -226,12 +227,12 @@ def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
 
 
 def _around(image: Image, whole: Array) -> Gray:
-    """Patches (S + 1, S + 1, N) of an image around pixels (N, 2), and the next row and column."""
+    """Return patches (S + 1, S + 1, N) around pixels (N, 2), with the next row and column."""
     return gather_patches(image, whole.astype(np.int64), _RADIUS + 1)[1:, 1:].astype(np.float32)
 
 
-def _at_four(patches: Gray) -> Gray:
-    """Patches (2, 2, S, S, N) at four pixels, rows first, of those that hold them."""
+def _at_four_pixels(patches: Gray) -> Gray:
+    """Return patches (2, 2, S, S, N) at four neighbouring pixels, rows first."""
     side = len(patches) - 1
     four = sliding_window_view(patches, (side, side), axis=(0, 1))
     return np.moveaxis(four, 2, 4)
@@ -239,22 +240,22 @@ def _at_four(patches: Gray) -> Gray:
 
 def _products(slopes: Gray, patches: Gray) -> Gray:
     """
-    Sum up products (2, 2, 2, N) of slopes (2, P, N) and of patches at four pixels, rows first.
+    Return the sums of products (2, 2, 2, N) of gradients (2, P, N) and patches at four pixels.
 
-    What lies between pixels is as linear in them as the image is.
+    Bilinear interpolation of the image is the same interpolation of these products.
     """
-    four = _at_four(patches)
+    four = _at_four_pixels(patches)
     return np.asarray(np.einsum('kyxn,ijyxn->ijkn', slopes.reshape(2, *four.shape[2:]), four))
 
 
 def _between(products: Gray, part: Array) -> Array:
-    """Interpolate (2, 2, ..., N) at pixels, rows first, by parts (N, 2) of the way; (..., N)."""
+    """Interpolate (2, 2, ..., N) bilinearly, rows first, by fractions (N, 2); returns (..., N)."""
     x, y = part.T
     rows = products[0] + y * (products[1] - products[0])
     return np.asarray(rows[0] + x * (rows[1] - rows[0]))
 
 
 def within(points: Array, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
-    """(N,) bool mask of the points (N, 2) at least so far from the border of an image."""
+    """Return a mask (N,) of the points (N, 2) at least `margin` from the image border."""
     upper = np.array([shape[1], shape[0]]) - 1 - margin
     return np.asarray(((points >= margin) & (points <= upper)).all(1))

@@ -1,8 +1,8 @@
 """
 The three residual surfaces: descriptor (D-JET), photometric (P-JET), re-projection (RP-E).
 
-They differ only in the paraboloid that they put around a point of the current image; the joint
-optimiser does not know which one it is given.
+They differ only in the paraboloid that they fit around a point of the current image; the optimiser
+(`core.jet`) treats all of them alike.
 """
 
 from __future__ import annotations
@@ -44,33 +44,34 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-# The outermost of ORB's tests is 13 pixels off, and moves by a quarter of a pixel.
-_WARP_STEP = 0.02
+# Change of a warp's entries beyond which a reference is sampled again: the outermost of ORB's test
+# points are 13 pixels from the centre, and move by a quarter of a pixel.
+_WARP_TOLERANCE = 0.02
 
-# chosen: a patch that would be stretched or shrunk by more is a false match, or no reference.
-_MOST_STRETCH = 2.0
+# chosen: limit of a warp's stretch and shrinkage; beyond it a match is false or the patch no
+# reference.
+_MAX_STRETCH = 2.0
 
-# Pixels between which a reference may stay as it was sampled.
-_NEAR_ENOUGH = 0.05
+# Pixels by which y may move before its reference is sampled again.
+_POSITION_TOLERANCE = 0.05
 
-# Side of the window around a place where the minimum is expected.
+# Side in pixels of the window sampled where the minimum is predicted.
 CLOSE = 3
 
-# Matches and tests by which the contrast is measured, and how far it may change.
-_MEASURED, _MEASURED_TESTS = 200, 32
-_MOST_CONTRAST = 8.0
+# Matches and tests that the contrast ratio is estimated from, and its limit.
+_CONTRAST_MATCHES, _CONTRAST_TESTS = 200, 32
+_MAX_CONTRAST_RATIO = 8.0
 
 
-# Differences of tests grow by their absolute values, so that a surface is sharper at its minimum
-# than the paraboloid through it, which is drawn to the pixel that it is fitted around ("pixel
-# locking"): a small displacement is seen at 1 / 1.37 = 0.73 of its length, one of half a pixel as
-# it is. A test measures what is left of that on rendered scenes.
-_LOCKING = 0.37
+# Pixel locking of a paraboloid fitted to sums of absolute differences, which have a sharper
+# minimum than it: a small displacement is estimated at 1 / 1.37 = 0.73 of its length, one of half
+# a pixel without bias. A test measures what remains of the bias on rendered scenes.
+_PIXEL_LOCKING = 0.37
 
 
 class ResidualSurface(Protocol):
     """
-    What the joint optimiser asks of a match residual.
+    Interface of a match residual that the tracking and the optimiser use.
 
     x: (N, 2) pixels of the reference points in the previous image.
     """
@@ -79,45 +80,45 @@ class ResidualSurface(Protocol):
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """
-        Paraboloids of the residual, valid in the neighbourhood of y (N, 2).
+        Return paraboloids of the residual, valid in the neighbourhood of y (N, 2).
 
-        warp: (N, 3, 2) how the surroundings of x are seen around y, see `geometry.patch_warp`;
-        None where that is not known, and for surfaces that are to be as the paper has them.
+        warp: (N, 3, 2) warps of the patches around x to those around y, see `geometry.patch_warp`;
+        None if they are unknown, and for surfaces as in the paper.
         """
         ...
 
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
         """
-        Places of chosen matches (N,) as found by another means than the surface, next to y.
+        Return positions of the chosen matches (N,) estimated independently of the surface, near y.
 
-        To be asked for matches that have a surface; warp: see ``around``.
+        Only for matches with a usable surface; warp: as in ``around``.
         """
         ...
 
 
-class _OfImages:
-    """What surfaces of two images share: gray levels tell places too, in unsmoothed patches."""
+class _ImageSurface:
+    """Base of surfaces between two images: independent positions from unsmoothed gray levels."""
 
     def __init__(self, previous: View, current: View, x: Array) -> None:
         self.x = x
         self._there, self._here = previous.gray, current.gray
 
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
-        """Places by gray levels, as they are seen through the warp; just y without one."""
+        """Return positions from patch alignment through the warp; y itself without a warp."""
         if warp is None:
             return as_matched(y[chosen])
         return place_exactly(self._there, self._here, *(
             values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
 
-class DescriptorSurface(_OfImages):
+class DescriptorSurface(_ImageSurface):
     """
-    Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled on whole pixels (D-JET).
+    Match residual of descriptors, H(d(x_k), d(y_k + v)), sampled at whole pixels (D-JET).
 
-    H is the Hamming distance, or that of graded tests. References are first taken at the whole
-    pixels next to x; where it is known how they look around y, they are taken between pixels, so
-    that the minimum falls on a whole pixel: there a paraboloid fits without a bias, and a smaller
-    window will do ("inverse compositional", Baker and Matthews, IJCV 2004).
+    H is the Hamming distance, or the distance of graded tests. Without warps, references are taken
+    at the whole pixels nearest to x, as in the paper. With warps they are taken between pixels, so
+    that the minimum falls on a whole pixel, where the fit has no bias and a smaller window
+    suffices ("inverse compositional", Baker and Matthews, IJCV 2004).
     """
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
@@ -129,35 +130,35 @@ class DescriptorSurface(_OfImages):
                                & ~at(previous.mask, x))
         self._mask = current.mask
         self._latest = no_paraboloids(len(x))
-        # How the reference of each match was seen last, if through a warp, and how far x is from
-        # its pixel.
+        # The warp of each match's reference, if it was sampled through one, and the offset of x
+        # from its pixel.
         self._warp = np.repeat(np.eye(3, 2)[None], len(x), axis=0)
         self._is_warped = np.zeros(len(x), bool)
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
         self._contrast: float | None = None
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
-        """Fit paraboloids to the surfaces around the whole pixels next to y."""
+        """Fit paraboloids to the surfaces around the whole pixels nearest to y."""
         if warp is None:
             return self._around_pixels(y)
-        moved = largest(self._latest.centres - y) > _NEAR_ENOUGH
-        warped = largest(warp - self._warp) > _WARP_STEP
+        moved = largest(self._latest.centres - y) > _POSITION_TOLERANCE
+        warped = largest(warp - self._warp) > _WARP_TOLERANCE
         usable = self._usable(np.rint(y), CLOSE // 2)
-        # Most matches rest from one round to the next.
+        # Most matches do not move from one round to the next.
         anew = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(anew[:, None, None], warp, self._warp)
         self._is_warped |= anew
         there, here, seen = (values.compress(anew, axis=0) for values in (self.x, y, warp))
-        return self._kept(anew, usable, y, self._distances.between_pixels(
+        return self._merged(anew, usable, y, self._distances.between_pixels(
             self._previous.tested, there, self._current, here, seen,
             self._contrast_around(y, usable), CLOSE // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
-        """Fit them with the references of whole pixels, as the paper does."""
+        """Fit paraboloids with references at whole pixels, as in the paper."""
         radius = self._config.window // 2
         centres = np.rint(y - self._offset).astype(np.int64)
         usable = self._usable(centres, radius)
-        # Those seen through a warp may lie on the same place, and are of another run.
+        # A surface that was sampled through a warp has to be sampled again even at the same place.
         elsewhere = (centres + self._offset != self._latest.centres).any(1)
         anew = usable & (elsewhere | self._is_warped)
         self._warp[anew], self._is_warped[anew] = np.eye(3, 2), False
@@ -165,24 +166,24 @@ class DescriptorSurface(_OfImages):
         references = self._distances.reference(
             self._previous.tested, pixels[anew], self._contrast_around(centres, usable))
         surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
-        return self._kept(anew, usable, y, fit_paraboloids(
+        return self._merged(anew, usable, y, fit_paraboloids(
             surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
 
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
-        """Measure the contrast where matches are at first, and keep it."""
+        """Estimate the contrast ratio at the initial matches, once."""
         if self._contrast is None:
             there = np.flatnonzero(usable)
-            there = there[thinned(len(there), _MEASURED)]
+            there = there[thinned(len(there), _CONTRAST_MATCHES)]
             self._contrast = self._distances.contrast(
                 self._previous.tested, np.rint(self.x[there]).astype(np.int64), self._current,
                 np.rint(y[there]).astype(np.int64))
         return self._contrast
 
-    def _kept(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
-              fitted: Paraboloids) -> Paraboloids:
-        """Take paraboloids that were fitted anew, for a mask (N,) of the matches, to the rest."""
-        self._latest = replace(_put(self._latest, fitted, anew), usable=usable)
-        # A match that never had a surface stays where it is.
+    def _merged(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
+                fitted: Paraboloids) -> Paraboloids:
+        """Merge newly fitted paraboloids, of the matches in a mask (N,), into the latest ones."""
+        self._latest = replace(_replaced(self._latest, fitted, anew), usable=usable)
+        # A match that never had a surface stays at y.
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
@@ -192,7 +193,7 @@ class DescriptorSurface(_OfImages):
 
 
 class DescriptorDistances:
-    """The distance between descriptors that a configuration asks for: graded, or Hamming's."""
+    """Distance of descriptors by a configuration: graded tests, or Hamming."""
 
     def __init__(self, config: EstimatorConfig) -> None:
         self._grading, self._scale = config.grading, config.patch_scale
@@ -200,52 +201,52 @@ class DescriptorDistances:
         self._tests = pattern(config.binary_tests, config.patch_scale)
 
     def seen(self, gray: Image) -> NDArray[Any]:
-        """Image (H, W) as the tests see it, that `reference` and `surfaces` take (View.tested)."""
+        """Smooth an image (H, W) for the tests: the input of all methods here (View.tested)."""
         return (smooth_finely if self._grading else smooth)(gray, self._scale)
 
     def describable(self, points: NDArray[Any], shape: tuple[int, ...],
                     radius: int = 0) -> NDArray[np.bool_]:
-        """(N,) bool mask of the points with a descriptor at every pixel within `radius`."""
+        """Return a mask (N,) of the points with a descriptor at every pixel within `radius`."""
         return describable(np.rint(points).astype(np.int64), shape, radius, self._tests)
 
     def contrast(self, there: NDArray[Any], x: Pixels, here: NDArray[Any], y: Pixels) -> float:
         """
-        Contrast of an image around whole pixels y (N, 2), over that of another around x (N, 2).
+        Return the contrast of an image around pixels y (N, 2) over another's around x (N, 2).
 
-        It is what a change of exposure makes it. Bits know of no contrast: 1.
+        A change of exposure changes it. Binary tests are invariant to contrast: 1.
         """
-        some = thinned(len(x), _MEASURED)
+        some = thinned(len(x), _CONTRAST_MATCHES)
         return contrast_of(self.strengths(here, y[some]), self.strengths(there, x[some]))
 
     def strengths(self, seen: NDArray[Any], points: Pixels) -> Array:
-        """Tell how much (N,) an image differs around whole pixels (N, 2), see ``contrast_of``."""
+        """Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_of``."""
         if not self._grading:
             return np.ones(len(points))
-        p, q = intensities(seen, points, self._tests[:_MEASURED_TESTS])
+        p, q = intensities(seen, points, self._tests[:_CONTRAST_TESTS])
         return np.asarray(np.abs(p - q).sum(0, dtype=float) + 1)
 
     def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
         """
-        Descriptors (T, N) at whole pixels, or seen through a warp (N, 3, 2) at any points (N, 2).
+        Return descriptors (T, N) at whole pixels, or through warps (N, 3, 2) at any points (N, 2).
 
-        contrast: that of the image which they are to be compared with. Raises ValueError where a
-        point is too close to the border for a descriptor, and there is no warp.
+        contrast: ratio of the contrast of the image to compare with over that of this one. Raises
+        ValueError if a point is too close to the border for a descriptor and there is no warp.
         """
         if warp is not None:
-            return self._through(warp, [(seen, len(points))], points, contrast)
+            return self._warped_descriptors(warp, [(seen, len(points))], points, contrast)
         p, q = intensities(seen, np.asarray(points, np.int64), self._tests)
         return grades(p, q, self._grading, contrast) if self._grading else p < q
 
-    def _through(self, warp: Array, images: Sequence[Shown], points: Array,
-                 contrast: float | Array) -> NDArray[Any]:
+    def _warped_descriptors(self, warp: Array, images: Sequence[Shown], points: Array,
+                            contrast: float | Array) -> NDArray[Any]:
         if self._grading:
             return grades_through(warp, images, points, self._grading, contrast, self._tests)
         return np.less(*intensities_through(warp, images, points, self._tests))
 
     def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:
-        """Distances (P, P, N) in bits between references (T, N) and all pixels of windows."""
+        """Return distances (P, P, N) in bits from references (T, N) to all pixels of windows."""
         if self._grading:
             return graded_surfaces(reference, seen, centres, radius, self._grading, self._tests)
         return hamming_surfaces(reference, seen, centres, radius, self._tests)
@@ -253,32 +254,32 @@ class DescriptorDistances:
     def between_pixels(self, there: NDArray[Any], x: Array, here: NDArray[Any], y: Array,
                        warp: Array, contrast: float, radius: int) -> Paraboloids:
         """
-        Fit paraboloids to the distances in an image around y (N, 2), from references around x.
+        Fit paraboloids to the distances around y (N, 2), with references around x (N, 2).
 
-        References are taken between pixels, so that a minimum at y comes to lie on a whole pixel:
-        there a paraboloid fits without a bias. warp: (N, 3, 2) how they are seen at y.
+        References are taken between pixels, so that a minimum at y falls on a whole pixel, where
+        the fit has no bias. warp: (N, 3, 2) from the patches around x to those around y.
         """
         return self.around(self.shifted([(there, len(x))], x, y, warp, contrast), here, y, radius)
 
     def shifted(self, there: Sequence[Shown], x: Array, y: Array, warp: Array,
                 contrast: float | Array) -> NDArray[Any]:
         """
-        Descriptors (T, N) next to x whose minima at y come to lie on whole pixels.
+        Return descriptors (T, N) next to x for which a minimum at y falls on a whole pixel.
 
-        there: the images that x are in, one after the other; contrast: (N,) where they differ.
+        there: the images of the points x, in their order; contrast: one for all, or (N,).
         """
         back = times(inverses(warp[:, :2]), y - np.rint(y))
-        return self._through(warp, there, x - back, contrast)
+        return self._warped_descriptors(warp, there, x - back, contrast)
 
     def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
                radius: int) -> Paraboloids:
-        """Fit paraboloids to the distances in an image around y (N, 2), from `shifted` ones."""
+        """Fit paraboloids to the distances around y (N, 2), with references from `shifted`."""
         centres = np.rint(y).astype(np.int64)
-        return _unlocked(
+        return _without_pixel_locking(
             fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))
 
 
-class PhotometricSurface(_OfImages):
+class PhotometricSurface(_ImageSurface):
     """Lucas-Kanade residual with structure tensor A' and a weight window (P-JET)."""
 
     def __init__(self, previous: View, current: View, x: Array, config: EstimatorConfig) -> None:
@@ -298,7 +299,7 @@ class PhotometricSurface(_OfImages):
         self._mask = current.mask
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
-        """Second-order expansion of the intensity residual at the sub-pixel positions y."""
+        """Return the second-order expansion of the intensity residual at sub-pixel positions y."""
         reference = (self._reference if warp is None
                      else self._sample(self._previous, self.x, warp))
         difference = reference - self._sample(self._image, y)
@@ -314,10 +315,10 @@ class PhotometricSurface(_OfImages):
     def _sample(self, image: NDArray[np.float32], points: Array,
                 warp: Array | None = None) -> NDArray[np.float32]:
         """
-        Bilinear samples (N, P^2) of the window around each point, as it looks through a warp.
+        Return bilinear samples (N, P^2) of the window around each point, seen through the warp.
 
-        Of the warp the derivatives alone: over so small a window they hardly change.
-        Before OpenCV 5, ``cv2.remap`` rounds positions to a 32nd of a pixel.
+        Only the derivatives of the warp are used: they hardly change over so small a window.
+        Before OpenCV 5, ``cv2.remap`` rounds positions to 1/32 pixel, so SciPy samples here.
         """
         offsets = self._offsets.T if warp is None else inverses(warp[:, :2]) @ self._offsets.T
         places = np.moveaxis(points[:, :, None] + offsets, 1, 0)
@@ -329,9 +330,9 @@ class PhotometricSurface(_OfImages):
 
 class ReprojectionSurface:
     """
-    Squared distance to the observed point: A' = I, b = 0, c = 0 at the original y (RP-E).
+    Squared distance from the observed point: A' = I, b = 0, c = 0 at the initial y (RP-E).
 
-    Where covariances (N, 2, 2) of y are told, A' is their inverses.
+    With covariances (N, 2, 2) of y, A' is their inverse.
     """
 
     def __init__(self, x: Array, y: Array, covariances: Array | None = None) -> None:
@@ -341,40 +342,40 @@ class ReprojectionSurface:
                    else inverses(covariances))
 
     def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
-        """Give the same paraboloid wherever the keypoint has moved."""
+        """Return the same paraboloid wherever the keypoint has moved."""
         n = len(y)
         return Paraboloids(self._y, self._A, np.zeros((n, 2)), np.zeros(n), np.ones(n, bool))
 
     def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
-        """There is no other means."""
+        """Return y: there is no independent estimate."""
         return as_matched(y[chosen])
 
 
 def contrast_of(here: Array, there: Array) -> float:
-    """Contrast of an image over that of another, by strengths (N,) around the same points."""
+    """Return the contrast ratio of two images, by texture strengths (N,) at the same points."""
     if not len(here):
         return 1.0
-    return min(max(median(here / there), 1 / _MOST_CONTRAST), _MOST_CONTRAST)
+    return min(max(median(here / there), 1 / _MAX_CONTRAST_RATIO), _MAX_CONTRAST_RATIO)
 
 
 def contrasts_of(here: Array, there: Array, counts: NDArray[np.int64]) -> Array:
-    """Give the same (N,) for each of N points of several images, so many of each in turn."""
+    """Return contrast ratios (N,) for points of several images, `counts` of each in turn."""
     ratios = medians_of_parts(here / there, counts)
-    return np.repeat(np.clip(ratios, 1 / _MOST_CONTRAST, _MOST_CONTRAST), counts)
+    return np.repeat(np.clip(ratios, 1 / _MAX_CONTRAST_RATIO, _MAX_CONTRAST_RATIO), counts)
 
 
 def comparable(warp: Array) -> NDArray[np.bool_]:
-    """(N,) bool mask of warps (N, 3, 2) through which a patch is still like itself."""
+    """Return a mask (N,) of the warps (N, 3, 2) with a moderate stretch."""
     least, most = stretches(warp[:, :2])
-    return np.asarray((least > 1 / _MOST_STRETCH) & (most < _MOST_STRETCH))
+    return np.asarray((least > 1 / _MAX_STRETCH) & (most < _MAX_STRETCH))
 
 
 def with_minimum(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloids, int]:
     """
-    Decide what becomes of indefinite surfaces, and count them.
+    Apply the policy for indefinite surfaces; return the paraboloids and the number of these.
 
-    policy: 'project' gives them the nearest bowl, 'drop' marks them unusable, 'keep' leaves them
-    as the paper prints them.
+    policy: 'project' replaces them by the nearest positive definite ones, 'drop' marks them
+    unusable, 'keep' leaves them as in the paper.
     """
     bad = indefinite(paraboloids) & paraboloids.usable
     if policy == 'project':
@@ -390,26 +391,26 @@ def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.flo
     return np.asarray(np.exp(-(offsets**2).sum(1) / (2 * sigma**2)), np.float32)
 
 
-def _unlocked(fitted: Paraboloids) -> Paraboloids:
+def _without_pixel_locking(fitted: Paraboloids) -> Paraboloids:
     """
-    Move minima away from the pixel that paraboloids were fitted around, which draws them.
+    Undo pixel locking: the bias of minima towards the pixel that the paraboloid is fitted around.
 
-    A first-order inverse of d - k sin(2 pi d) / (2 pi), by which minima lie a share of d off.
+    First-order inverse of d - k sin(2 pi d) / (2 pi), the estimate of a displacement d in pixels.
     """
-    drawn = _LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.ways)
+    drawn = _PIXEL_LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.ways)
     return replace(fitted, b=fitted.b - times(fitted.A, drawn))
 
 
 def no_paraboloids(n: int) -> Paraboloids:
-    """Give paraboloids of which none is usable."""
+    """Return n unusable paraboloids."""
     return Paraboloids(np.full((n, 2), np.nan), np.repeat(np.eye(2)[None], n, axis=0),
                        np.zeros((n, 2)), np.zeros(n), np.zeros(n, bool))
 
 
-def _put(paraboloids: Paraboloids, fitted: Paraboloids,
-         places: NDArray[np.bool_]) -> Paraboloids:
-    """Give the paraboloids with those at some places (N,) bool replaced by fitted ones."""
-    # To take is several times as fast as to put in, of what has several axes.
+def _replaced(paraboloids: Paraboloids, fitted: Paraboloids,
+              places: NDArray[np.bool_]) -> Paraboloids:
+    """Return the paraboloids with those in a mask (N,) replaced by the fitted ones."""
+    # np.take is several times as fast as assignment by a mask for arrays of several axes.
     which = np.arange(len(places))
     which[places] = len(places) + np.arange(len(fitted.c))
     return replace(paraboloids, **{
