@@ -1,4 +1,4 @@
-"""Which points become landmarks: near ones first, spread over the image."""
+"""Choice of points as landmarks: near ones first, spread over the image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
-# Side in pixels of a patch, by which its landmark is told: points nearer than that err alike.
+# Side in pixels of a landmark's patch; errors of points nearer than that are correlated.
 PATCH = 26
 
 # chosen: octaves of depth that count as equally near
@@ -17,13 +17,14 @@ _CLASSES = 2.0
 def choose_landmarks(x: Array, rho: Array, present: Array, side: float, room: int
                      ) -> NDArray[np.int64]:
     """
-    Choose of pixels x (N, 2), with inverse depths rho (N,) > 0, those that become landmarks.
+    Return the indices of the pixels x (N, 2), with inverse depths rho (N,) > 0, to make landmarks.
 
-    present: (M, 2) where there are some; side: of cells, in pixels, and the first in each comes
-    before others; room: for so many. Gives their indices.
+    present: (M, 2) existing landmarks; side: of cells in pixels, each of which gets one landmark
+    before any gets another; room: most to choose.
     """
-    # Near ones tell most, but by their own noisy depths those would be chosen that err most, and
-    # each step come out shorter: by 6 % in 300 small pictures. Others tell where is near.
+    # Near points have the most parallax. Selecting by their own noisy depths would select those
+    # with the largest errors, and bias each step short: by 6 % over 300 small images. So depth is
+    # judged by neighbours.
     nearest = np.argsort(-np.floor(around_patches(x, np.log2(rho)) / _CLASSES), kind='stable')
     cells, taken = (cells_of(points, side) for points in (x[nearest], present))
     rank = rank_in_cells(cells) + np.isin(cells, taken)
@@ -32,9 +33,9 @@ def choose_landmarks(x: Array, rho: Array, present: Array, side: float, room: in
 
 def around_patches(points: Array, values: Array) -> Array:
     """
-    Means (N,) of the values of other points (N, 2) next to each, but beyond its own patch.
+    Return means (N,) of the values of other points (N, 2) around each, outside its own patch.
 
-    The mean of all where there are none.
+    The mean of all if there are none.
     """
     cells = np.floor((points - points.min(0, initial=0.0)) / PATCH).astype(np.int64)
     columns, rows = cells.max(0, initial=0) + 1
@@ -44,7 +45,7 @@ def around_patches(points: Array, values: Array) -> Array:
     total = np.cumsum(np.cumsum(np.pad(sums, ((3, 2), (3, 2), (0, 0))), axis=0), axis=1)
 
     def within(reach: int) -> Array:
-        """Sum up, and count, what is in a square of cells around each of them."""
+        """Return sums and counts over squares of cells around each cell."""
         (x, beyond_x), (y, beyond_y) = (
             (slice(2 - reach, 2 - reach + count), slice(3 + reach, 3 + reach + count))
             for count in (columns, rows))

@@ -1,9 +1,9 @@
 """
-What a window of frames tells of the distortion that its images still have.
+Online estimation of radial distortion that remains in the images, from windows of frames.
 
-A calibration may leave some radial distortion, rectification too: points u = (X/Z, Y/Z) are seen
-at u (1 + k1 |u|^2). On a straight road the poses and depths take it up, but for little; in a turn
-they do not, and as long as it is unknown, lengths of steps come out ever longer or shorter.
+A calibration, and rectification, may leave some radial distortion: points u = (X/Z, Y/Z) appear at
+u (1 + k1 |u|^2). On straight roads poses and depths absorb nearly all of it; in turns they do not,
+and uncorrected it makes lengths of steps drift.
 """
 
 from __future__ import annotations
@@ -14,32 +14,33 @@ from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
 import numpy as np
 
-# chosen: share of its distance from the middle by which a calibration may leave the farthest
-# corner off, as a standard deviation.
+# chosen: prior standard deviation of the distortion, as relative displacement of the farthest
+# corner.
 _LEFT_AT_THE_CORNER = 0.01
 
-# Pixels; chosen: what else may look like a distortion, in all windows alike.
+# Pixels; chosen: standard deviation of a systematic error that looks like distortion in all
+# windows.
 _ALIKE = 0.01
 
-# chosen: no lens is off by k1 alone, so one pattern of points tells another k1 than the next one;
-# as a share of how unsure k1 is at first.
+# chosen: no lens deviates by k1 alone, so each set of points prefers another k1: standard
+# deviation of that, relative to the prior one.
 _ANOTHER = 0.3
 
-# Standard errors, more than usual: it is asked again and again.
+# Standard errors; more than usual, since the test is repeated over and over.
 _CERTAIN = 4.0
 
-# chosen: how much more probable it is beforehand that nothing was left.
+# chosen: prior odds that there is no distortion.
 _RIGHT = 20.0
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
     """
-    What is known of k1.
+    Estimate of k1.
 
-    mean, covariance: (2,) and (2, 2) of k1, if there is any, and of what looks like it in all
-    windows, in pixels; first: standard deviation of k1 before anything was told; undone: k1 that
-    images are seen without by now, and unsure: how unsure it was when that was chosen.
+    mean, covariance: (2,) and (2, 2) of k1, if there is any, and of the systematic error that
+    looks like it, in pixels; first: prior standard deviation of k1; undone: k1 that images are
+    already corrected for, and unsure: its standard deviation when that was chosen.
     """
 
     mean: Array
@@ -50,7 +51,7 @@ class SelfCalibration:
 
     @classmethod
     def unknown(cls, K: Array, shape: tuple[int, ...]) -> SelfCalibration:
-        """Begin with a camera matrix (3, 3) and the shape (H, W) of its images."""
+        """Return the prior for a camera matrix (3, 3) and the shape (H, W) of its images."""
         height, width = shape
         corners = rays(K, np.array([[0, 0], [width, 0], [0, height], [width, height]]))[:, :2]
         first = _LEFT_AT_THE_CORNER / float((corners**2).sum(1).max())
@@ -58,22 +59,22 @@ class SelfCalibration:
 
     @property
     def sigma(self) -> float:
-        """Tell how unsure k1 is, if there is any."""
+        """Return the standard deviation of k1, if there is any distortion."""
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def certain(self) -> bool:
-        """Whether there is a distortion, for certain."""
+        """Return whether the distortion is significant."""
         return abs(float(self.mean[0])) > _CERTAIN * self.sigma
 
     @property
     def k1(self) -> float:
         """
-        Give the coefficient that is to be expected: next to none until it is told for certain.
+        Return the expected coefficient: next to zero until it is significant.
 
-        That there is none has become as much more probable as the density there has grown by what
-        was told (Dickey, Annals of Mathematical Statistics 1971). A k1 that wanders costs more
-        than one that is never known: with each change lengths come out otherwise.
+        The odds of no distortion grow by the ratio of posterior to prior density at zero (Dickey,
+        Annals of Mathematical Statistics 1971). A k1 that fluctuates costs more than one that is
+        never estimated: with each change the lengths of steps change.
         """
         off = float(self.mean[0]) / self.sigma
         none = _RIGHT * self.first / self.sigma * np.exp(-off**2 / 2)
@@ -81,34 +82,34 @@ class SelfCalibration:
 
     @property
     def left(self) -> float:
-        """Give the k1 to be expected in images as they are seen by now."""
+        """Return the expected k1 that remains in images as they are corrected now."""
         return self.k1 - self.undone
 
     @property
     def due(self) -> bool:
         """
-        Whether images are to be seen without another k1 from now on.
+        Return whether images should be corrected with a new k1.
 
-        First where there is one for certain, and then each time that twice as much is known of it:
-        a few times in all, and never back and forth, as it becomes no less sure.
+        First when it becomes significant, then each time its variance has halved: a few times in
+        all, and never back and forth, as the variance never grows.
         """
         if np.isinf(self.unsure):
             return self.certain
         return 2 * self.sigma**2 < self.unsure**2
 
     def straightened(self) -> SelfCalibration:
-        """Give the same where images are seen without the k1 that is to be expected."""
+        """Return the same after images have been corrected for the expected k1."""
         return replace(self, undone=self.k1, unsure=self.sigma)
 
     def told(self, k1: float, variance: float, left: float) -> SelfCalibration:
         """
-        Take in what a window tells, by a Kalman filter.
+        Update the estimate with the result of one window, by a Kalman filter.
 
-        k1: that suits it best in images as they are seen, variance: by the noise of its
-        observations; left: pixels that a k1 of one leaves of itself, in the root mean square,
-        once poses and depths have taken up what they can. Where that is little, as on a straight
-        road, it takes little else to look the same: that is told from k1 by its being larger
-        there than in turns.
+        k1: best for the window in images as they are corrected, variance: from the noise of its
+        observations; left: root mean square, in pixels, of the residuals that a k1 of one leaves
+        after poses and depths have adapted. Where it is small, as on a straight road, a small
+        systematic error has the same effect as a large k1; comparing with turns, where it is not,
+        separates the two.
         """
         row = np.array([1.0, 1 / left])
         noise = variance + (_ANOTHER * self.first)**2

@@ -1,10 +1,10 @@
 """
-Landmarks in a new frame: where their surfaces, and gray levels around these, have them.
+Observation of landmarks in a new frame, by their descriptor surfaces and by patch alignment.
 
-A landmark's surface is sampled where pose and depth let it be expected, seen through the warp that
-they imply from the frame that saw it first, its anchor. The warp is that of a surface that leans
-as depths around the landmark say (`core.slants`): were all taken to face the camera, a road's
-places would be off by up to half a pixel, alike in all.
+The surface of a landmark is sampled where pose and depth predict it, through the warp from its
+anchor (the keyframe that created it). The warp includes the slant of the surface, from depths
+around the landmark (`core.slants`): with fronto-parallel patches, landmarks on a road would be
+biased by up to half a pixel, all in the same direction.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Sighted:
-    """Which landmarks (M,) are seen, at which pixels (M, 2), and roots (M, 2, 2) of how surely."""
+    """Observed landmarks: indices (M,), pixels (M, 2), and roots (M, 2, 2) of their precision."""
 
     which: NDArray[np.int64]
     places: Array
@@ -43,7 +43,7 @@ class Sighted:
 @dataclass(frozen=True)
 class Sighting:
     """
-    Looks for landmarks in the newest of some views, by those that saw them first.
+    Search for landmarks in the newest view, by the views that they are anchored in.
 
     K: (3, 3); views: one for each of the poses.
     """
@@ -55,12 +55,12 @@ class Sighting:
     landmarks: Landmarks
 
     def look(self, reach: int) -> Sighted | None:
-        """Look within a reach in pixels of where landmarks are expected; None where none is."""
+        """Observe landmarks within `reach` pixels of their prediction; None if none is found."""
         here, distances = self.views[-1], self.distances
-        mine, expected, warps = self._expected(reach)
-        # Wide paraboloids say in which direction a minimum lies, but a quarter too far off, as
-        # what undoes the locking is made for close ones: all would swing about where they were
-        # expected. Close ones around it do not.
+        mine, expected, warps = self._predict(reach)
+        # A wide paraboloid finds the direction to the minimum but overshoots by a quarter, since
+        # the correction of pixel locking is made for small windows; landmarks would oscillate
+        # about their prediction. A second, small window around the first estimate does not.
         mine, fits = self._around(mine, warps[mine], expected[mine], reach)
         close = fits.minima()
         good = ~at(here.mask, close) & distances.describable(close, here.tested.shape, CLOSE // 2)
@@ -69,18 +69,18 @@ class Sighting:
         if not len(mine):
             return None
         minima = fits.minima()
-        # As in any least squares, what the best fit leaves over tells the noise.
+        # The residual of a least-squares fit estimates its noise variance.
         left = np.maximum(fits.values(minima), 1e-3)
         places, spread = joined_places(minima, fits.inverses * left[:, None, None],
-                                       self._placed(mine, warps[mine], minima))
+                                       self._aligned(mine, warps[mine], minima))
         halves = np.asarray(np.linalg.cholesky(inverses(spread)), float)
         return Sighted(mine, places, halves.transpose(0, 2, 1))
 
-    def _expected(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
+    def _predict(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
         """
-        Tell which landmarks (M,) to look for, ordered by their anchors.
+        Predict which landmarks (M,) are visible, ordered by their anchors.
 
-        Gives with them where all are expected, (N, 2), and through which warps (N, 3, 2).
+        Also returns the predicted pixels (N, 2) and warps (N, 3, 2) of all landmarks.
         """
         landmarks, newest = self.landmarks, len(self.views) - 1
         places = in_frame(self.K, self.poses, landmarks, newest)
@@ -88,7 +88,7 @@ class Sighting:
         here = self.views[newest]
         wanted = (places[:, 2] > 0) & ~at(here.mask, expected) & self.distances.describable(
             expected, here.tested.shape, reach)
-        # One that neither of the last two frames saw is gone.
+        # A landmark that neither of the last two frames observed is lost.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
         which = np.argsort(landmarks.anchors, kind='stable')
         which = which[wanted[which]]
@@ -104,13 +104,13 @@ class Sighting:
         """
         Sample surfaces of landmarks (M,) around places (M, 2) in the newest view.
 
-        They come ordered by their anchors, for images are sampled one by one, surfaces at once.
-        Gives those that have a minimum within the window, and their paraboloids.
+        Landmarks are ordered by their anchors, since images are sampled one by one. Returns those
+        with a minimum within the window, and their paraboloids.
         """
         if not len(mine):
             return mine, no_paraboloids(0)
-        here, (anchors, counts) = self.views[-1].tested, self._anchored(mine)
-        # Of where they are sampled: that of where they were expected would bend the scale.
+        here, (anchors, counts) = self.views[-1].tested, self._anchor_counts(mine)
+        # Contrast at the sampled places; that at the prediction would bias the scale.
         strengths = self.distances.strengths(here, np.rint(places).astype(np.int64))
         contrasts = contrasts_of(strengths, self.landmarks.strengths[mine], counts)
         references = self.distances.shifted(
@@ -120,15 +120,15 @@ class Sighting:
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 
-    def _placed(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
-        """Tell where gray levels have landmarks (M,), ordered by their anchors, next to places."""
+    def _aligned(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
+        """Align patches of landmarks (M,), ordered by their anchors, from places (M, 2)."""
         images = [(self.views[anchor].gray, count)
-                  for anchor, count in zip(*self._anchored(mine))]
+                  for anchor, count in zip(*self._anchor_counts(mine))]
         return place_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
 
-    def _anchored(self, mine: NDArray[np.int64]
-                  ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Give the anchors of landmarks (M,), which they are ordered by, and how many each has."""
+    def _anchor_counts(self, mine: NDArray[np.int64]
+                       ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the distinct anchors of landmarks (M,), ordered by them, and their counts."""
         counts = np.bincount(self.landmarks.anchors[mine])
         anchors = np.flatnonzero(counts)
         return anchors, counts[anchors]

@@ -1,4 +1,4 @@
-"""How surfaces lean against the image: planes through the inverse depths around points."""
+"""Slants of surfaces against the image plane: planes through inverse depths around points."""
 
 from __future__ import annotations
 
@@ -7,42 +7,44 @@ from djet_ros.core.types import Array
 import numpy as np
 from scipy.spatial import cKDTree
 
-# Pixels up to which a surface is taken to be flat, and how many points there may tell it.
+# Neighbourhood in pixels within which a surface is taken to be flat, and the most points used.
 _REACH, _NEIGHBOURS = 50.0, 16
 
-# chosen: so many points have to lie in the plane, to three standard deviations.
-_FEW = 6
+# chosen: points that have to lie in the plane, within three standard deviations.
+_MIN_POINTS = 6
 
-# chosen: by which share real surfaces are off a plane, and what a slope of inverse depth is that
-# is nothing out of the ordinary, as a share of the depth over the whole reach.
-_BENT, _USUAL = 0.01, 1.0
+# chosen: relative deviation of real surfaces from a plane; and the prior standard deviation of the
+# change of inverse depth over the neighbourhood, relative to it.
+_NONPLANARITY, _PRIOR_SLOPE = 0.01, 1.0
 
-# Shares a pixel beyond which a surface is seen too much from the side; a road is at 0.016.
-_STEEPEST = 0.03
+# Limit of the relative slope of inverse depth, per pixel: beyond it a surface is seen too
+# obliquely. A road is at 0.016.
+_MAX_SLOPE = 0.03
 
 _ROUNDS = 4
 
-# Square of the usual three standard deviations.
-_FITS = 9.0
+# Square of three standard deviations.
+_INLIER = 9.0
 
-# Half the side in pixels of the squares in which all points are told at once, and rounds of that.
-_HALF, _ROUNDS_OF_ALL = 32.0, 3
+# Half the side in pixels of the squares of `slopes_of_all`, and rounds of its robust fit.
+_HALF_SIDE, _SQUARE_ROUNDS = 32.0, 3
 
-# Chi-squared of two degrees of freedom that chance exceeds once in a hundred. What leans by noise
-# alone leans as the pose would have it, be that wrong, and makes patches agree with it.
-_BY_CHANCE = 9.2
+# 99 % quantile of chi-squared with two degrees of freedom: the least significance of a slant. A
+# slant fitted to noise follows the pose that the depths come from, and warps the patches to agree
+# with it, even if it is wrong.
+_SIGNIFICANT = 9.2
 
 
 def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     """
-    Slopes (M, 2) of inverse depth at points (M, 2), a pixel, as shares of the inverse depth there.
+    Return the relative gradient (M, 2) of inverse depth at points (M, 2), per pixel.
 
-    x: (N, 2) other pixels, rho: (N,) inverse depths and sigma: (N,) their standard deviations. The
+    x: (N, 2) other pixels, rho: (N,) their inverse depths and sigma: (N,) standard deviations. The
     inverse depth of a plane is affine in pixels. It is fitted to the neighbours by least squares
-    under a Cauchy loss, so that those beyond an edge count little. Zero, as of a surface that
-    faces the camera, where too few lie in one plane.
+    with a Cauchy loss, which down-weights those beyond a depth edge. Zero, as for a
+    fronto-parallel surface, if too few points lie in one plane.
     """
-    if len(x) < _FEW or not len(points):
+    if len(x) < _MIN_POINTS or not len(points):
         return np.zeros((len(points), 2))
     away, near = cKDTree(x).query(
         points, k=min(_NEIGHBOURS, len(x)), distance_upper_bound=_REACH)
@@ -50,13 +52,13 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     near = np.where(there, near, 0)
     value = rho[near]
     count = np.maximum(there.sum(1), 1)
-    # The lower median of those that are there.
+    # The lower median of the neighbours.
     level = np.take_along_axis(np.sort(np.where(there, value, np.inf), axis=1),
                                (count - 1)[:, None] // 2, axis=1)[:, 0]
     level = np.where(there.any(1), level, 1.0)
     J = np.concatenate([np.ones_like(value)[:, :, None], (x[near] - points[:, None]) / _REACH], 2)
-    trusted = there / (sigma[near]**2 + (_BENT * level[:, None])**2)
-    prior = np.diag([1e-9, 1.0, 1.0]) / (_USUAL * level)[:, None, None]**2
+    trusted = there / (sigma[near]**2 + (_NONPLANARITY * level[:, None])**2)
+    prior = np.diag([1e-9, 1.0, 1.0]) / (_PRIOR_SLOPE * level)[:, None, None]**2
     weights = trusted
     for _ in range(_ROUNDS):
         back = (J * weights[:, :, None]).transpose(0, 2, 1)
@@ -64,71 +66,72 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
         squares = (value - (J @ plane)[:, :, 0])**2 * trusted
         weights = trusted / (1 + squares / 4)
     here, lean = plane[:, 0, 0], plane[:, 1:, 0]
-    flat = ((there & (squares < _FITS)).sum(1) >= _FEW) & (here > 0)
+    flat = ((there & (squares < _INLIER)).sum(1) >= _MIN_POINTS) & (here > 0)
     found = lean / (_REACH * np.where(flat, here, 1.0)[:, None])
-    flat &= np.abs(found).max(1) < _STEEPEST
+    flat &= np.abs(found).max(1) < _MAX_SLOPE
     return np.where(flat[:, None], found, 0.0)
 
 
 def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
     """
-    Slopes (N, 2) of inverse depth at points themselves, pixels x (N, 2), a pixel.
+    Return the gradient (N, 2) of inverse depth, per pixel, at the measured pixels x (N, 2).
 
-    rho, sigma: (N,) inverse depths and their standard deviations; where all are negative, so are
-    slopes. As `slopes`, but with one plane for all points that are next to the middle of a square:
-    squares overlap by half, and are summed up from their quarters. Many points cost a tenth so.
+    rho, sigma: (N,) inverse depths and their standard deviations; if all rho are negative, so are
+    the slopes. As `slopes`, but with one plane for all points near the centre of a square; squares
+    overlap by half, and are summed from their quarters. For many points this takes a tenth of the
+    time.
     """
-    if len(x) < _FEW:
+    if len(x) < _MIN_POINTS:
         return np.zeros((len(x), 2))
-    u, v = x.T / _HALF - np.floor(x.min(0) / _HALF)[:, None]
-    trusted = 1 / np.maximum(sigma**2 + (_BENT * rho)**2, 1e-18)
+    u, v = x.T / _HALF_SIDE - np.floor(x.min(0) / _HALF_SIDE)[:, None]
+    trusted = 1 / np.maximum(sigma**2 + (_NONPLANARITY * rho)**2, 1e-18)
     planes, off, fitting = planes_at(u, v, rho, trusted)
-    found, told = planes[:, 1:3] / _HALF, planes[:, 3]
-    flat = ((off < _FITS) & (fitting >= _FEW) & (told > _BY_CHANCE)
-            & (np.abs(found).max(1) < _STEEPEST * np.abs(rho)))
+    found, told = planes[:, 1:3] / _HALF_SIDE, planes[:, 3]
+    flat = ((off < _INLIER) & (fitting >= _MIN_POINTS) & (told > _SIGNIFICANT)
+            & (np.abs(found).max(1) < _MAX_SLOPE * np.abs(rho)))
     return np.where(flat[:, None], found, 0.0)
 
 
 def planes_at(u: Array, v: Array, rho: Array, trusted: Array) -> tuple[Array, Array, Array]:
     """
-    Fit planes to inverse depths rho (N,) around points at u, v >= 0 (N,), in halves of squares.
+    Fit planes to inverse depths rho (N,) at u, v >= 0 (N,), in half sides of squares.
 
-    trusted: (N,) over the variances of rho. Gives planes (N, 4): their values at u = v = 0, their
-    slopes along both, and by how much these lessen the sum of squares; the squares (N,) by which
-    points are off theirs, in variances; and how many points (N,) of a square fit its plane.
+    trusted: (N,) inverse variances of rho. Returns planes (N, 4): value at u = v = 0, slopes along
+    u and v, and the decrease of the sum of squares by these; the normalised squared residuals (N,)
+    of the points; and the number of points (N,) of each square that fit its plane.
     """
-    usual = _USUAL * _HALF / _REACH
+    usual = _PRIOR_SLOPE * _HALF_SIDE / _REACH
     if compiled.library is not None:
-        return compiled.planes(u, v, rho, trusted, _ROUNDS_OF_ALL, usual)
+        return compiled.planes(u, v, rho, trusted, _SQUARE_ROUNDS, usual)
     squares = _Squares(u, v)
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
     weights = trusted
-    for _ in range(_ROUNDS_OF_ALL):
+    for _ in range(_SQUARE_ROUNDS):
         planes = _planes(squares.sums(weights * terms), usual)[:, squares.which]
         here, along_u, along_v, _ = planes
         off = (rho - here - along_u * u - along_v * v)**2 * trusted
         weights = trusted / (1 + off / 4)
-    fits = (off < _FITS)[None].astype(float)
+    fits = (off < _INLIER)[None].astype(float)
     return planes.T, off, squares.sums(fits)[0, squares.which]
 
 
 class _Squares:
     """
-    Squares with a side of two that overlap by half, and the points (N,) at u, v >= 0 in them.
+    Squares of side two that overlap by half, and the points (N,) at u, v >= 0 in them.
 
-    which: (N,) the square in whose middle each point is, of the S squares that are in use.
+    which: (N,) index of the square whose centre is nearest to each point, among the S in use.
     """
 
     def __init__(self, u: Array, v: Array) -> None:
         columns, rows = u.astype(np.int64), v.astype(np.int64)
-        # One more on each side, so that those at the edges are made of four quarters too.
+        # One more on each side, so that squares at the edges have four quarters too.
         self._shape = int(rows.max()) + 3, int(columns.max()) + 3
         self._quarter = (rows + 1) * self._shape[1] + columns + 1
         middles = np.rint(v).astype(np.int64) * (self._shape[1] - 1) + np.rint(u).astype(np.int64)
         self._used, self.which = np.unique(middles, return_inverse=True)
 
     def sums(self, values: Array) -> Array:
-        """Sum up values (V, N) of the points in each square, (V, S)."""
+        """Sum values (V, N) over the points in each square; returns (V, S)."""
         size = self._shape[0] * self._shape[1]
         places = self._quarter + size * np.arange(len(values))[:, None]
         quarters = np.bincount(places.ravel(), values.ravel(), size * len(values)).reshape(
@@ -142,15 +145,15 @@ def _planes(sums: Array, usual: float) -> Array:
     """
     Fit planes to points, by sums (9, S) of their weights, and of u, v, uu, uv, vv, r, ur, vr.
 
-    r: the values; usual: slopes that are nothing out of the ordinary, as shares of the level.
-    Gives (4, S): values at u = v = 0, slopes along both, and by how much these lessen the sum of
-    squares.
+    r: the values; usual: prior standard deviation of the slopes, relative to the mean value.
+    Returns (4, S): value at u = v = 0, slopes along u and v, and the decrease of the sum of
+    squares by these.
     """
     n, u, v, uu, uv, vv, r, ur, vr = sums
     level = r / n
-    # Of no depth at all, nothing leans.
+    # Without depth there is no slant.
     prior = 1 / np.maximum((usual * level)**2, 1e-18)
-    # The level is eliminated first.
+    # The mean is eliminated first.
     uu, uv, vv = uu - u * u / n + prior, uv - u * v / n, vv - v * v / n + prior
     ur, vr = ur - u * level, vr - v * level
     scale = 1 / (uu * vv - uv**2)
