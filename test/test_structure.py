@@ -373,7 +373,7 @@ def test_where_a_landmark_is_seen_does_not_hang_on_where_it_was_expected(cards):
     for pixels in (-1.0, -0.5, 0.5, 1.0):
         window._poses.R[-1] = rotation_exp(np.array([0.0, pixels / focal, 0.0])) @ R[-1]
         found.seen[:, -1] = False
-        window._measure()
+        window._observe_landmarks()
         both = seen & found.seen[:, -1]
         assert both.sum() > 0.5 * seen.sum()
         moved = (found.minima[both, -1] - before[both])[:, 0]
@@ -390,7 +390,7 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     window = Window(ESTIMATOR, replace(WINDOW_TUNING, landmarks=40))
     window.start(views[0])
     window._append(views[1], wrong, 1.0)
-    window._found(wrong, 1.0)
+    window._create_landmarks(wrong, 1.0)
     at = {tuple(x): factor for x, factor in zip(pair.x, factors)}
     chosen = np.log([at[tuple(x)] for x in window._landmarks.found])
     assert len(chosen) == 40

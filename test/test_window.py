@@ -108,10 +108,10 @@ class NumbersWindow(Window):
             self._which[tuple(new)] = self._which[tuple(old)]
         self._street.k1 -= self.lens.undone
 
-    def _straight(self, view: Any, before: float) -> Any:
+    def _corrected(self, view: Any, before: float) -> Any:
         return view
 
-    def _measure(self) -> None:
+    def _observe_landmarks(self) -> None:
         found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)

@@ -1,20 +1,21 @@
 """
-Least squares over several frames: poses and inverse depths, from paraboloids around observations.
+Bundle adjustment over several frames: poses and inverse depths, from paraboloids at observations.
 
-The paper's joint epipolar tracking has one residual for each match, because with two frames an
-inverse depth can slide along its epipolar line without cost. Where more frames see a landmark,
-each sees it at a minimum y* with curvature A', and the residual has two numbers, the way from y*
-to the projection of the landmark, whitened by A'. Inverse depths are eliminated by the Schur
-complement, so that what is solved is as small as the poses are few.
+The paper's joint epipolar tracking has one residual per match, because with two frames an inverse
+depth can slide along the epipolar line without cost. If more frames observe a landmark, each does
+so at a minimum y* with curvature A', and the residual has two components: the displacement from y*
+to the projection of the landmark, whitened by A'. Landmarks are eliminated by the Schur
+complement, so that the system to solve has the size of the poses.
 
-What is told of a landmark was told by its patch in the frame that saw it first, its anchor, and
-the noise of that patch is in all of its observations. So the place where it was found is an
-observation too: its ray there is free, held by a residual like the others. With the ray fixed the
-depth would have to make up for that noise, and steps would come out ever shorter.
+All observations of a landmark compare with its patch in the anchor, the frame that created it, so
+the noise of that patch is common to them. Therefore the position in the anchor is an observation
+too: the landmark's ray there is free, with a residual like the others. With a fixed ray the depth
+would have to absorb that noise, and steps would be biased short, ever more.
 
-Poses are world to camera, ``X_camera = R X_world + t``, moved from the left: a step (omega,
-upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``. All have one lens, of which a
-calibration may leave some radial distortion: it moves points u = (X/Z, Y/Z) to u (1 + k1 |u|^2).
+Poses are world to camera, ``X_camera = R X_world + t``, perturbed from the left: a step (omega,
+upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``. All frames share one lens,
+whose calibration may leave some radial distortion: it moves points u = (X/Z, Y/Z) to u (1 + k1
+|u|^2).
 """
 
 from __future__ import annotations
@@ -31,28 +32,28 @@ from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
 
-# A landmark that was projected from this near or from behind, in its anchor's depths.
-_NEAREST = 1e-3
+# Least depth of a projection, in units of the landmark's depth in its anchor.
+_MIN_DEPTH = 1e-3
 
-# Pixels beyond which nothing need be told apart; they fit into an integer.
-_FAR_OUT = 1e6
+# Bound of projected pixels; it fits into an integer.
+_MAX_PIXEL = 1e6
 
-# Information that holds a pose where it is.
-_HELD = 1e10
+# Information that fixes a pose.
+_FIXED = 1e10
 
-# Information where there is none, so that what hangs on it can be eliminated.
-_HARDLY = 1e-6
+# Information added where there is none, so that a frame can be eliminated.
+_WEAK = 1e-6
 
-# What is added to the information about an inverse depth, so that there always is some.
-_TRACE = 1e-9
+# Information added to an inverse depth, so that there always is some.
+_DEPTH_INFORMATION = 1e-9
 
-# Information that poses hold on to where observations leave them open, as a share of theirs.
-_OPEN = 1e-7
+# Information added to poses that observations leave undetermined, relative to theirs.
+_GAUGE = 1e-7
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of F frames: R (F, 3, 3), t (F, 3), and the k1 of their lens, see above."""
+    """Poses of F frames: R (F, 3, 3), t (F, 3), and the k1 of their lens, see the module."""
 
     R: Array
     t: Array
@@ -60,41 +61,41 @@ class Poses:
 
     @cached_property
     def between(self) -> tuple[Array, Array]:
-        """Motions from frame a to frame f: R (F, F, 3, 3) and t (F, F, 3), indexed [f, a]."""
+        """Return motions from frame a to frame f: R (F, F, 3, 3), t (F, F, 3), indexed [f, a]."""
         R = np.einsum('fij,akj->faik', self.R, self.R)
         return R, self.t[:, None] - np.einsum('faij,aj->fai', R, self.t)
 
     def camera(self, frame: int) -> Array:
-        """Give a frame's camera in the world, (4, 4)."""
+        """Return the pose of a frame's camera in the world, (4, 4)."""
         camera = np.eye(4)
         camera[:3, :3] = self.R[frame].T
         camera[:3, 3] = -self.R[frame].T @ self.t[frame]
         return camera
 
     def joined(self, R: Array, t: Array) -> Poses:
-        """Give the poses and one more, R (3, 3) and t (3,)."""
+        """Return the poses with one more, R (3, 3) and t (3,)."""
         return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]),
                      self.k1)
 
     def without_frame(self, frame: int) -> Poses:
-        """Give all poses but one."""
+        """Return the poses without a frame."""
         return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0), self.k1)
 
     def moved(self, step: Array) -> Poses:
-        """Give the poses moved by a step (6 F,)."""
+        """Return the poses perturbed by a step (6 F,)."""
         step = step.reshape(-1, 6)
         turns = rotation_exp(step[:, :3])
         return Poses(turns @ self.R, times(turns, self.t) + step[:, 3:], self.k1)
 
     def step_from(self, other: Poses) -> Array:
-        """Give the step (6 F,) that moves other poses to these, to first order."""
+        """Return the step (6 F,) that takes other poses to these, to first order."""
         turns = self.R @ other.R.transpose(0, 2, 1)
         shifts = self.t - np.einsum('fij,fj->fi', turns, other.t)
         return np.concatenate([rotation_log(turns), shifts], axis=1).ravel()
 
 
 class OfPrior(NamedTuple):
-    """What poses cost by a prior, and the slope (6 F,) of that there."""
+    """Cost of poses under a prior, and its gradient (6 F,)."""
 
     cost: float
     slope: Array
@@ -103,9 +104,9 @@ class OfPrior(NamedTuple):
 @dataclass
 class PosePrior:
     """
-    What is known of F poses beside their landmarks.
+    Prior on F poses, in addition to their landmarks.
 
-    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from where they were, `since`.
+    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from the linearisation point `since`.
     """
 
     H: Array
@@ -114,31 +115,31 @@ class PosePrior:
 
     @classmethod
     def holding(cls, pose: Poses) -> PosePrior:
-        """Hold a first pose where it is."""
-        return cls(np.eye(6) * _HELD, np.zeros(6), pose)
+        """Return a prior that fixes the first pose."""
+        return cls(np.eye(6) * _FIXED, np.zeros(6), pose)
 
     def at(self, poses: Poses) -> OfPrior:
-        """Tell what it has some poses cost."""
+        """Return the cost of poses and its gradient."""
         step = poses.step_from(self.since)
         pull = self.H @ step
         return OfPrior(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
-        """Add what is known around poses."""
+        """Add information H, g linearised at `poses`."""
         self.H += H
         self.g += g - H @ poses.step_from(self.since)
 
     def with_frame(self, R: Array, t: Array) -> PosePrior:
-        """Give the same with one more pose, of which nothing is known."""
+        """Return the prior with one more pose, without information on it."""
         return PosePrior(np.pad(self.H, (0, 6)), np.pad(self.g, (0, 6)), self.since.joined(R, t))
 
     def without_frame(self, frame: int) -> PosePrior:
-        """Give what is known of the others, a frame eliminated."""
+        """Return the prior with a frame marginalised out."""
         gone = np.zeros(len(self.H), bool)
         gone[6 * frame:6 * frame + 6] = True
         own, others = self.H[np.ix_(gone, gone)], self.H[np.ix_(~gone, gone)]
-        # Of a frame that a mere turn led to, nothing may be known but its rotation.
-        own = own + np.diag(1e-9 * np.diag(own) + _HARDLY)
+        # After a pure rotation, only the rotation of a frame may be constrained.
+        own = own + np.diag(1e-9 * np.diag(own) + _WEAK)
         gain = np.linalg.solve(own, others.T).T
         H = self.H[np.ix_(~gone, ~gone)] - gain @ others.T
         return PosePrior((H + H.T) / 2, self.g[~gone] - gain @ self.g[gone],
@@ -148,15 +149,15 @@ class PosePrior:
 @dataclass
 class Landmarks:
     """
-    N landmarks, and what F frames saw of them.
+    N landmarks, and their observations by F frames.
 
-    anchors: (N,) frames that saw them first; found: (N, 2) pixels there, around which their
-    patches lie; held: (N, 2, 2) roots of the precision of these; points: (N, 2) pixels there
-    where they would be seen without k1; rho: (N,) inverse depths there; slopes: (N, 2) by which
-    share these change around them, a pixel; strengths: (N,) how much their patches differ from
-    pixel to pixel; sightings: (N,) how often they were seen since, by frames that are gone too;
-    minima: (N, F, 2) pixels y*; roots: (N, F, 2, 2) of their precision, so that
-    ``root (y - y*)`` is white; seen: (N, F) where the last two mean anything.
+    anchors: (N,) frames that created them; found: (N, 2) pixels there, the centres of their
+    patches; held: (N, 2, 2) roots of the precision of these; points: (N, 2) estimated pixels
+    there, undistorted; rho: (N,) inverse depths there; slopes: (N, 2) relative slopes of the
+    inverse depth around them, per pixel; strengths: (N,) texture strengths of their patches;
+    sightings: (N,) numbers of observations, also by frames since removed; minima: (N, F, 2) pixels
+    y*; roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F)
+    whether the last two are valid.
     """
 
     anchors: NDArray[np.int64]
@@ -178,9 +179,9 @@ class Landmarks:
     def at(cls, found: Array, rho: Array, anchor: int, frames: int, points: Array | None = None,
            slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
         """
-        Make landmarks that no other frame has seen yet.
+        Create landmarks without observations.
 
-        Without points they are seen through no k1; without slopes they face the camera.
+        Without points there is no k1; without slopes the surfaces are fronto-parallel.
         """
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), found, np.zeros((n, 2, 2)),
@@ -191,40 +192,40 @@ class Landmarks:
                    np.zeros((n, frames), bool))
 
     def of(self, chosen: NDArray[np.bool_]) -> Landmarks:
-        """Give some of the landmarks."""
-        # To take is three to six times as fast as to index, of whatever has several axes.
+        """Return a subset of the landmarks."""
+        # np.take is three to six times as fast as indexing for arrays of several axes.
         places = np.flatnonzero(chosen)
         return Landmarks(*(array.take(places, axis=0) for array in vars(self).values()))
 
     def joined(self, other: Landmarks) -> Landmarks:
-        """Give these landmarks and others of the same frames."""
+        """Return these landmarks and others of the same frames."""
         return Landmarks(*(np.concatenate(pair) for pair in zip(
             vars(self).values(), vars(other).values(), strict=True)))
 
     def with_frame(self) -> Landmarks:
-        """Give the same with room for what one more frame sees."""
+        """Return the landmarks with room for the observations of one more frame."""
         return Landmarks(*self._by_anchor(), *(
             np.concatenate([array, np.zeros_like(array[:, :1])], axis=1)
             for array in self._by_frame()))
 
     def without_frame(self, frame: int) -> Landmarks:
-        """Give those that are anchored elsewhere, without what a frame saw."""
+        """Return the landmarks with other anchors, without the observations of a frame."""
         left = self.of(self.anchors != frame)
         return Landmarks(left.anchors - (left.anchors > frame), *left._by_anchor()[1:],
                          *(np.delete(array, frame, axis=1) for array in left._by_frame()))
 
     def moved(self, step: Array) -> Landmarks:
-        """Give the landmarks moved by a step (N, 3) of their inverse depths and points."""
+        """Return the landmarks moved by a step (N, 3) of their inverse depths and points."""
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
 
     def seen_otherwise(self, K: Array, before: float, after: float) -> Landmarks:
         """
-        Give them as images without a k1 show them, that were seen without another before.
+        Convert observations in images corrected for one k1 to images corrected for another.
 
-        Their points stay: they are without all of it.
+        The points do not change: they are undistorted.
         """
         def moved(pixels: Array) -> tuple[Array, Array]:
-            """Pixels (N, 2) in the other image, and how the former ones change by those."""
+            """Return pixels (N, 2) in the new image, and Jacobians of the old by the new ones."""
             straight = straightened(K, bent(K, pixels, before), after)
             u = rays(K, straight)[:, :2]
             back = bending(K, rays(K, pixels)[:, :2], before)
@@ -247,7 +248,7 @@ class Landmarks:
 
 
 def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
-    """Give places (N, 3) of landmarks in a frame, times their inverse depths in their anchors."""
+    """Return landmarks (N, 3) in a frame, times their inverse depths in their anchors."""
     R, t = poses.between
     turned = R[frame, landmarks.anchors]
     places = times(turned, rays(K, landmarks.points))
@@ -255,9 +256,9 @@ def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
 
 
 def projected(K: Array, places: Array, k1: float = 0.0) -> Array:
-    """Project places (N, 3) in a camera to pixels (N, 2); what is behind it goes far out."""
-    u = places[:, :2] / np.maximum(places[:, 2:], _NEAREST)
-    return np.clip((u * stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_FAR_OUT, _FAR_OUT)
+    """Project points (N, 3) in a camera to pixels (N, 2); those behind it are moved far out."""
+    u = places[:, :2] / np.maximum(places[:, 2:], _MIN_DEPTH)
+    return np.clip((u * stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_MAX_PIXEL, _MAX_PIXEL)
 
 
 @dataclass(frozen=True)
@@ -266,9 +267,10 @@ class Observed:
     M observations of N landmarks: see ``observe``.
 
     landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); off: (N, 2) residuals of
-    the points, held: (N, 2, 2) roots of their precision. R (M, 3, 3), t (M, 3), ray (M, 3), rho
-    (M,): motion from the anchor to the frame, and the landmark there; place (M, 3): R ray + rho t;
-    root: (M, 2, 2) of the precision; straight: (N, 2) X/Z, Y/Z of the points.
+    the points in their anchors, held: (N, 2, 2) roots of their precision. R (M, 3, 3), t (M, 3),
+    ray (M, 3), rho (M,): motion from the anchor to the frame, and the landmark in the anchor;
+    place (M, 3): R ray + rho t; root: (M, 2, 2) of the precision; straight: (N, 2) X/Z, Y/Z of the
+    points.
     """
 
     landmark: NDArray[np.int64]
@@ -289,7 +291,7 @@ class Observed:
 
 
 def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
-    """Take the residuals of all observations, in the unit of their roots."""
+    """Return the residuals of all observations, whitened by their roots of precision."""
     landmark, frame = np.nonzero(landmarks.seen)
     if compiled.library is not None:
         anchor, (residuals, off, straight, *at_places) = compiled.observe(
@@ -312,18 +314,18 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
 
 
 def _tuning(k1: float) -> tuple[float, ...]:
-    """Give what a lens is told by, and what projections are held to, compiled."""
-    return k1, _NEAREST, FARTHEST, _FAR_OUT
+    """Return k1 and the limits of projections, as compiled code takes them."""
+    return k1, _MIN_DEPTH, FARTHEST, _MAX_PIXEL
 
 
 @dataclass(frozen=True)
 class Jacobians:
     """
-    How the residuals of M observations and N points change: see ``jacobians``.
+    Jacobians of the residuals of M observations and N points: see ``jacobians``.
 
-    by_frame, by_anchor: (M, 2, 6) over the steps of the two poses; by_own: (M, 2, 3) over those of
-    the landmark's inverse depth and point; by_k1: (M, 2). Those of the points over their own steps
-    (N, 2, 2), and over k1 (N, 2).
+    by_frame, by_anchor: (M, 2, 6) by the steps of the two poses; by_own: (M, 2, 3) by those of the
+    landmark's inverse depth and point; by_k1: (M, 2). Those of the points by their own steps (N,
+    2, 2), and by k1 (N, 2).
     """
 
     by_frame: Array
@@ -334,39 +336,39 @@ class Jacobians:
     points_by_k1: Array
 
 
-def _seen(observed: Observed) -> Array:
-    """X/Z, Y/Z (M + N, 2) of observations and points, as they would be seen without k1."""
-    ahead = np.maximum(observed.place[:, 2:], _NEAREST)
+def _undistorted(observed: Observed) -> Array:
+    """Return the undistorted X/Z, Y/Z (M + N, 2) of observations and points."""
+    ahead = np.maximum(observed.place[:, 2:], _MIN_DEPTH)
     return np.concatenate([observed.place[:, :2] / ahead, observed.straight])
 
 
-def _through_the_lens(observed: Observed) -> tuple[Array, Array]:
-    """Give how residuals (M, 2, 2) and (N, 2, 2) move with pixels that k1 has not moved yet."""
+def _by_undistorted(observed: Observed) -> tuple[Array, Array]:
+    """Return the Jacobians of residuals (M, 2, 2) and (N, 2, 2) by undistorted pixels."""
     roots = np.concatenate([observed.root, observed.held])
-    turned = roots @ bending(observed.K, _seen(observed), observed.k1)
+    turned = roots @ bending(observed.K, _undistorted(observed), observed.k1)
     return turned[:len(observed.root)], turned[len(observed.root):]
 
 
-def _over_k1(observed: Observed) -> tuple[Array, Array]:
-    """Give how residuals of observations (M, 2) and of points (N, 2) move with k1."""
-    u = _seen(observed)
+def _by_k1(observed: Observed) -> tuple[Array, Array]:
+    """Return the derivatives by k1 of the residuals of observations (M, 2) and points (N, 2)."""
+    u = _undistorted(observed)
     moved = (u * (u * u).sum(1, keepdims=True)) @ observed.K[:2, :2].T
     count = len(observed.root)
     return times(observed.root, moved[:count]), times(observed.held, moved[count:])
 
 
 def jacobians(observed: Observed) -> Jacobians:
-    """Differentiate the residuals of observations and of points."""
+    """Return the analytic Jacobians of the residuals of observations and points."""
     K, R, place, ray = observed.K, observed.R, observed.place, observed.ray
-    root, points_by_own = _through_the_lens(observed)
-    scaled = root @ K[:2, :2] / np.maximum(place[:, 2], _NEAREST)[:, None, None]
-    # Of the projection: d(x / z) = (dx - x / z dz) / z.
-    ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _NEAREST)
+    root, points_by_own = _by_undistorted(observed)
+    scaled = root @ K[:2, :2] / np.maximum(place[:, 2], _MIN_DEPTH)[:, None, None]
+    # Projection: d(x / z) = (dx - x / z dz) / z.
+    ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _MIN_DEPTH)
     by_place = np.concatenate([scaled, ahead[:, :, None]], axis=2)
     by_turned = by_place @ R
     weight = observed.rho[:, None, None]
     by_frame, by_anchor = np.empty((2, len(place), 2, 6))
-    # Of a turn about omega: d(X) = omega x X, and a . (omega x X) = omega . (X x a).
+    # Rotation by omega: d(X) = omega x X, and a . (omega x X) = omega . (X x a).
     _cross(place[:, None], by_place, by_frame[:, :, :3])
     _cross(by_turned, ray[:, None], by_anchor[:, :, :3])
     np.multiply(by_place, weight, out=by_frame[:, :, 3:])
@@ -374,12 +376,12 @@ def jacobians(observed: Observed) -> Jacobians:
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
     np.matmul(by_turned, inverse_of(K)[:, :2], out=by_own[:, :, 1:])
-    by_k1, points_by_k1 = _over_k1(observed)
+    by_k1, points_by_k1 = _by_k1(observed)
     return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
 
 
 def _cross(a: Array, b: Array, out: Array) -> None:
-    """Put cross products into an array (…, 3): components first, which is cheaper."""
+    """Write cross products to an array (…, 3): components first, which is cheaper."""
     (a1, a2, a3), (b1, b2, b3) = (np.moveaxis(v, -1, 0) for v in (a, b))
     out[..., 0] = a2 * b3 - a3 * b2
     out[..., 1] = a3 * b1 - a1 * b3
@@ -388,13 +390,13 @@ def _cross(a: Array, b: Array, out: Array) -> None:
 
 def noise_scale(observed: Observed) -> float:
     """
-    Tell the standard deviation of observations in the unit of their roots, robustly.
+    Return the robust standard deviation of observations in the unit of their roots.
 
-    A landmark that m frames saw beside its anchor has 2 m + 2 residuals, and its inverse depth and
-    point make up for three of them: what is left over has the squares of 2 m - 1 degrees of
-    freedom. Without that, landmarks that were just found, which can make up for nearly all, would
-    let the noise seem to be little more than half of what it is, and what errs by no more than
-    usual be taken for false. What poses make up for is neglected. At least one observation.
+    A landmark that m frames observe besides its anchor has 2 m + 2 residuals and three parameters,
+    so 2 m - 1 degrees of freedom. Without that correction, new landmarks, whose parameters absorb
+    nearly all residuals, would make the noise seem little more than half as large, and ordinary
+    errors would be rejected as outliers. The parameters of poses are neglected. Needs at least one
+    observation.
     """
     count = np.bincount(observed.landmark, minlength=len(observed.off))
     squares = (observed.off**2).sum(1) + np.bincount(
@@ -406,7 +408,7 @@ def noise_scale(observed: Observed) -> float:
 
 
 class OfK1(NamedTuple):
-    """What observations tell of k1, all else free: its information, and the step to the best."""
+    """Marginal information of k1, and its Newton step."""
 
     curvature: float
     step: float
@@ -417,8 +419,8 @@ class Reduced:
     """
     Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
 
-    Those of k1 before them in the whole, where it is asked for. change gives what becomes of the
-    landmarks with a step of the poses.
+    If k1 is a parameter, it comes before the poses in the whole. `change` back-substitutes the
+    landmarks.
     """
 
     _whole: Array
@@ -430,29 +432,29 @@ class Reduced:
 
     @property
     def H(self) -> Array:
-        """Give (6 F, 6 F), at a k1 that is known."""
+        """Return the Hessian (6 F, 6 F) over the poses, given k1."""
         return self._whole[self._lens:, self._lens:]
 
     @property
     def g(self) -> Array:
-        """Give (6 F,)."""
+        """Return the gradient (6 F,) over the poses."""
         return self._gradient[self._lens:]
 
     def of_k1(self) -> OfK1:
         """
-        Take out the poses too, as if nothing else were known of them, and leave k1.
+        Marginalise the poses too, without any prior on them, and return the information on k1.
 
-        It has to be among the equations.
+        k1 has to be among the parameters.
         """
         row, H = self._whole[0, 1:], self.H
-        # Where all is, and how large, is open and does not matter.
-        gain = np.linalg.solve(H + np.diag(_OPEN * np.diag(H) + _HARDLY), row)
+        # Position and scale are gauge freedoms.
+        gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), row)
         curvature = float(self._whole[0, 0] - gain @ row)
         slope = float(self._gradient[0] - gain @ self.g)
         return OfK1(curvature, -slope / curvature if curvature > 0 else 0.0)
 
     def change(self, step: Array) -> Array:
-        """Give the steps (N, 3) of landmarks that go with a step (6 F,) of the poses."""
+        """Return the steps (N, 3) of the landmarks for a step (6 F,) of the poses."""
         return np.asarray(-np.einsum('nij,nj->ni', self._variances,
                                      self._slopes + self._coupling[:, :, self._lens:] @ step))
 
@@ -460,10 +462,10 @@ class Reduced:
 def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
               lens: bool = False) -> Reduced:
     """
-    Sum up observations, and eliminate the landmarks.
+    Sum the normal equations of observations, and eliminate the landmarks.
 
-    weights: (M,) of the observations; weight: that of where the landmarks were found; lens:
-    whether k1 is among the equations, or taken as it is.
+    weights: (M,) of the observations; weight: of the residuals in the anchors; lens: whether k1 is
+    a parameter, or fixed.
     """
     if compiled.library is not None:
         o = observed
@@ -471,7 +473,7 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
             (o.landmark, o.frame, o.anchor),
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
             (o.straight, o.held, o.off, weight), lens, (o.K, inverse_of(o.K)), _tuning(o.k1),
-            _TRACE, frames), lens)
+            _DEPTH_INFORMATION, frames), lens)
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]
@@ -486,7 +488,7 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     flat = J.reshape(-1, size)
     H, g = flat.T @ flat, flat.T @ e.ravel()
     own, by_lens = linear.points_by_own, linear.points_by_k1
-    information, slopes = np.tile(np.eye(3) * _TRACE, (n, 1, 1)), np.zeros((n, 3))
+    information, slopes = np.tile(np.eye(3) * _DEPTH_INFORMATION, (n, 1, 1)), np.zeros((n, 3))
     transposed = own.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ own
     slopes[:, 1:] = times(transposed, observed.off)
@@ -496,7 +498,7 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
         H[0, 0] += weight * (by_lens * by_lens).sum()
         g[0] += weight * (by_lens * observed.off).sum()
     if count:
-        # Each landmark is seen once by a frame, and has one anchor.
+        # Each frame observes a landmark once, and each landmark has one anchor.
         coupling[observed.landmark, observed.frame] = back @ by_frame
         first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
         seen, anchor = observed.landmark[first], observed.anchor[first]

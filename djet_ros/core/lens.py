@@ -1,16 +1,16 @@
 """
-What a calibration leaves of a lens's distortion, told by the epipolar lines of many pairs.
+Estimation of residual lens distortion from the epipolar lines of many pairs.
 
-The pose of a pair takes up most of what a wrong coefficient k1 does to its matches. What remains
-are distances from epipolar lines, in pairs whose motion carries points across the image: turns,
-above all. k1 is found from all pairs together by least squares, each with a pose of its own:
+The pose of a pair absorbs most of the effect of a wrong coefficient k1 on its matches. The rest
+shows as distances from epipolar lines, above all where the camera rotates and points move across
+the image. k1 is estimated from all pairs jointly by least squares, each with its own pose:
 
     min over k1 and all (R, t) of   sum over pairs and matches of rho(r^2).
 
 The poses are eliminated from the normal equations (variable projection; Golub and Pereyra, Inverse
-Problems 2003). r is the distance in pixels of the images as they come. Among undistorted points it
-would not do: a coefficient that shrinks the image shrinks all distances there, and noise alone
-would seem to tell one.
+Problems 2003). r is the distance in pixels of the original images. Distances between undistorted
+points would be biased: a coefficient that shrinks the image shrinks all of them, and would be
+preferred on noise alone.
 """
 
 from __future__ import annotations
@@ -38,76 +38,72 @@ from djet_ros.core.starts import thinned
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 
-# Matches of a pair that are kept, evenly among the surest and the least sure.
+# Most matches of a pair, evenly sampled.
 MOST_MATCHES = 300
 
-# chosen: of a distortion's pixels, what a pair's pose has to leave over for the pair to take part.
-# On straight roads, where it is less, what is wrong otherwise looks like a distortion.
+# chosen: least share of a distortion's displacement in pixels that the pair's pose leaves over,
+# for the pair to be used. On straight roads, where it is less, other errors look like distortion.
 LEAST_SHARE = 0.005
 
-# chosen: times that parallax has to exceed noise, twice what makes it be believed at all. Where it
-# does not, a way sideways passes for a turn, and a distortion makes it pass better.
-_OUT_OF_NOISE = 6.0
+# chosen: least ratio of parallax to noise, twice that for which a translation is accepted. Below,
+# a sideways translation passes for a rotation, and better so with a distortion.
+_MIN_PARALLAX_RATIO = 6.0
 
-# chosen: rounds, of which three are enough where k1 is small; and what k1 may still move in the
-# last one, in standard errors. It may tremble by half of that, as each tells the noise anew.
+# chosen: rounds, of which three are enough for small k1; and the step of k1, in standard errors,
+# below which it has converged. It may fluctuate by half of that, as each round estimates the noise
+# anew.
 _ROUNDS, _SETTLED = 20, 0.1
 
-# What a step of k1 may move the outermost matches by, as a share of their distance from the
-# middle. Without distortion, -k1 r^2 = 4/27 folds the image there; a step is a quarter of that.
-_LONGEST = 1 / 27
+# Largest displacement of the outermost matches by one step of k1, relative to their radius. The
+# image folds where -k1 r^2 = 4/27; a step is a quarter of that.
+_MAX_STEP = 1 / 27
 
-# Newton's steps to a point that a lens shows at a pixel, from where it is by the calibration:
-# three are enough far from a fold. They end with steps of so little in X/Z, and have arrived where
-# the pixel is met.
-_INVERSIONS, _NEXT_TO_NOTHING, _MET = 12, 1e-10, 1e-6
+# Newton iterations of the undistortion, started at the calibrated point: three are enough far from
+# a fold. They end with steps of so little in X/Z, and have converged if the pixel is met within
+# the last value.
+_INVERSIONS, _STEP_TOLERANCE, _PIXEL_TOLERANCE = 12, 1e-10, 1e-6
 
-# Distances are taken to first order. Over so large a share of the radius, the area that a pixel
-# sees may grow by a quarter at most: half of that is by what such a distance is off.
-_FARTHER, _EVEN = 0.01, 1.25
+# Distances are first-order, so the area that a pixel covers may grow at most by this factor over
+# this share of the radius; half of that is the relative error of such a distance.
+_RADIUS_SHARE, _MAX_AREA_RATIO = 0.01, 1.25
 
-# Step of k1 by which residuals are differentiated.
-_STEP = 1e-4
+# Step of k1 for numerical derivatives.
+_DERIVATIVE_STEP = 1e-4
 
-# Robust standard deviations where the loss bends, as in the odometry.
-_BEND = 3.0
+# Scale of the robust loss in standard deviations, as in the odometry.
+_LOSS_SCALE = 3.0
 
-# Pixels; matches that are off by less are exact, and must not divide by nothing.
+# Pixels; lower bound of the noise, for exact matches.
 _LEAST_NOISE = 1e-4
 
-# chosen: what an image's sampling, its lens and its rolling rows shift all that is seen in a large
-# cell by, in all pairs alike, as a share of the noise of a match.
+# chosen: systematic displacement of all points in a large cell of the image, by sampling, lens and
+# rolling shutter, the same in all pairs, relative to the noise of a match.
 SHIFT = 0.12
 
-# Groups of pairs in a row of which the jackknife leaves out one at a time.
+# Groups of consecutive pairs for the jackknife.
 _GROUPS = 10
 
-# Pairs that a standard error needs at least.
-_FEW = 5
+# Least number of pairs for a standard error.
+_MIN_PAIRS = 5
 
 
 class Lens(Protocol):
-    """A camera whose first coefficient of radial distortion may be another."""
+    """A camera with a free first coefficient of radial distortion."""
 
     @property
     def k1(self) -> float:
-        """Give the coefficient as it was calibrated."""
+        """Return the calibrated coefficient."""
 
     def pixels(self, places: Array, k1: float) -> tuple[Array, Array]:
-        """
-        Project points X/Z, Y/Z (N, 2).
-
-        Gives pixels (N, 2), and how these move with the points (N, 2, 2).
-        """
+        """Project points X/Z, Y/Z (N, 2); return pixels (N, 2) and their Jacobians (N, 2, 2)."""
 
 
 @dataclass(frozen=True)
 class MatchedPair:
     """
-    Matches of two views, and about where the camera went between them.
+    Matches of two views with an approximate pose.
 
-    x, y: (N, 2) points X/Z, Y/Z, undistorted as the calibration has it; pose: the motion from x
-    to y.
+    x, y: (N, 2) points X/Z, Y/Z, undistorted with the calibration; pose: the motion from x to y.
     """
 
     x: Array
@@ -117,9 +113,9 @@ class MatchedPair:
     @classmethod
     def of(cls, relative: RelativePose, K: Array) -> MatchedPair:
         """
-        Take what the odometry found in undistorted images with a camera matrix K (3, 3).
+        Return matches of the odometry, in undistorted images with a camera matrix K (3, 3).
 
-        Uses ``placed``, which is measured without the epipolar line. Takes all voting matches:
+        Uses ``placed``, which is measured without the epipolar line, and all voting matches:
         inliers were selected with the calibration under test.
         """
         voting = np.flatnonzero(relative.voting)
@@ -129,18 +125,18 @@ class MatchedPair:
 
     @property
     def angle(self) -> float:
-        """By how much the camera turned, in rad."""
+        """Return the rotation angle in rad."""
         return float(np.linalg.norm(rotation_log(self.pose.R)))
 
 
 class Linearised(NamedTuple):
     """
-    A pair about some k1, once its pose is eliminated.
+    A pair linearised at some k1, its pose eliminated.
 
-    share: how much of a distortion its pose can't take up, as residuals over the pixels by which
-    matches move; noise: robust standard deviation in pixels of what no k1 explains; by_match:
-    (2, N): second and first derivative of half the loss by k1, over noise^2; pulls: (N, 2) by how
-    much the first derivative changes where a match is seen farther in x and y by the noise.
+    share: of a distortion that the pose can't absorb: residuals over the pixels by which matches
+    move; noise: robust standard deviation, in pixels, of residuals that k1 does not explain;
+    by_match: (2, N) second and first derivative of half the loss by k1, over noise^2; pulls: (N,
+    2) change of the first derivative when a match moves in x and y by the noise.
     """
 
     pair: MatchedPair
@@ -153,11 +149,11 @@ class Linearised(NamedTuple):
 @dataclass(frozen=True)
 class LensFit:
     """
-    The coefficient k1 that suits all pairs best, and its standard error.
+    Least-squares k1 over all pairs, with its standard error.
 
-    about: a k1 next to it; linearised: the pairs about that; disagreement: by how many standard
-    errors the more informative pairs differ from the others. Noise does not make them; something
-    that is the same in many pairs, and is no k1, is larger in those that are less informative.
+    about: the linearisation point; linearised: the pairs there; disagreement: difference between
+    the more informative pairs and the others in standard errors. It is large if an effect that is
+    common to many pairs, and not distortion, dominates the less informative ones.
     """
 
     k1: float
@@ -168,18 +164,18 @@ class LensFit:
 
     @property
     def noise(self) -> float:
-        """Give the usual distance of matches from their epipolar lines, in pixels."""
+        """Return the median distance of matches from their epipolar lines, in pixels."""
         return float(np.median([one.noise for one in self.linearised]))
 
 
 def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
     """
-    Find k1 from pairs in the order of their recording, twice _FEW or more.
+    Estimate k1 from at least twice _MIN_PAIRS pairs, in the order of their recording.
 
-    None where steps lead to where the image folds, or go on and on.
+    None if the steps approach a fold of the image or do not converge.
     """
     rim, k1 = outermost(pairs), lens.k1
-    if not _is_even(rim, lens, k1):
+    if not _is_far_from_fold(rim, lens, k1):
         return None
     for _ in range(_ROUNDS):
         linearised = [linearise(pair, lens, k1) for pair in pairs]
@@ -190,27 +186,27 @@ def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
         if abs(step) < _SETTLED * sigma:
             return LensFit(k1 + step, sigma, k1, tuple(linearised), _disagreement(linearised))
         pairs = [one.pair for one in linearised]
-        k1 += _shortened(step, rim, lens, k1)
+        k1 += _limited(step, rim, lens, k1)
     return None
 
 
 def outermost(pairs: Sequence[MatchedPair]) -> Array:
-    """Give the points X/Z, Y/Z (2P, 2) farthest from the middle in both views of P pairs."""
+    """Return the points X/Z, Y/Z (2P, 2) with the largest radius in both views of P pairs."""
     return np.array([points[np.argmax((points**2).sum(1))]
                      for pair in pairs for points in (pair.x, pair.y)])
 
 
 def displacements(places: Array, lens: Lens, k1: float) -> Array:
-    """By how many pixels (N,) points (N, 2) move over k1."""
-    more, less = (lens.pixels(places, k1 + way)[0] for way in (_STEP, -_STEP))
-    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _STEP))
+    """Return the pixels (N,) by which points (N, 2) move per unit of k1."""
+    more, less = (lens.pixels(places, k1 + way)[0] for way in (_DERIVATIVE_STEP, -_DERIVATIVE_STEP))
+    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _DERIVATIVE_STEP))
 
 
 def by_radius(fit: LensFit, edges: Array) -> Array:
     """
-    Give k1 and its standard error (2, B) by matches between two radii X/Z of edges (B + 1,) each.
+    Return k1 and its standard error (2, B) by the matches of each range of radii.
 
-    All else is as it was fitted. NaN where there are none.
+    edges: (B + 1,) radii X/Z. All else is as fitted. NaN if there are too few.
     """
     rows = []
     for inner, outer in pairwise(edges):
@@ -219,61 +215,61 @@ def by_radius(fit: LensFit, edges: Array) -> Array:
         curvature, gradient = np.array([sums for sums in chosen if sums[0] > 0]).reshape(-1, 2).T
         rows.append([fit.about - gradient.sum() / curvature.sum(),
                      _standard_error(curvature, gradient)]
-                    if len(curvature) >= _FEW else [np.nan, np.nan])
+                    if len(curvature) >= _MIN_PAIRS else [np.nan, np.nan])
     return np.array(rows).T
 
 
 def is_informative(pair: MatchedPair, lens: Lens) -> bool:
-    """Whether a pair's pose leaves enough of a k1 to be seen, by the calibration at hand."""
+    """Return whether a pair, linearised at the calibrated k1, determines k1 beyond its noise."""
     linearised = linearise(pair, lens, lens.k1)
     return (linearised.share > LEAST_SHARE
-            and _parallax(pair, lens) > _OUT_OF_NOISE * linearised.noise)
+            and _parallax(pair, lens) > _MIN_PARALLAX_RATIO * linearised.noise)
 
 
 def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
-    """Linearise a pair about some k1, at its own best pose there."""
+    """Linearise a pair at some k1, with its pose refined for that k1."""
     problem, by_pixel = _problem(pair, lens, k1)
     R, t = pair.pose.R, pair.pose.t
     noise = max(core_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
-    loss = Loss('geman_mcclure', _BEND * noise)
+    loss = Loss('geman_mcclure', _LOSS_SCALE * noise)
     solution = minimise(problem, R, t, loss)
     r = solution.residuals.r
     weights = loss(r * r)[1]
-    left = _left_over(pair, lens, k1, solution, weights)
+    left = _unabsorbed(pair, lens, k1, solution, weights)
     squares = np.stack([left * left, left * r]) * weights
     by_own_k1 = r - left * (squares[1].sum() / max(squares[0].sum(), 1e-300))
-    # A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6): two
-    # thirds of that with normal noise.
+    # The second derivative of a robust loss is below its weights (Huber, Robust Statistics,
+    # section 7.6): two thirds of them for normal noise.
     squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), LEAST_CURVED)
     moved = displacements(problem.rays_y[:2].T, lens, k1)
     share = np.sqrt((weights * left * left).sum() / max((weights * moved * moved).sum(), 1e-300))
-    pulls = (weights * left / noise)[:, None] * _across(problem, solution, by_pixel)
+    pulls = (weights * left / noise)[:, None] * _across_lines(problem, solution, by_pixel)
     return Linearised(replace(pair, pose=solution.pose), float(share), core_scale(by_own_k1),
                       squares / noise**2, pulls)
 
 
-def _left_over(pair: MatchedPair, lens: Lens, k1: float, solution: Solution, weights: Array
-               ) -> Array:
-    """By how many pixels (N,) residuals move over k1, as far as the pose can't follow."""
+def _unabsorbed(pair: MatchedPair, lens: Lens, k1: float, solution: Solution, weights: Array
+                ) -> Array:
+    """Return derivatives (N,) of residuals by k1, in pixels, orthogonal to those by the pose."""
     more, less = (epipolar_residuals(_problem(pair, lens, k1 + way)[0], solution.R, solution.t).r
-                  for way in (_STEP, -_STEP))
-    by_k1, J = (more - less) / (2 * _STEP), solution.residuals.jacobian
+                  for way in (_DERIVATIVE_STEP, -_DERIVATIVE_STEP))
+    by_k1, J = (more - less) / (2 * _DERIVATIVE_STEP), solution.residuals.jacobian
     weighed = J * weights
     followed = np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0]
     return np.asarray(by_k1 - followed @ J)
 
 
-def _across(problem: JetProblem, solution: Solution, by_pixel: Array) -> Array:
-    """Directions (N, 2) in the image across the epipolar lines."""
+def _across_lines(problem: JetProblem, solution: Solution, by_pixel: Array) -> Array:
+    """Return the directions (N, 2) across the epipolar lines, in the image."""
     lines = essential(solution.R, solution.t) @ problem.rays_x
     return unit(np.einsum('kn,nki->ni', lines[:2], by_pixel))
 
 
 def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Array]:
     """
-    Pose the pair's problem at some k1, with noise of a pixel in y as it comes.
+    Set up the pair's problem at some k1, with unit noise of the original pixels of y.
 
-    Also gives how points y move with the pixels at which they are seen, (N, 2, 2).
+    Also returns the Jacobians (N, 2, 2) of points y by these pixels.
     """
     x, _ = _undistorted(pair.x, lens, k1)
     y, by_pixel = _undistorted(pair.y, lens, k1)
@@ -287,58 +283,58 @@ def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Arra
 
 def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
     """
-    Move points (N, 2) to where they are if the coefficient is k1; what is seen stays.
+    Move points (N, 2) to another coefficient k1, with the same pixels.
 
-    Also gives how they move with the pixels at which they are seen, (N, 2, 2).
+    Also returns their Jacobians (N, 2, 2) by these pixels.
     """
-    return _shown_at(lens.pixels(places, lens.k1)[0], places, lens, k1)
+    return _invert_projection(lens.pixels(places, lens.k1)[0], places, lens, k1)
 
 
-def _shown_at(seen: Array, places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
-    """Give the points that a lens shows at pixels (N, 2), from next to them, and their slopes."""
+def _invert_projection(seen: Array, places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
+    """Undistort pixels (N, 2) from nearby points; also return the Jacobians."""
     for _ in range(_INVERSIONS):
         there, slopes = lens.pixels(places, k1)
         by_pixel = inverses(slopes)
         step = times(by_pixel, seen - there)
         places = places + step
-        if np.abs(step).max() < _NEXT_TO_NOTHING:
+        if np.abs(step).max() < _STEP_TOLERANCE:
             break
     return places, by_pixel
 
 
-def _is_even(rim: Array, lens: Lens, k1: float) -> bool:
+def _is_far_from_fold(rim: Array, lens: Lens, k1: float) -> bool:
     """
-    Whether k1 shows points (N, 2), the outermost of all, far enough from where the image folds.
+    Return whether points (N, 2), the outermost of all, are far enough from a fold of the image.
 
-    There (1 + 3 k1 r^2 = 0) points move without bound from pixel to pixel. So does the noise that
-    they are said to have, and all residuals vanish: a minimum that is none.
+    At a fold (1 + 3 k1 r^2 = 0) points move without bound from pixel to pixel. So does their
+    assumed noise, and all whitened residuals vanish: a spurious minimum.
     """
     seen, middle = lens.pixels(rim, lens.k1)[0], lens.pixels(np.zeros((1, 2)), k1)[0]
     areas = []
-    # Beyond a fold, where there is no such point, numbers run away.
+    # Beyond a fold there is no solution, and iterations diverge.
     with np.errstate(all='ignore'):
-        for farther in (0.0, _FARTHER):
+        for farther in (0.0, _RADIUS_SHARE):
             pixels = seen + farther * (seen - middle)
-            places, by_pixel = _shown_at(pixels, rim, lens, k1)
-            if not np.abs(lens.pixels(places, k1)[0] - pixels).max() < _MET:
+            places, by_pixel = _invert_projection(pixels, rim, lens, k1)
+            if not np.abs(lens.pixels(places, k1)[0] - pixels).max() < _PIXEL_TOLERANCE:
                 return False
             areas.append(np.linalg.det(by_pixel))
         return bool((areas[0] > 0).all() and (areas[1] > 0).all()
-                    and (areas[1] / areas[0]).max() < _EVEN)
+                    and (areas[1] / areas[0]).max() < _MAX_AREA_RATIO)
 
 
-def _shortened(step: float, rim: Array, lens: Lens, k1: float) -> float:
-    """Shorten a step of k1 to what moves the outermost points (N, 2) a little, without a fold."""
+def _limited(step: float, rim: Array, lens: Lens, k1: float) -> float:
+    """Limit a step of k1 by the displacement of the outermost points (N, 2) and any fold."""
     radii = np.linalg.norm(lens.pixels(rim, k1)[0] - lens.pixels(np.zeros((1, 2)), k1)[0], axis=1)
-    longest = _LONGEST * float((radii / displacements(rim, lens, k1)).min())
+    longest = _MAX_STEP * float((radii / displacements(rim, lens, k1)).min())
     step = float(np.clip(step, -longest, longest))
-    while not _is_even(rim, lens, k1 + step):
+    while not _is_far_from_fold(rim, lens, k1 + step):
         step /= 2
     return step
 
 
 def _parallax(pair: MatchedPair, lens: Lens) -> float:
-    """Give the usual distance in pixels of matches from where a turn alone would bring them."""
+    """Return the median distance in pixels of matches from their prediction by rotation alone."""
     rays_x, rays_y = (np.column_stack([one, np.ones(len(one))]) for one in (pair.x, pair.y))
     turned = rays_x @ fit_rotation(rays_x, rays_y).T
     there, here = (lens.pixels(places, lens.k1)[0]
@@ -347,12 +343,12 @@ def _parallax(pair: MatchedPair, lens: Lens) -> float:
 
 
 def _disagreement(linearised: Sequence[Linearised]) -> float:
-    """Compare the more informative pairs with the others: half of what is known by each."""
+    """Compare the more informative half of the pairs with the other, in standard errors."""
     sums = np.array([one.by_match.sum(1) for one in linearised]).T
     order = np.argsort([one.share for one in linearised], kind='stable')
     known = np.cumsum(sums[0, order])
-    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _FEW, len(linearised) - _FEW))
-    # Neighbours have to stay neighbours.
+    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _MIN_PAIRS, len(linearised) - _MIN_PAIRS))
+    # The jackknife needs the order of the recording.
     halves = [sums[:, np.sort(half)] for half in (order[:first], order[first:])]
     off = [gradient.sum() / curvature.sum() for curvature, gradient in halves]
     one, other = (_standard_error(*half) for half in halves)
@@ -361,9 +357,9 @@ def _disagreement(linearised: Sequence[Linearised]) -> float:
 
 def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
     """
-    Give the standard error of k1 by what no residual shows: all that is seen in a cell is shifted.
+    Return the standard error of k1 by systematic displacements of whole cells of the image.
 
-    It is so in all pairs alike, as sampling and the lens go with the place in the image.
+    They are the same in all pairs, as sampling and lens depend on the position in the image.
     """
     seen = np.concatenate([lens.pixels(one.pair.y, lens.k1)[0] for one in linearised])
     side = max(float(np.sqrt(np.ptp(seen, axis=0).prod() / LARGE_CELLS)), 1.0)
@@ -376,10 +372,10 @@ def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
 
 def _standard_error(curvature: Array, gradient: Array) -> float:
     """
-    Give the standard error of k1 from how it moves without some of the pairs.
+    Return the jackknife standard error of k1 over pairs.
 
-    Without each group of pairs in a row, as neighbours err alike; or without each alone, where
-    the few groups agree better than that by chance.
+    It leaves out groups of consecutive pairs, whose errors are correlated, or single pairs,
+    whichever gives more: few groups may agree by chance.
     """
     group = np.arange(len(gradient)) * _GROUPS // len(gradient)
     by_group = group == np.arange(_GROUPS)[:, None]
@@ -388,6 +384,6 @@ def _standard_error(curvature: Array, gradient: Array) -> float:
 
 
 def _jackknife(curvature: Array, gradient: Array) -> float:
-    """Give the standard error from parts (N,), each left out once."""
+    """Return the leave-one-out standard error over parts (N,)."""
     without = -(gradient.sum() - gradient) / (curvature.sum() - curvature)
     return float(np.sqrt((1 - 1 / len(without)) * ((without - without.mean())**2).sum()))
