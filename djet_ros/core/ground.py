@@ -1,10 +1,10 @@
 """
-The ground under a moving camera: how far it went over it, in heights of the camera.
+The ground under a moving camera: the translation in heights of the camera.
 
 Points X of a plane with m.X = 1 have the inverse depth m.x along their ray x, so that two views
-with X' = R X + t see it as y ~ (R + t m^T) x (Faugeras and Lustman, 1988). With t of length one,
-|m| is the length of the translation in heights of the camera over the plane, and m / |m| is its
-normal. All pixels where level ground would be are aligned directly, because roads have few
+with X' = R X + t see it by the homography y ~ (R + t m^T) x (Faugeras and Lustman, 1988). With t
+of length one, |m| is the translation in heights of the camera over the plane, and m / |m| is its
+normal. All pixels that would see level ground are aligned directly, because roads have few
 corners.
 """
 
@@ -27,70 +27,70 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class GroundTuning:
-    """Constants of the ground, each with where it comes from ("chosen" was not searched)."""
+    """Constants of the ground, each with its source ("chosen" means not searched)."""
 
-    # What is looked at, in heights of the camera over level ground; chosen for a car's lane:
-    # from so near, and to either side
+    # Region of the ground, in heights of the camera over level ground; chosen for a car's lane:
+    # least distance ahead, and to either side
     near: float = 1.0
     aside: float = 1.5
-    # roads bend up and down, so that only the nearest is flat: up to so far, or where the nearest
-    # that is seen is far already, to so many times that, but not beyond the last
+    # roads bend up and down, so that only the nearest part is flat: farthest distance, or if the
+    # nearest visible ground is far already, its multiple, but not beyond the last
     flat: float = 6.0
     times: float = 1.5
     far: float = 14.0
 
-    # Pixels. Chosen: fewer than this see too little; more than this only cost time
+    # Pixels. Chosen: fewer are not enough; more only cost time
     least_pixels: int = 400
     pixels: int = 4000
-    # of an image, from which those are chosen; chosen: the size of a car's camera
+    # of an image, to select from; chosen: the size of a car's camera
     candidates: int = 500_000
 
     # The search. Lengths of a translation in heights; chosen, from a crawl to the fastest car
     lengths: tuple[float, float] = (0.02, 4.0)
-    # of the logarithm of a length: makes steps of a pixel or two
+    # of the logarithm of a length: a step of a pixel or two
     step: float = 0.03
-    # correlation with which ground is seen again; chosen: walls and cars that are taken for
-    # ground have less
+    # least correlation of ground; chosen: walls and cars mistaken for ground have less
     seen: float = 0.6
-    # chosen: correlation with which images about whose motion nothing is known are of one place
+    # chosen: least correlation of images without known motion to be of the same place
     same: float = 0.95
-    # chosen: another length must correlate by so much less, if it is no neighbour by so many steps
+    # chosen: distinctness of the best length: others, beyond so many neighbouring steps, have a
+    # correlation lower by this
     clearly: float = 0.1
     neighbours: int = 6
-    # pixels; chosen: ground that moves by less, while other things show that the camera moves,
-    # is none: something that moves with the camera hides it
+    # pixels; chosen: ground that moves by less, while other points show that the camera moves, is
+    # an object that moves with the camera and hides the ground
     least_shift: float = 1.0
 
-    # The texture. Gray levels at which contrast is noise, a camera's usual
+    # The texture. Gray levels at which contrast is noise, typical of a camera
     noise: float = 2.0
-    # pixels over which contrast is evened out; chosen. Nearer than half of that to the rim of
-    # the image, what lies beyond would have to be invented
+    # pixels over which contrast is normalised; chosen. Nearer than half of that to the image
+    # border it is undefined
     side: int = 25
     rim: int = side // 2 + 2
 
-    # The fit. Standard deviation in rad of the normals considered, about level ground's: the 2
-    # degrees to which the pitch is to be given, and a road's own on top
+    # The fit. Standard deviation in rad of the normal about that of level ground: the 2 degrees to
+    # which the pitch has to be given, and the road's own slope
     lean: float = math.radians(3.0)
-    # pixels that cells of flat ground are off at most, in the median; chosen: walls are off more
+    # pixels; largest median displacement of cells of flat ground; chosen: walls have more
     uneven: float = 0.6
-    # chosen: rounds of Gauss-Newton, and the share of the plane by which it moves at rest
+    # chosen: rounds of Gauss-Newton, and the relative step of the plane at convergence
     rounds: int = 10
     rests: float = 1e-3
 
 
 _TUNING = GroundTuning()
 
-# Heights of the camera for which a place on the ground stays in sight, as the camera goes on.
+# Heights of the camera over which a point on the ground stays in view.
 SIGHT = _TUNING.flat - _TUNING.near
 
 
 @dataclass(frozen=True)
 class GroundMotion:
     """
-    What a pair of views says of the ground.
+    Estimate of the ground from a pair of views.
 
-    value: (3,) length of the translation in heights of the camera, and pitch (down is positive)
-    and roll in rad of the previous view's camera against the ground; covariance: (3, 3).
+    value: (3,) length of the translation in heights of the camera, and pitch (positive down) and
+    roll in rad of the previous camera against the ground; covariance: (3, 3).
     """
 
     value: Array
@@ -99,18 +99,18 @@ class GroundMotion:
 
 class Ground:
     """
-    Where a camera sees the ground, if that is level.
+    The part of an image that sees level ground, and its alignment over pairs.
 
-    K: (3, 3) camera matrix; shape: (height, width) of its images; pitch: in rad, by which it looks
-    down. Roll is taken to be small.
+    K: (3, 3) camera matrix; shape: (height, width) of its images; pitch: in rad, positive down.
+    Roll is taken to be small.
     """
 
     def __init__(self, K: Array, shape: tuple[int, ...], pitch: float) -> None:
-        """Choose the pixels that see ground."""
+        """Select the pixels that see the ground."""
         self._normal = np.array([0.0, np.cos(pitch), np.sin(pitch)])
         self._forward = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
         self._reach = _TUNING.far
-        # Of large images every second row and column, and so on, are more than enough.
+        # Large images are subsampled.
         every = max(math.isqrt(shape[0] * shape[1] // _TUNING.candidates), 1)
         columns, rows = np.meshgrid(np.arange(_TUNING.rim, shape[1] - _TUNING.rim, every),
                                     np.arange(_TUNING.rim, shape[0] - _TUNING.rim, every))
@@ -126,20 +126,20 @@ class Ground:
             return
         some = np.linspace(0, len(chosen) - 1, min(len(chosen), _TUNING.pixels)).astype(np.int64)
         self._pixels, self._rays = pixels[chosen[some]], towards[chosen[some]]
-        # Above the ground nothing is looked at, but for what the filters reach.
+        # Rows above the ground are cropped, except for the support of the filters.
         self._top = max(int(self._pixels[:, 1].min()) - _TUNING.side, 0)
         self._K = K - [[0, 0, 0], [0, 0, self._top], [0, 0, 0]]
         self._pixels[:, 1] -= self._top
         _, self._cells = np.unique((self._pixels // CELL) @ [1, 1 << 16], return_inverse=True)
 
     def _ahead(self, towards: Array) -> Array:
-        """Give how far ahead, in heights, rays (N, 3) meet level ground; infinite above it."""
+        """Return how far ahead (N,), in heights, rays (N, 3) meet level ground, or infinity."""
         inverse = towards @ self._normal
         ahead = np.where(inverse > 1e-9, towards @ self._forward, np.inf)
         return np.asarray(ahead / np.maximum(inverse, 1e-9))
 
     def _sees(self, towards: Array) -> NDArray[np.bool_]:
-        """(N,) bool mask of the rays (N, 3) that meet level ground that is looked at."""
+        """Return a mask (N,) of the rays (N, 3) that meet level ground within the region."""
         ahead = self._ahead(towards)
         aside = np.abs(towards[:, 0]) / np.maximum(towards @ self._normal, 1e-9)
         return np.asarray((ahead > _TUNING.near) & (ahead < min(self._reach, _TUNING.far))
@@ -148,27 +148,27 @@ class Ground:
     def motion(self, previous: View, current: View, relative: RelativePose,
                lengths: tuple[float, float] = _TUNING.lengths) -> GroundMotion | None:
         """
-        Find how the ground moves between two views, from the motion between them.
+        Estimate how the ground moves between two views, given the relative pose.
 
-        lengths: from which to which one, in heights, is searched first. None where no ground is
-        seen, or where it does not tell.
+        lengths: range of lengths, in heights, to search first. None if no ground is visible or it
+        does not determine the length.
         """
         if not self.is_in_view:
             return None
         here, there = self._texture(previous), self._texture(current)
         wanted = _sampled(here, self._pixels)
         if relative.status is not Status.OK:
-            return self._standing(wanted, there, relative)
+            return self._zero_motion(wanted, there, relative)
         start = self._search(wanted, there, relative, lengths)
         if start is None:
             start = self._search(wanted, there, relative, _TUNING.lengths)
         return None if start is None else self._fit(wanted, there, relative, start)
 
     def _texture(self, view: View) -> Image:
-        """Image whose contrast is alike everywhere, from the highest row looked at."""
+        """Return the image with normalised contrast, from the highest row used."""
         gray = cv2.GaussianBlur(view.gray[self._top:], (0, 0), 1.0).astype(np.float32)
         detail = gray - cv2.blur(gray, (_TUNING.side, _TUNING.side))
-        # The running sums of a filter may end a little below zero.
+        # Running sums of a filter may end slightly below zero.
         power = np.maximum(cv2.blur(detail**2, (_TUNING.side, _TUNING.side)), 0.0)
         inner, rim = np.full(gray.shape, np.nan, np.float32), _TUNING.side // 2
         inner[rim:-rim, rim:-rim] = (detail / (np.sqrt(power) + _TUNING.noise))[rim:-rim, rim:-rim]
@@ -176,18 +176,18 @@ class Ground:
             inner[view.mask[self._top:]] = np.nan
         return inner
 
-    def _seen_again(self, R: Array, t: Array, m: Array) -> Array:
-        """Pixels (N, 2) of the points of a plane m in the current view."""
+    def _project(self, R: Array, t: Array, m: Array) -> Array:
+        """Return the pixels (N, 2) of the points of a plane m in the current view."""
         seen = (self._rays @ R.T + np.outer(self._rays @ m, t)) @ self._K.T
         return np.asarray(seen[:, :2] / np.maximum(seen[:, 2:], 1e-9))
 
-    def _standing(self, wanted: Array, there: Image,
-                  relative: RelativePose) -> GroundMotion | None:
-        """Tell whether the ground is where a rotation alone would bring it, or where it was."""
+    def _zero_motion(self, wanted: Array, there: Image,
+                     relative: RelativePose) -> GroundMotion | None:
+        """Return zero motion if the ground is where a pure rotation, or none, predicts it."""
         turned = relative.status is Status.NO_PARALLAX
         R = relative.R if turned else np.eye(3)
         correlation = _correlation(
-            wanted, _sampled(there, self._seen_again(R, np.zeros(3), self._normal)))
+            wanted, _sampled(there, self._project(R, np.zeros(3), self._normal)))
         if correlation < (_TUNING.seen if turned else _TUNING.same):
             return None
         least = _TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
@@ -195,16 +195,16 @@ class Ground:
 
     def _search(self, wanted: Array, there: Image, relative: RelativePose,
                 lengths: tuple[float, float]) -> Array | None:
-        """Plane (3,) of the length at which level ground correlates best, if one stands out."""
+        """Return level ground (3,) for the length of best correlation, if that is distinct."""
         step, (least, most) = _TUNING.step, _TUNING.lengths
         low, high = max(lengths[0], least), min(lengths[1], most)
         tried = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
-        found = np.array([_correlation(wanted, _sampled(there, self._seen_again(
+        found = np.array([_correlation(wanted, _sampled(there, self._project(
             relative.R, relative.t, length * self._normal))) for length in tried])
         best = int(found.argmax())
         if found[best] < _TUNING.seen or best in (0, len(found) - 1):
             return None
-        # Textures that repeat have several peaks; slow ground has one, but a broad one.
+        # Repetitive textures have several peaks; slow ground has one, but a broad one.
         peaks = found == maximum_filter1d(found, 2 * _TUNING.neighbours + 1, mode='nearest')
         if (peaks & (found > found[best] - _TUNING.clearly)).sum() > 1:
             return None
@@ -213,10 +213,10 @@ class Ground:
     def _fit(self, wanted: Array, there: Image, relative: RelativePose,
              m: Array) -> GroundMotion | None:
         """
-        Fit the plane by Gauss-Newton, together with the motion as far as that is uncertain.
+        Fit the plane by Gauss-Newton, jointly with the pose within its covariance.
 
-        Robust (Cauchy) residuals of intensity; their noise is taken from their sums over cells, as
-        for the pose, so that the covariance holds however rough the texture is.
+        Cauchy loss on intensities; the noise is estimated from sums of scores over cells, as for
+        the pose, so that the covariance holds for any texture.
         """
         known = np.zeros((8, 8))
         known[3:, 3:] = np.linalg.inv(relative.covariance_5 + 1e-12 * np.eye(5))
@@ -226,7 +226,7 @@ class Ground:
         for _ in range(_TUNING.rounds):
             R = rotation_exp(theta[:3]) @ relative.R
             t = relative.t + tangents @ theta[3:]
-            places = self._seen_again(R, t, m)
+            places = self._project(R, t, m)
             found = _sampled(there, places)
             r = found - wanted
             J = self._jacobian([_sampled(g, places) for g in gradients], R, t, m, tangents)
@@ -235,10 +235,10 @@ class Ground:
                 return None
             J, r = np.where(inside[:, None], J, 0.0), np.where(inside, r, 0.0)
             hessian, gradient, spread = self._normal_equations(J, r, inside)
-            lean, offset = _leaning(m, self._normal)
+            lean, offset = _whitened_tilt(m, self._normal)
             prior = known.copy()
             prior[:3, :3] += lean.T @ lean
-            # The noise that makes residuals and priors comparable.
+            # The noise variance that relates residuals to priors.
             noise = max(float(np.trace(np.linalg.solve(hessian + 1e-9 * np.eye(8), spread))) / 8,
                         1e-9)
             total = hessian / noise + prior
@@ -250,22 +250,22 @@ class Ground:
             if np.linalg.norm(step[:3]) < _TUNING.rests * np.linalg.norm(m):
                 break
         shift = float(np.median(np.linalg.norm(
-            places - self._seen_again(R, np.zeros(3), m), axis=1)))
+            places - self._project(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
         if correlation < _TUNING.seen or shift < _TUNING.least_shift or m @ self._normal <= 0 \
                 or not self._unevenness(r, J, R, t, m) <= _TUNING.uneven:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
-        return _described(m, covariance)
+        return _motion_of_plane(m, covariance)
 
     def _unevenness(self, r: Array, J: Array, R: Array, t: Array, m: Array) -> float:
         """
-        Median shift in pixels by which cells are still off along their flow.
+        Return the median displacement in pixels that remains in cells, along their flow.
 
-        A wall may move much as ground does, but not everywhere.
+        A wall may resemble ground in its motion, but not everywhere.
         """
-        longer = (self._seen_again(R, t, 1.01 * m) - self._seen_again(R, t, m)) / 0.01
+        longer = (self._project(R, t, 1.01 * m) - self._project(R, t, m)) / 0.01
         slope = (J[:, :3] @ m) / np.maximum(np.linalg.norm(longer, axis=1), 1e-9)
         sums, squares = (np.bincount(self._cells, values) for values in (slope * r, slope**2))
         told = squares > 0.2 * float(np.median(squares[squares > 0]))
@@ -273,7 +273,7 @@ class Ground:
 
     def _jacobian(self, gradients: list[Array], R: Array, t: Array, m: Array,
                   tangents: Array) -> Array:
-        """Differentiate intensities by plane, rotation and direction of translation, (N, 8)."""
+        """Differentiate intensities by plane, rotation and translation direction, (N, 8)."""
         turned, inverse = self._rays @ R.T, self._rays @ m
         y = turned + np.outer(inverse, t)
         flow = np.stack(gradients, axis=1) @ self._K[:2, :2]
@@ -284,7 +284,7 @@ class Ground:
 
     def _normal_equations(self, J: Array, r: Array,
                           inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-        """Hessian (8, 8), gradient (8,), and the covariance (8, 8) that noise gives the latter."""
+        """Return Hessian (8, 8), gradient (8,), and the latter's covariance (8, 8) by noise."""
         scale = robust_scale(r[inside]) + 1e-6
         weights = 1 / (1 + (r / (2 * scale))**2)
         scores = np.stack([np.bincount(self._cells, column)
@@ -296,7 +296,7 @@ class Ground:
 
 
 def _sampled(image: Image, pixels: Array) -> Array:
-    """Values (N,) at pixels (N, 2), NaN outside."""
+    """Return values (N,) at pixels (N, 2), NaN outside."""
     x, y = pixels.T.astype(np.float32)
     values = cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR,
                        borderMode=cv2.BORDER_CONSTANT, borderValue=float('nan'))
@@ -304,7 +304,7 @@ def _sampled(image: Image, pixels: Array) -> Array:
 
 
 def _correlation(a: Array, b: Array) -> float:
-    """Correlation of two samples (N,) where both are there; 0 if that is too little."""
+    """Return the correlation of two samples (N,) where both are finite; 0 if these are too few."""
     there = np.isfinite(a) & np.isfinite(b)
     if there.sum() < max(_TUNING.least_pixels, len(b) / 4):
         return 0.0
@@ -313,11 +313,11 @@ def _correlation(a: Array, b: Array) -> float:
     return float(a @ b) / np.sqrt(power) if power > 0 else 0.0
 
 
-def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
+def _whitened_tilt(m: Array, normal: Array) -> tuple[Array, Array]:
     """
-    Tell how a plane leans against level ground, in its usual deviations.
+    Return the tilt of a plane against level ground, whitened.
 
-    Gives the derivative (2, 3) by the plane, and the lean (2,) itself.
+    Returns its derivative (2, 3) by the plane, and the tilt (2,) itself.
     """
     across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _TUNING.lean
     length = float(np.linalg.norm(m))
@@ -325,16 +325,16 @@ def _leaning(m: Array, normal: Array) -> tuple[Array, Array]:
     return across @ (np.eye(3) - np.outer(n, n)) / length, across @ n
 
 
-def _described(m: Array, covariance: Array) -> GroundMotion:
-    """Length, pitch and roll of a plane m (3,) and of its covariance (3, 3)."""
+def _motion_of_plane(m: Array, covariance: Array) -> GroundMotion:
+    """Return length, pitch and roll of a plane m (3,), with their covariance from its (3, 3)."""
     length = float(np.linalg.norm(m))
-    lean, by_plane = _lean(m)
+    lean, by_plane = _tilt(m)
     J = np.vstack([m / length, by_plane])
     return GroundMotion(np.array([length, *lean]), J @ covariance @ J.T)
 
 
-def _lean(m: Array) -> tuple[Array, Array]:
-    """Pitch and roll (2,) in rad of a plane m (3,), and their derivative (2, 3) by it."""
+def _tilt(m: Array) -> tuple[Array, Array]:
+    """Return pitch and roll (2,) in rad of a plane m (3,), and their derivative (2, 3) by it."""
     length = float(np.linalg.norm(m))
     x, y, z = (m / length).tolist()
     upright = np.hypot(y, z)
@@ -345,16 +345,16 @@ def _lean(m: Array) -> tuple[Array, Array]:
 
 def turned(lean: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """
-    Tell how a plane at rest leans against a camera that turns.
+    Propagate pitch and roll of a plane through a rotation of the camera.
 
-    lean: (2,) pitch and roll in rad before; R: (3, 3) rotation, ``x_after = R x_before``, with
-    the covariance (3, 3) of its rotation vector. Gives the lean (2,) after, its derivative (2, 2)
-    by that before, and the covariance (2, 2) that comes of the rotation.
+    lean: (2,) pitch and roll in rad before; R: (3, 3) rotation, ``x_after = R x_before``, with the
+    covariance (3, 3) of its rotation vector. Returns the (2,) after, their derivative (2, 2) by
+    those before, and their covariance (2, 2) by the rotation.
     """
     pitch, roll = lean
     normal = np.array([np.sin(roll), np.cos(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch)])
-    _, before = _lean(normal)
-    after, J = _lean(R @ normal)
+    _, before = _tilt(normal)
+    after, J = _tilt(R @ normal)
     by_turn = -J @ skew(R @ normal)
-    # A lean moves the normal across itself, as the pseudoinverse does.
+    # Pitch and roll move the normal orthogonally to itself, as the pseudoinverse does.
     return after, J @ R @ np.linalg.pinv(before), by_turn @ covariance @ by_turn.T

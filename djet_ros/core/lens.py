@@ -68,7 +68,7 @@ _INVERSIONS, _STEP_TOLERANCE, _PIXEL_TOLERANCE = 12, 1e-10, 1e-6
 _RADIUS_SHARE, _MAX_AREA_RATIO = 0.01, 1.25
 
 # Step of k1 for numerical derivatives.
-_DERIVATIVE_STEP = 1e-4
+_STEP = 1e-4
 
 # Scale of the robust loss in standard deviations, as in the odometry.
 _LOSS_SCALE = 3.0
@@ -95,7 +95,7 @@ class Lens(Protocol):
         """Return the calibrated coefficient."""
 
     def pixels(self, places: Array, k1: float) -> tuple[Array, Array]:
-        """Project points X/Z, Y/Z (N, 2); return pixels (N, 2) and their Jacobians (N, 2, 2)."""
+        """Project points X/Z, Y/Z (N, 2) to pixels, (N, 2), with their Jacobians (N, 2, 2)."""
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ def outermost(pairs: Sequence[MatchedPair]) -> Array:
 
 def displacements(places: Array, lens: Lens, k1: float) -> Array:
     """Return the pixels (N,) by which points (N, 2) move per unit of k1."""
-    more, less = (lens.pixels(places, k1 + way)[0] for way in (_DERIVATIVE_STEP, -_DERIVATIVE_STEP))
-    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _DERIVATIVE_STEP))
+    more, less = (lens.pixels(places, k1 + way)[0] for way in (_STEP, -_STEP))
+    return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _STEP))
 
 
 def by_radius(fit: LensFit, edges: Array) -> Array:
@@ -252,8 +252,8 @@ def _unabsorbed(pair: MatchedPair, lens: Lens, k1: float, solution: Solution, we
                 ) -> Array:
     """Return derivatives (N,) of residuals by k1, in pixels, orthogonal to those by the pose."""
     more, less = (epipolar_residuals(_problem(pair, lens, k1 + way)[0], solution.R, solution.t).r
-                  for way in (_DERIVATIVE_STEP, -_DERIVATIVE_STEP))
-    by_k1, J = (more - less) / (2 * _DERIVATIVE_STEP), solution.residuals.jacobian
+                  for way in (_STEP, -_STEP))
+    by_k1, J = (more - less) / (2 * _STEP), solution.residuals.jacobian
     weighed = J * weights
     followed = np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0]
     return np.asarray(by_k1 - followed @ J)
@@ -347,7 +347,8 @@ def _disagreement(linearised: Sequence[Linearised]) -> float:
     sums = np.array([one.by_match.sum(1) for one in linearised]).T
     order = np.argsort([one.share for one in linearised], kind='stable')
     known = np.cumsum(sums[0, order])
-    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _MIN_PAIRS, len(linearised) - _MIN_PAIRS))
+    first = int(np.clip(np.searchsorted(known, known[-1] / 2), _MIN_PAIRS,
+                        len(linearised) - _MIN_PAIRS))
     # The jackknife needs the order of the recording.
     halves = [sums[:, np.sort(half)] for half in (order[:first], order[first:])]
     off = [gradient.sum() / curvature.sum() for curvature, gradient in halves]
