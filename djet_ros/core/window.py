@@ -1,14 +1,14 @@
 """
-A window of frames and of the landmarks that they share: what ties the lengths of steps together.
+A sliding window of keyframes and shared landmarks, which ties the lengths of steps together.
 
-A landmark keeps the descriptor of the frame that saw it first, its anchor, and its inverse depth
-there. Each later frame samples the landmark's surface anew (`core.sighting`): nothing is detected
-again, so nothing wanders.
-`djet_ros.core.bundle` refines poses and depths together. A frame that leaves the window leaves
-what it told about the others behind as a prior, its landmarks eliminated with it (Leutenegger et
-al., "Keyframe-based visual-inertial odometry using nonlinear optimization", IJRR 2015). So does
-one between keyframes, with those that it was the last to see: where the camera turns by much, they
-alone may tell how long the steps before and after it are.
+A landmark has an inverse depth in its anchor, the frame that created it, and the descriptor of its
+patch there. Each later frame samples the landmark's surface anew (`core.sighting`): features are
+not detected again, so tracks do not drift. `djet_ros.core.bundle` refines poses and depths
+jointly. A frame that leaves the window is marginalised into a prior on the others, with its
+landmarks (Leutenegger et al., "Keyframe-based visual-inertial odometry using nonlinear
+optimization", IJRR 2015). So is a frame between keyframes, with the landmarks that it was the last
+to observe: after a large rotation these may be the only link between the lengths of the steps
+before and after.
 """
 
 from __future__ import annotations
@@ -54,67 +54,69 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Constants of the window, each with where it comes from ("chosen" was not searched)."""
+    """Constants of the window, each with its source ("chosen" means not searched)."""
 
-    # chosen for the price: twice as many of either changed the drift on real streets by noise
+    # chosen for the cost: twice as many of either changed the drift on real streets only by noise
     keyframes: int = 6
     landmarks: int = 160
-    # pixels, in the median, by which landmarks have moved beyond what the turn alone moved them
-    # where a frame becomes a keyframe; 10 costs a third more and drifts as much
+    # pixels: median displacement of landmarks since the last keyframe, without that by rotation,
+    # that makes a frame a keyframe; 10 costs a third more and drifts as much
     parallax: float = 25.0
-    # chosen: share of the landmarks that are seen no more, where it becomes one too
+    # chosen: share of the landmarks that are lost that makes a frame a keyframe
     gone: float = 0.4
-    # chosen: side of the cells over which landmarks spread, as a share of that with one in each
+    # chosen: side of the cells that landmarks are spread over, relative to cells of one landmark
+    # each
     cell: float = 0.75
-    # chosen: Gauss-Newton steps for each frame; four come to the same
+    # chosen: Gauss-Newton steps for each frame; four give the same result
     steps: int = 2
-    # chosen: how often a step that would cost more is halved: where the camera hardly moved, or
-    # turned by much, depths are told so badly that a full one may lead anywhere
+    # chosen: halvings of a step that would increase the cost: where the camera hardly moved, or
+    # rotated by much, depths are so uncertain that a full step may lead anywhere
     halvings: int = 6
-    # robust standard deviations beyond which an observation is false, and where the loss bends
+    # robust standard deviations beyond which an observation is an outlier, and the scale of the
+    # loss
     outlier: float = 4.0
     bend: float = 3.0
-    # pixels; chosen, below the noise of rendered streets, which is 0.04
+    # pixels; chosen, below the noise on rendered streets, which is 0.04
     least_scale: float = 0.02
-    # chosen: pixels between a landmark and a match of a pair that are taken for one another
+    # chosen: pixels between a landmark and a match of a pair up to which they are the same point
     beside: float = 1.5
-    # pixels; chosen: what a match is off at most, but for false ones; and the share by which the
-    # depth of a landmark may be
+    # pixels; chosen: largest error of an inlier match; and largest relative error of a landmark's
+    # depth
     matched: float = 0.4
     known: float = 0.15
-    # pixels; chosen: what right matches are off, where surfaces are fitted to them
+    # pixels; chosen: error of inliers that slants are fitted to
     off: float = 0.1
-    # rad; chosen: parallax of a step, negative, to which noise takes what is infinitely far
+    # rad; chosen: negative parallax of a step that noise may give to a point at infinity
     beyond: float = 0.01
-    # chosen: so few landmarks do not tell a length
+    # chosen: fewer landmarks do not determine a length
     few: int = 8
-    # chosen: shares by which the length of a pair may be off that depths around it tell, and one
-    # that nothing tells; landmarks that are measured in both frames are far surer
+    # chosen: relative standard deviations of the length of a pair: from depths around it, and of a
+    # guess; landmarks that both frames observe determine it far better
     told: float = 0.02
     guessed: float = 0.5
-    # chosen: share of the way to where the frame before is by now that a step makes up for. By
-    # all of it the track would jump, by none drift two times as much over a hundred frames
+    # chosen: share of the previous frame's refinement that a step corrects. With all of it the
+    # track would jump; with none it would drift twice as much over a hundred frames
     mended: float = 0.2
 
 
 WINDOW_TUNING = WindowTuning()
 
-# By which share the first length may be off, which is the unit of the track.
-_EXACT = 1e-4
+# Relative standard deviation of the first length, which is the unit of the track.
+_UNIT_SIGMA = 1e-4
 
-# Information about the rotation of a pair without parallax, which has no covariance: 1 mrad.
-_ROTATION_ALONE = 1e6
+# Information on the rotation of a pair without parallax, which has no covariance: 1 mrad.
+_ROTATION_INFORMATION = 1e6
 
 
 @dataclass(frozen=True)
 class Addition:
     """
-    What a window says of its newest frame: its motion from the one before, and how long it is.
+    Motion of the newest frame as the window estimates it, with its length.
 
-    R (3, 3), t (3,) with its length in the unit of the track: x_new = R x_before + t; sigma:
-    standard deviation of the length, as if the frames before stood where the window has them, and
-    covariance (6, 6) of all of it, over R -> exp([w]_x) R and t + dt. onward: (4, 4) the newest
-    camera in the one before as that was told: with a part of what has become known of it since.
+    R (3, 3), t (3,) in the unit of the track: x_new = R x_before + t; sigma: standard deviation of
+    the length, given the poses of the frames before, and covariance (6, 6) of the motion, over R
+    -> exp([w]_x) R and t + dt. onward: (4, 4) pose of the newest camera in the previous one as
+    that was published: it includes a share of the refinement of the previous pose since.
     """
 
     R: Array
@@ -131,8 +133,8 @@ class Window:
 
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
 
-    settled: (M, 3) places, in the newest frame, of landmarks that it was the last to refine; lens:
-    what is known of the distortion of its images.
+    settled: (M, 3) landmarks, in the newest frame, that were refined for the last time; lens:
+    estimate of the distortion of the images.
     """
 
     def __init__(self, config: EstimatorConfig, tuning: WindowTuning = WINDOW_TUNING) -> None:
@@ -140,7 +142,7 @@ class Window:
         self._distances = DescriptorDistances(config)
 
     def start(self, view: View, lens: SelfCalibration | None = None) -> None:
-        """Forget everything, but what is known of the lens; this frame is the first."""
+        """Reset everything but the estimate of the lens; this frame is the first."""
         self._K, self._views = view.K, [view]
         self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.left)
@@ -148,125 +150,126 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
-        # The newest camera as it was told, seen from the oldest keyframe; its pose may have been
-        # refined since.
-        self._told = np.eye(4)
-        # The newest pair and its length, where it has a direction.
+        # The newest camera as it was published, in the frame of the oldest keyframe; its pose may
+        # have been refined since.
+        self._published = np.eye(4)
+        # The newest pair and its length, if it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
-        # The pair that was last asked for its length, and what landmarks say of it.
-        self._asked: tuple[RelativePose, tuple[Array, Array]] | None = None
+        # The pair whose length was last asked for, and the ratios by landmarks.
+        self._ratios_of: tuple[RelativePose, tuple[Array, Array]] | None = None
         self.settled = np.empty((0, 3))
 
     @property
     def is_new(self) -> bool:
-        """Whether there is one frame alone, so that the next pair makes the unit."""
+        """Return whether there is only one frame, so that the next pair defines the unit."""
         return len(self._views) == 1
 
     @property
     def is_keyframe(self) -> bool:
-        """Whether the newest frame stays as a keyframe when others come."""
+        """Return whether the newest frame is a keyframe."""
         return self._is_keyframe[-1]
 
     def add(self, view: View, relative: RelativePose, guess: float) -> Addition:
         """
-        Take the next frame and the pair of the newest one with it.
+        Add the next frame and its pair with the newest one, and refine.
 
-        guess: length of the pair, where landmarks do not tell. The first pair has it in any case,
-        and must have a direction.
+        guess: length of the pair, used if landmarks do not determine it. The first pair always
+        takes it, and must have a direction.
         """
-        # What the pair says, in a length by depths that the window knows.
+        # Predict by the pair, with a length from known depths.
         first = self.is_new
-        length, share = (guess, _EXACT) if first else self._length(relative, guess)
-        self._asked = None
+        length, share = (guess, _UNIT_SIGMA) if first else self._length(relative, guess)
+        self._ratios_of = None
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
-        # Landmarks, old and new, are measured in the frame; then all is refined together.
+        # Observe old and new landmarks in the frame; then refine all.
         if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
-            self._found(relative, length)
-        self._measure()
+            self._create_landmarks(relative, length)
+        self._observe_landmarks()
         stood = self._poses.camera(0)[:3, 3]
         H = self._refine()
-        # How far the window slid as a whole says nothing of the step. No frame tells where it
-        # lies; what frames that are gone told is known to first order alone, and what that leaves
-        # over pushes the window along, the farther from its start, the less holds it there.
-        self._told[:3, 3] += self._poses.camera(0)[:3, 3] - stood
-        addition = self._addition(H)
+        # A shift of the window as a whole is no motion of the step. Its position is a gauge
+        # freedom; the prior of marginalised frames is only first-order, and its remainder moves
+        # the window, the more, the farther it is from its start and the less it is held there.
+        self._published[:3, 3] += self._poses.camera(0)[:3, 3] - stood
+        addition = self._newest_motion(H)
         if first:  # by definition
             addition = replace(addition, length=length)
-        # What is no keyframe goes, and so does the oldest where there are too many.
+        # Marginalise the previous frame unless it is a keyframe, and the oldest keyframe beyond
+        # the limit.
         self.settled = np.empty((0, 3))
         if len(self._views) > 2 and not self._is_keyframe[-2]:
-            self._settle(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
-            self._forget(len(self._views) - 2)
+            self._marginalise_landmarks(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
+            self._marginalise_frame(len(self._views) - 2)
         if sum(self._is_keyframe) > self._tuning.keyframes:
-            self._learn_lens()
-            self._settle(self._landmarks.anchors == 0)
-            self._forget(0)
+            self._update_lens()
+            self._marginalise_landmarks(self._landmarks.anchors == 0)
+            self._marginalise_frame(0)
         if relative.t.any():
             self._choose_keyframe()
         self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
 
     def tell(self, motion: Array) -> None:
-        """Take note of what was told of the newest step, (4, 4), in the unit of the track."""
-        self._told = self._told @ motion
+        """Record the motion (4, 4) published for the newest step, in the unit of the track."""
+        self._published = self._published @ motion
 
     def straighten(self, newest: View) -> None:
         """
-        Go on with images without the k1 that is to be expected, of which newest is the first.
+        Continue with images corrected for the expected k1, of which newest is the first.
 
-        What was seen in images by now is where these would have shown it.
+        Earlier observations are moved to where the corrected images would show them.
         """
         before, self.lens = self.lens.undone, self.lens.straightened()
-        self._views = [*(self._straight(view, before) for view in self._views[:-1]), newest]
+        self._views = [*(self._corrected(view, before) for view in self._views[:-1]), newest]
         moved = self._landmarks.seen_otherwise(self._K, before, self.lens.undone)
-        # What comes to lie beyond an image tells nothing any more.
+        # Patches that leave the image are dropped.
         inside = self._distances.describable(moved.found, newest.tested.shape)
         self._landmarks = moved.of(inside)
         self._poses = replace(self._poses, k1=self.lens.left)
         self._latest = None
 
-    def _straight(self, view: View, before: float) -> View:
+    def _corrected(self, view: View, before: float) -> View:
         """
-        Give a view without the k1 that is to be expected, which was without another before.
+        Correct a view for the expected k1 where it was corrected for another before.
 
-        As far as it is asked for: where landmarks were found in it, nothing is looked for anew.
+        Only its images that are still needed: landmarks are not created in it again.
         """
         gray, _ = straight_image(view.gray, self._K, self.lens.undone, before=before)
         return replace(view, gray=gray, tested=self._distances.seen(gray))
 
     def landmarks(self) -> Array:
-        """Places (M, 3) of landmarks in the newest frame, in the unit of the track."""
+        """Return the reliable landmarks as points (M, 3) in the newest frame."""
         return self._places(np.ones(len(self._landmarks), bool))
 
     def _places(self, chosen: NDArray[np.bool_]) -> Array:
-        """Places (M, 3), in the newest frame, of those of some landmarks (N,) that are sure."""
+        """Return the reliable ones of landmarks (N,), as points (M, 3) in the newest frame."""
         sure = self._landmarks.of(np.asarray(
             chosen & (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
         places = in_frame(self._K, self._poses, sure, len(self._views) - 1)
         return np.asarray(places / sure.rho[:, None])
 
     def _projected(self, places: Array) -> Array:
-        """Project places (N, 3) in a camera to pixels (N, 2) as its lens shows them."""
+        """Project points (N, 3) in a camera to distorted pixels (N, 2)."""
         return projected(self._K, places, self._poses.k1)
 
     def _rays(self, pixels: Array) -> Array:
-        """Take pixels (N, 2) as the lens shows them to their viewing rays (N, 3), with z = 1."""
+        """Return the viewing rays (N, 3), with z = 1, of distorted pixels (N, 2)."""
         return straight_rays(self._K, pixels, self._poses.k1)
 
     def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
         """
-        Length of the pair, and by which share it may be off.
+        Return the length of the pair and its relative standard deviation.
 
-        A robust mean over landmarks beside which it has a match; where the camera turned past
-        them, over the matches of the pair before.
+        A weighted median over landmarks with a match nearby; if too few of them are in view, over
+        the matches of the previous pair.
         """
         unknown = guess, self._tuning.guessed
         if not relative.t.any():
             return unknown
         ratios, weights = self._ratios(relative)
         if len(ratios) < self._tuning.few and self._latest is not None:
-            ratios, weights = self._ratios_by(relative, *self._near(
+            ratios, weights = self._ratios_by(relative, *self._nearest(
                 relative.x[relative.inliers], *self._depths_of(*self._latest)))
         if len(ratios) < self._tuning.few:
             return unknown
@@ -275,37 +278,37 @@ class Window:
 
     def told_length(self, relative: RelativePose) -> tuple[float, float] | None:
         """
-        Length of a pair by landmarks, and its standard error by how much these differ.
+        Return the length of a pair by landmarks and its standard error; None if there are too few.
 
-        None where there are too few. Of a translation that is none, noise in place of depths is
-        left, and the length is nothing to within its error.
+        For a translation of zero the depths of the pair are noise, and the length is zero within
+        its standard error.
         """
         ratios, weights = self._ratios(relative)
         if len(ratios) < self._tuning.few:
             return None
         length = _weighted_median(ratios, weights)
-        # Of a median, with as many as these weights are worth.
+        # Standard error of the median, for the effective number of weights.
         spread = 1.25 * 1.4826 * _weighted_median(np.abs(ratios - length), weights)
         return length, spread * float(np.sqrt((weights**2).sum()) / weights.sum())
 
     def _ratios(self, relative: RelativePose) -> tuple[Array, Array]:
-        """Lengths (M,) of a pair by landmarks beside its matches, one by one, and weights."""
-        # Asked twice of a pair: whether it went anywhere, and how far.
-        if self._asked is None or self._asked[0] is not relative:
+        """Return the lengths (M,) of a pair by each landmark with a match, and their weights."""
+        # Asked twice for a pair: whether the camera moved, and how far.
+        if self._ratios_of is None or self._ratios_of[0] is not relative:
             x = relative.x[relative.inliers]
-            self._asked = relative, self._ratios_by(
-                relative, *self._beside(x, self._landmarks.seen[:, -1]))
-        return self._asked[1]
+            self._ratios_of = relative, self._ratios_by(
+                relative, *self._matched(x, self._landmarks.seen[:, -1]))
+        return self._ratios_of[1]
 
     def _ratios_by(self, relative: RelativePose, rho: Array, match: NDArray[np.int64]
                    ) -> tuple[Array, Array]:
-        """Tell the same by inverse depths rho (M,) that are known of some inliers (M,)."""
+        """Return lengths and weights by inverse depths rho (M,) of the inliers `match` (M,)."""
         x, y = relative.x[relative.inliers][match], relative.y_opt[relative.inliers][match]
         in_units, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
         return in_units / rho, rho / sigma
 
     def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
-        """Pixels (N, 2) of a pair's inliers in its second frame, and inverse depths (N,) there."""
+        """Return pixels (N, 2) and inverse depths (N,) of a pair's inliers in its second frame."""
         y = relative.y_opt[relative.inliers]
         rays_x = self._rays(relative.x[relative.inliers])
         rho, _ = inverse_depths(relative.R, relative.t, rays_x, self._rays(y))
@@ -313,23 +316,24 @@ class Window:
         ahead = (rho > 0) & (depths > 0)
         return y[ahead], rho[ahead] / (depths[ahead] * length)
 
-    def _beside(self, x: Array, chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
+    def _matched(self, x: Array, chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
         """
-        Tell which of the pixels x (N, 2) of the newest frame lie beside some of the landmarks.
+        Match pixels x (N, 2) of the newest frame with the nearest of the chosen landmarks.
 
-        Gives inverse depths (M,) there of those that do, and indices (M,) into x.
+        Returns the inverse depths (M,) in the newest frame of matched landmarks, and indices (M,)
+        into x.
         """
         before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
         places = in_frame(self._K, self._poses, before, len(self._views) - 1)
         ahead = places[:, 2] > 0
-        return self._near(x, self._projected(places[ahead]),
-                          before.rho[ahead] / places[ahead, 2])
+        return self._nearest(x, self._projected(places[ahead]),
+                             before.rho[ahead] / places[ahead, 2])
 
-    def _near(self, x: Array, points: Array, rho: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Tell the same of pixels x beside points (P, 2) of some inverse depths (P,)."""
+    def _nearest(self, x: Array, points: Array, rho: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Match pixels x with the nearest points (P, 2) of inverse depths (P,), as `_matched`."""
         if not len(points) or not len(x):
             return np.empty(0), np.empty(0, np.int64)
-        # Built in half the time of a balanced one, and asked as fast.
+        # Built in half the time of a balanced one, and as fast to query.
         tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
         away, match = tree.query(points, distance_upper_bound=self._tuning.beside)
         near = np.isfinite(away)
@@ -337,23 +341,24 @@ class Window:
 
     def agreement(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
-        Count landmarks that lie where a motion has them, and all that were asked.
+        Count the landmarks that agree with a motion, and those that were tested.
 
-        pose: from the newest frame to another one, the sign of t open; x, y: (N, 2) matched pixels
-        of the two. Asked are landmarks with a match beside them that were seen more than twice, so
-        that their depths do not come from one pair. The motion's length is the one that serves
-        them best.
+        pose: from the newest frame to another one, the sign of t is free; x, y: (N, 2) matched
+        pixels of the two. Landmarks are tested that have a match and more than two observations,
+        so that their depths do not come from one pair. The length of the motion is the one that
+        most of them agree with.
         """
         newest = self._landmarks.seen[:, -1] & (self._landmarks.sightings > 2)
         finite = np.isfinite(y).all(1)
         x, y = x[finite], y[finite]
-        known, match = self._beside(x, newest)
+        known, match = self._matched(x, newest)
         if not len(known):
             return 0, 0
         in_units, sigma = inverse_depths(pose.R, pose.t, self._rays(x[match]),
                                          self._rays(y[match]))
         ratios = in_units / known
-        # By what is near, which tells most but may be another body, or by all alike.
+        # By near landmarks, which have most parallax but may be another body, or by all with equal
+        # weight.
         lengths = np.array([[_weighted_median(ratios, known / sigma)], [median(ratios)]])
         noise = self._tuning.matched / self._K[0, 0] * sigma
         off = np.abs(in_units - lengths * known)
@@ -362,10 +367,10 @@ class Window:
 
     def _choose_keyframe(self) -> None:
         """
-        Make the newest frame a keyframe where landmarks moved since the last, or are gone.
+        Make the newest frame a keyframe if landmarks have moved since the last one, or were lost.
 
-        To be asked where the camera moved: while it does not, no landmarks can be found anew, and
-        keyframes that go by would take those away that there are.
+        Only for frames with parallax: without it no new landmarks can be created, and new
+        keyframes would drop the existing ones.
         """
         if self._is_keyframe[-1]:
             return
@@ -385,7 +390,7 @@ class Window:
         R, t = self._poses.R[-1], self._poses.t[-1]
         new = relative.R @ R, relative.R @ t + length * relative.t
         self._poses, self._prior = self._poses.joined(*new), self._prior.with_frame(*new)
-        # The second frame stays, for the unit is told by it.
+        # The second frame is a keyframe, since it defines the unit.
         self._is_keyframe.append(self.is_new)
         self._has_landmarks.append(False)
         self._views.append(view)
@@ -393,14 +398,15 @@ class Window:
 
     def _add_pair(self, relative: RelativePose, length: float, share: float) -> None:
         """
-        Add what all matches of the pair tell of its rotation and direction to the prior.
+        Add the rotation and translation direction of the pair to the prior.
 
-        And its length, which may be off by a share: where landmarks tell next to nothing of it,
-        it would go wherever a prior drives it that was linearised elsewhere.
+        And its length, with a relative standard deviation: if landmarks hardly determine it, a
+        prior linearised elsewhere would move it arbitrarily.
         """
         R, t = relative.R, length * relative.t
-        # With steps (omega, upsilon) of the frame before and of the new one, the motion turns by
-        # omega_new - R omega_before and shifts by upsilon_new - [t]x omega_new - R upsilon_before.
+        # With steps (omega, upsilon) of the previous frame and of the new one, the motion rotates
+        # by omega_new - R omega_before and shifts by upsilon_new - [t]x omega_new - R
+        # upsilon_before.
         J = np.zeros((6, 12))
         J[:3, :3], J[3:, 3:6] = -R, -R
         J[:3, 6:9], J[3:, 6:9], J[3:, 9:] = np.eye(3), -skew(t), np.eye(3)
@@ -410,13 +416,13 @@ class Window:
             information = (J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
                            + np.outer(along, along))
         else:
-            information = J[:3].T @ J[:3] * _ROTATION_ALONE
+            information = J[:3].T @ J[:3] * _ROTATION_INFORMATION
         H = np.zeros_like(self._prior.H)
         H[-12:, -12:] = information
         self._prior.add(H, np.zeros(len(H)), self._poses)
 
-    def _found(self, relative: RelativePose, length: float) -> None:
-        """Make landmarks of the matches of a keyframe with the frame after it."""
+    def _create_landmarks(self, relative: RelativePose, length: float) -> None:
+        """Create landmarks from the matches of a keyframe with the frame after it."""
         tuning, anchor = self._tuning, len(self._views) - 2
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
@@ -435,8 +441,8 @@ class Window:
             straightened(self._K, x, self._poses.k1), slopes(*surfaces, x),
             self._distances.strengths(self._views[anchor].tested, np.rint(x).astype(np.int64))))
 
-    def _measure(self) -> None:
-        """Look for landmarks in the newest frame, and take where they are seen as observations."""
+    def _observe_landmarks(self) -> None:
+        """Observe landmarks in the newest frame."""
         sighted = Sighting(self._distances, self._K, self._views, self._poses,
                            self._landmarks).look(self._config.window // 2)
         if sighted is not None:
@@ -446,26 +452,26 @@ class Window:
             self._landmarks.sightings[sighted.which] += 1
 
     def _refine(self) -> Array:
-        """Move poses and depths by Gauss-Newton steps; gives the Hessian over the poses."""
-        self._equalise()
+        """Refine poses and depths by Gauss-Newton; returns the Hessian over the poses."""
+        self._normalise_roots()
         observed, prior = self._observed(), self._prior.at(self._poses)
         for _ in range(self._tuning.steps):
             reduced = self._reduced(observed)
             H, g = self._prior.H + reduced.H, prior.slope + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            observed, prior = self._moved(observed, prior, step, reduced.change(step))
+            observed, prior = self._line_search(observed, prior, step, reduced.change(step))
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
-        # Of the newest step, as the unit may be a far longer or shorter one.
+        # Relative to the newest step: the unit may be much longer or shorter.
         length = float(np.linalg.norm(self._poses.between[1][-1, -2]))
         self._landmarks = self._landmarks.of(np.asarray(
             self._landmarks.seen.any(1) & (self._landmarks.rho * length > -self._tuning.beyond)))
         return H
 
-    def _moved(self, observed: Observed, prior: OfPrior, step: Array, change: Array
-               ) -> tuple[Observed, OfPrior]:
-        """Go a step of the poses and its change of the landmarks, or as much as costs no more."""
+    def _line_search(self, observed: Observed, prior: OfPrior, step: Array, change: Array
+                     ) -> tuple[Observed, OfPrior]:
+        """Apply a step of poses and landmarks, halved until the cost does not grow."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
         cost = self._cost(observed, scale) + prior.cost
         for _ in range(self._tuning.halvings + 1):
@@ -478,87 +484,87 @@ class Window:
         return observed, prior
 
     def _cost(self, observed: Observed, scale: float) -> float:
-        """Tell what observations of a noise cost, robustly."""
-        losses, _ = self._robustly(observed, scale)
+        """Return the robust cost of observations with a noise `scale`."""
+        losses, _ = self._robust_losses(observed, scale)
         return float((losses.sum() + (observed.off**2).sum()) / (2 * scale**2))
 
-    def _robustly(self, observed: Observed, scale: float) -> tuple[Array, Array]:
-        """Losses (M,) of observations of a noise, and their weights."""
+    def _robust_losses(self, observed: Observed, scale: float) -> tuple[Array, Array]:
+        """Return the losses (M,) of observations with a noise `scale`, and their weights."""
         return Loss('geman_mcclure', self._tuning.bend * scale)((observed.residuals**2).sum(1))
 
-    def _equalise(self) -> None:
-        """Scale the roots in the newest frame so that a typical one is of a pixel."""
+    def _normalise_roots(self) -> None:
+        """Scale the roots of precision in the newest frame to a median of one pixel."""
         seen = self._landmarks.seen[:, -1]
         roots = self._landmarks.roots[seen, -1]
         if len(roots):
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
             self._landmarks.roots[seen, -1] = roots / median(sizes)
-            # The patch where a landmark was found has as much noise as the first that shows it.
+            # The anchor's patch is as noisy as the first one that observes it.
             anew = seen & ~self._landmarks.held.any((1, 2))
             self._landmarks.held[anew] = self._landmarks.roots[anew, -1]
 
     def _observed(self) -> Observed:
-        """All observations; their scale is told anew."""
+        """Return all observations, and update the noise scale."""
         observed = observe(self._K, self._poses, self._landmarks)
         if len(observed.residuals):
             self._scale = max(noise_scale(observed), self._tuning.least_scale)
         return observed
 
     def _reduced(self, observed: Observed, lens: bool = False) -> Reduced:
-        """Weigh observations robustly, and eliminate the depths; lens: with k1 beside poses."""
-        _, weights = self._robustly(observed, self._scale)
+        """Weight observations robustly and eliminate landmarks; lens: with k1 as a parameter."""
+        _, weights = self._robust_losses(observed, self._scale)
         weight = self._scale**-2
         return eliminate(observed, weights * weight, weight, len(self._views), lens)
 
-    def _addition(self, H: Array) -> Addition:
-        """Read the newest motion off the window, and how sure its length is."""
+    def _newest_motion(self, H: Array) -> Addition:
+        """Return the newest motion, and the uncertainty of its length."""
         R = self._poses.R[-1] @ self._poses.R[-2].T
         t = self._poses.t[-1] - R @ self._poses.t[-2]
         length = float(np.linalg.norm(t))
-        # Of the newest frame alone, the others held: an inverse of the block, not a block of the
-        # inverse, so that what the unit has drifted by before is not in it.
+        # Conditional on the other frames: the inverse of the block, not a block of the inverse, so
+        # that the drift of the unit before is not included.
         block = H[-6:, -6:]
         covariance = np.linalg.inv(block + np.diag(1e-12 * np.diag(block)))
         variance = float(unit(t) @ covariance[3:, 3:] @ unit(t))
-        # A frame's step turns its translation too.
+        # A frame's step also rotates its translation.
         J = np.eye(6)
         J[3:, :3] = -skew(t)
-        # Where rounding leaves less than nothing, nobody knows.
+        # Rounding may leave no positive variance.
         return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
-                        J @ covariance @ J.T, self._onward())
+                        J @ covariance @ J.T, self._corrected_step())
 
-    def _onward(self) -> Array:
+    def _corrected_step(self) -> Array:
         """
-        Go on (4, 4) from where the camera before was told to be.
+        Return the newest camera (4, 4) relative to the previous one as it was published.
 
-        By the step to the newest frame, and a part of what the one before has been refined by: a
-        track drifts less by it, but need not jump.
+        The step to the newest frame, with a share of the previous frame's refinement: it reduces
+        drift without a jump.
         """
         before, newest = self._poses.camera(-2), self._poses.camera(-1)
-        refined = np.linalg.inv(self._told) @ before
+        refined = np.linalg.inv(self._published) @ before
         mended, share = np.eye(4), self._tuning.mended
         mended[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
         mended[:3, 3] = share * refined[:3, 3]
         return np.asarray(mended @ np.linalg.inv(before) @ newest)
 
-    def _learn_lens(self) -> None:
+    def _update_lens(self) -> None:
         """
-        Ask the window which k1 suits it, before its oldest keyframe goes.
+        Update the estimate of k1 by the window, before its oldest keyframe is marginalised.
 
-        As each landmark is in as many windows as there are keyframes, each of them tells so much
-        less. What frames that are gone told stays as it was with the k1 of then.
+        Each landmark is in as many windows as there are keyframes, so each window's information is
+        divided by that number. The prior of marginalised frames keeps the k1 of its time.
         """
         observed = observe(self._K, self._poses, self._landmarks)
         told = self._reduced(observed, lens=True).of_k1()
-        _, weights = self._robustly(observed, self._scale)
+        _, weights = self._robust_losses(observed, self._scale)
         if told.curvature > 0:
             self.lens = self.lens.told(
                 self._poses.k1 + told.step, self._tuning.keyframes / told.curvature,
                 self._scale * np.sqrt(told.curvature / weights.sum()))
             self._poses = replace(self._poses, k1=self.lens.left)
 
-    def _settle(self, chosen: NDArray[np.bool_]) -> None:
-        """Take what some landmarks tell into the prior, and drop them, before a frame goes."""
+    def _marginalise_landmarks(self, chosen: NDArray[np.bool_]) -> None:
+        """Marginalise the chosen landmarks (N,) into the prior, before a frame is removed."""
         everything = self._landmarks
         self.settled = np.concatenate([self.settled, self._places(chosen)])
         self._landmarks = everything.of(chosen)
@@ -566,8 +572,8 @@ class Window:
         self._prior.add(reduced.H, reduced.g, self._poses)
         self._landmarks = everything.of(~chosen)
 
-    def _forget(self, frame: int) -> None:
-        """Eliminate a frame from the prior, and drop it with its landmarks."""
+    def _marginalise_frame(self, frame: int) -> None:
+        """Marginalise a frame, and remove it with its landmarks."""
         self._poses = self._poses.without_frame(frame)
         self._prior = self._prior.without_frame(frame)
         self._landmarks = self._landmarks.without_frame(frame)
