@@ -156,7 +156,7 @@ class Window:
         # The newest pair and its length, if it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
         # The pair whose length was last asked for, and the ratios by landmarks.
-        self._ratios_of: tuple[RelativePose, tuple[Array, Array]] | None = None
+        self._cached_ratios: tuple[RelativePose, tuple[Array, Array]] | None = None
         self.settled = np.empty((0, 3))
 
     @property
@@ -179,7 +179,7 @@ class Window:
         # Predict by the pair, with a length from known depths.
         first = self.is_new
         length, share = (guess, _UNIT_SIGMA) if first else self._length(relative, guess)
-        self._ratios_of = None
+        self._cached_ratios = None
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
         # Observe old and new landmarks in the frame; then refine all.
@@ -294,11 +294,11 @@ class Window:
     def _ratios(self, relative: RelativePose) -> tuple[Array, Array]:
         """Return the lengths (M,) of a pair by each landmark with a match, and their weights."""
         # Asked twice for a pair: whether the camera moved, and how far.
-        if self._ratios_of is None or self._ratios_of[0] is not relative:
+        if self._cached_ratios is None or self._cached_ratios[0] is not relative:
             x = relative.x[relative.inliers]
-            self._ratios_of = relative, self._ratios_by(
+            self._cached_ratios = relative, self._ratios_by(
                 relative, *self._matched(x, self._landmarks.seen[:, -1]))
-        return self._ratios_of[1]
+        return self._cached_ratios[1]
 
     def _ratios_by(self, relative: RelativePose, rho: Array, match: NDArray[np.int64]
                    ) -> tuple[Array, Array]:
