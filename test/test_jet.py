@@ -287,7 +287,7 @@ def test_the_core_scale_is_that_of_the_right_matches_where_most_are_false():
 
 @pytest.mark.parametrize('rounds', [1, 6, 7, 8, 9])
 def test_the_core_scale_of_exact_matches_is_zero_after_any_number_of_rounds(monkeypatch, rounds):
-    monkeypatch.setattr(jet, '_CORE_ROUNDS', rounds)
+    monkeypatch.setattr(jet, '_CLIPPING_ROUNDS', rounds)
     assert core_scale(np.zeros(10)) == 0.0
     assert core_scale(np.append(np.zeros(10), [3.0, 5.0, 9.0])) == 0.0
 

@@ -1,4 +1,4 @@
-/* Gray levels between pixels, of several places at once. */
+/* Bilinear interpolation of gray levels, at several positions in parallel (SIMD). */
 #ifndef DJET_BETWEEN_H
 #define DJET_BETWEEN_H
 
@@ -8,12 +8,11 @@
 
 enum { LANES = 8 };
 
-/* So many numbers side by side; sums are those of each lane by itself. */
+/* Vectors of numbers; each lane has a sum of its own. */
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
 typedef int32_t Whole __attribute__((vector_size(LANES * sizeof(int32_t))));
 
-/* Numbers that lie so far apart, side by side. Where there are fewer than lanes, the last one stands
-   in for those that are lacking. */
+/* Load numbers at a stride. If there are fewer than lanes, the last one is repeated. */
 INLINE Lanes gathered(const float *values, int apart, int count)
 {
     Lanes lanes = {0};
@@ -29,7 +28,7 @@ INLINE Lanes load(const float *values)
     return lanes;
 }
 
-/* Each lane at least `least` and at most `most`, which what is no number is too. */
+/* Clip each lane to [least, most], also NaN. */
 INLINE Lanes clipped(Lanes values, float least, float most)
 {
     const Whole above = values > least, below = values < most;
@@ -38,13 +37,13 @@ INLINE Lanes clipped(Lanes values, float least, float most)
     return (Lanes)((below & raised) | (~below & (Whole)highest));
 }
 
-/* An image of so many bytes a pixel: unsigned ones, or two with a sign. */
+/* An image of one unsigned byte or two signed bytes a pixel. */
 typedef struct {
     const void *pixels;
     int bytes, height, width;
 } Image;
 
-/* What is at so many pixels, and next to them on the right, in one number. */
+/* The values at pixels and their right neighbours, packed in one number. */
 INLINE Whole pairs_at(Image image, Whole pixels)
 {
     Whole pairs = {0};
@@ -59,8 +58,8 @@ INLINE Whole pairs_at(Image image, Whole pixels)
     return pairs;
 }
 
-/* The first or the second of pairs. */
-INLINE Lanes one_of(Image image, Whole pairs, int number)
+/* Unpack the first or the second value of pairs. */
+INLINE Lanes unpacked(Image image, Whole pairs, int number)
 {
     const int is_low = (__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__) == (number == 0);
     const Whole one = image.bytes == 1 ? (is_low ? pairs & 255 : pairs >> 8)
@@ -68,7 +67,7 @@ INLINE Lanes one_of(Image image, Whole pairs, int number)
     return __builtin_convertvector(one, Lanes);
 }
 
-/* Gray levels between pixels; beyond the image its border goes on. */
+/* Bilinear interpolation; beyond the image, border pixels are replicated. */
 INLINE Lanes between(Image image, Lanes x, Lanes y)
 {
     x = clipped(x, 0, image.width - 1);
@@ -80,9 +79,10 @@ INLINE Lanes between(Image image, Lanes x, Lanes y)
                 of_below = pairs_at(image, first + image.width);
     x -= __builtin_convertvector(left, Lanes);
     y -= __builtin_convertvector(top, Lanes);
-    const Lanes left_above = one_of(image, of_above, 0), left_below = one_of(image, of_below, 0);
-    const Lanes above = left_above + x * (one_of(image, of_above, 1) - left_above);
-    const Lanes below = left_below + x * (one_of(image, of_below, 1) - left_below);
+    const Lanes left_above = unpacked(image, of_above, 0),
+                left_below = unpacked(image, of_below, 0);
+    const Lanes above = left_above + x * (unpacked(image, of_above, 1) - left_above);
+    const Lanes below = left_below + x * (unpacked(image, of_below, 1) - left_below);
     return above + y * (below - above);
 }
 

@@ -1,15 +1,16 @@
-/* Residuals of a window, and its normal equations, the landmarks eliminated: see core/bundle.py. */
+/* Residuals of the sliding window, and its normal equations with landmarks eliminated: see
+   core/bundle.py. */
 #include <string.h>
 
 #include "common.h"
 
-/* Of one observation: X/Z, Y/Z; its residuals (2,), and how they change with the steps of both
-   poses, and with the landmark's inverse depth and point, all of them by the root of its weight. */
+/* One observation: X/Z, Y/Z; its residuals (2,), and their Jacobians by the steps of both
+   poses, and by the landmark's inverse depth and point, all times the root of its weight. */
 typedef struct {
     double u[2], e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
 } Row;
 
-/* A camera (3, 3) and its inverse, its lens, and what projections are held to: see core/bundle.py
+/* A camera (3, 3) and its inverse, its lens, and the limits of projections: see core/bundle.py
    and core/radial.py. */
 typedef struct {
     const double *K, *K_inverse;
@@ -22,7 +23,7 @@ static Lens lens_of(const double *K, const double *K_inverse, const double tunin
     return lens;
 }
 
-INLINE double within(double value, double most)
+INLINE double limited(double value, double most)
 {
     return value > most ? most : value < -most ? -most : value;
 }
@@ -30,7 +31,7 @@ INLINE double within(double value, double most)
 /* radial.stretch. */
 INLINE double stretch(const Lens *lens, const double u[2])
 {
-    return 1 + within(lens->k1 * (u[0] * u[0] + u[1] * u[1]), lens->farthest);
+    return 1 + limited(lens->k1 * (u[0] * u[0] + u[1] * u[1]), lens->farthest);
 }
 
 INLINE double depth_of(const Lens *lens, const double place[3])
@@ -38,8 +39,8 @@ INLINE double depth_of(const Lens *lens, const double place[3])
     return place[2] > lens->nearest ? place[2] : lens->nearest;
 }
 
-/* What is left over (2,), by a root (2, 2), between where a place is seen and a pixel. */
-INLINE void hold_against(const Lens *lens, const double place[3], const double pixel[2],
+/* The residual (2,) of a point and an observed pixel, whitened by a root (2, 2). */
+INLINE void whitened_residual(const Lens *lens, const double place[3], const double pixel[2],
                          const double *root, double *residual)
 {
     const double depth = depth_of(lens, place), u[2] = {place[0] / depth, place[1] / depth};
@@ -47,14 +48,15 @@ INLINE void hold_against(const Lens *lens, const double place[3], const double p
     double off[2];
     for (int i = 0; i < 2; i++) {
         const double *row = lens->K + 3 * i;
-        off[i] = within(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
+        off[i] = limited(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
     }
     for (int i = 0; i < 2; i++)
         residual[i] = root[2 * i] * off[0] + root[2 * i + 1] * off[1];
 }
 
-/* bundle._through_the_lens, of one root (2, 2) at u. */
-INLINE void see_through(const Lens *lens, const double u[2], const double *root, double turned[4])
+/* bundle._by_undistorted, of one root (2, 2) at u. */
+INLINE void by_undistorted(const Lens *lens, const double u[2], const double *root,
+                           double turned[4])
 {
     const double *K = lens->K, *back = lens->K_inverse, by = stretch(lens, u);
     for (int i = 0; i < 2; i++) {
@@ -69,8 +71,8 @@ INLINE void see_through(const Lens *lens, const double u[2], const double *root,
     }
 }
 
-/* bundle._over_k1, of one root (2, 2) at u. */
-INLINE void over_k1(const Lens *lens, const double u[2], const double *root, double moved[2])
+/* bundle._by_k1, of one root (2, 2) at u. */
+INLINE void by_k1(const Lens *lens, const double u[2], const double *root, double moved[2])
 {
     const double *K = lens->K, squared = u[0] * u[0] + u[1] * u[1];
     const double x = squared * (K[0] * u[0] + K[1] * u[1]);
@@ -79,10 +81,10 @@ INLINE void over_k1(const Lens *lens, const double u[2], const double *root, dou
         moved[i] = root[2 * i] * x + root[2 * i + 1] * y;
 }
 
-/* bundle.observe: of N landmarks, their points (N, 2) seen first by some of F frames, M
-   observations. R_between (F, F, 3, 3) and t_between (F, F, 3) lead from each frame (second) to
-   each other one; minima (N, F, 2), roots (N, F, 2, 2); tuning: k1, the nearest place, the
-   farthest that k1 moves points, and pixels beyond which nothing is told apart. */
+/* bundle.observe: M observations of N landmarks by F frames. points: (N, 2) in the anchors;
+   R_between (F, F, 3, 3) and t_between (F, F, 3) lead from each frame (second index) to each
+   other one; minima (N, F, 2), roots (N, F, 2, 2); tuning: k1, least depth, largest relative
+   displacement by k1, and bound of pixels. */
 WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
                        const int64_t *anchors, const double *R_between, const double *t_between,
                        const double (*points)[2], const double *depths, const double *minima,
@@ -99,7 +101,7 @@ WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64
             towards[i] = straight[n][i] = points[n][0] * K_inverse[3 * i]
                                           + points[n][1] * K_inverse[3 * i + 1]
                                           + K_inverse[3 * i + 2];
-        hold_against(&lens, towards, found[n], held + 4 * n, off[n]);
+        whitened_residual(&lens, towards, found[n], held + 4 * n, off[n]);
     }
     for (int m = 0; m < M; m++) {
         const int64_t n = landmark[m], seen = n * F + frame[m];
@@ -115,7 +117,7 @@ WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64
         for (int i = 0; i < 3; i++)
             place[m][i] = R[m][3 * i] * ray[m][0] + R[m][3 * i + 1] * ray[m][1]
                           + R[m][3 * i + 2] + rho[m] * t[m][i];
-        hold_against(&lens, place[m], minima + 2 * seen, root[m], residuals[m]);
+        whitened_residual(&lens, place[m], minima + 2 * seen, root[m], residuals[m]);
     }
 }
 
@@ -145,7 +147,7 @@ static void differentiate(const Lens *lens, const double *residuals, const doubl
     double turned[4];
     row->u[0] = place[0] / depth;
     row->u[1] = place[1] / depth;
-    see_through(lens, row->u, root, turned);
+    by_undistorted(lens, row->u, root, turned);
     for (int i = 0; i < 2; i++) {
         double by_place[3], by_turned[3];
         for (int j = 0; j < 2; j++)
@@ -167,7 +169,7 @@ static void differentiate(const Lens *lens, const double *residuals, const doubl
     }
 }
 
-/* Add A^T B to a block that begins somewhere in rows of a length. A: (2, rows), B: (2, columns). */
+/* Add A^T B to a block of a matrix with rows of a given length. A: (2, rows), B: (2, columns). */
 INLINE void add_block(double *block, int64_t length, const double *A, int rows, const double *B,
                       int columns)
 {
@@ -176,7 +178,7 @@ INLINE void add_block(double *block, int64_t length, const double *A, int rows, 
             block[i * length + j] += A[i] * B[j] + A[rows + i] * B[columns + j];
 }
 
-/* The inverse of a positive definite matrix (3, 3), by L D L^T. */
+/* Invert a positive definite matrix (3, 3), by L D L^T. */
 static void invert(const double *A, double *inverse)
 {
     const double d0 = A[0], l10 = A[3] / d0, l20 = A[6] / d0;
@@ -192,8 +194,8 @@ static void invert(const double *A, double *inverse)
     inverse[8] = 1 / d2;
 }
 
-/* Take a landmark out of the equations over the poses: it is coupled with these by C (3, size),
-   between two columns alone. */
+/* Eliminate a landmark from the equations over the poses (Schur complement). C: (3, size)
+   couples it with them, and is zero outside of columns [from, to). */
 INLINE void eliminate(int64_t size, int64_t from, int64_t to, const double *C,
                       const double *variances, const double *slopes, double *gain, double *H,
                       double *g)
@@ -212,9 +214,9 @@ INLINE void eliminate(int64_t size, int64_t from, int64_t to, const double *C,
     }
 }
 
-/* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark.
-   Adds to H (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 6F for the poses, and
-   one before them where k1 is asked for; gives variances (N, 3, 3); gain: (3, S) of memory;
+/* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark. Adds to H
+   (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 6F for the poses, and one
+   before them if k1 is a parameter; writes variances (N, 3, 3); gain: (3, S) scratch memory;
    tuning: see djet_observe. */
 WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landmark,
                          const int64_t *frame, const int64_t *anchor, const double *residuals,
@@ -232,9 +234,9 @@ WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landma
         double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace}, held[4], by[2];
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
         const double *gone = off + 2 * n;
-        see_through(&lens, straight[n], held_before + 4 * n, held);
-        over_k1(&lens, straight[n], held_before + 4 * n, by);
-        /* All frames that see a landmark lie between two of them. */
+        by_undistorted(&lens, straight[n], held_before + 4 * n, held);
+        by_k1(&lens, straight[n], held_before + 4 * n, by);
+        /* Range of columns of the frames that observe the landmark. */
         int64_t from = with_k1 ? 0 : size, to = with_k1;
         if (with_k1) {
             H[0] += weight * (by[0] * by[0] + by[1] * by[1]);
@@ -271,7 +273,7 @@ WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landma
             add_block(slope, 1, by_own, 3, row.e, 1);
             if (with_k1) {
                 double k1[2];
-                over_k1(&lens, row.u, root + 4 * m, k1);
+                by_k1(&lens, row.u, root + 4 * m, k1);
                 k1[0] *= root_of_weight;
                 k1[1] *= root_of_weight;
                 add_block(H, size, k1, 1, k1, 1);

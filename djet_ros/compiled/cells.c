@@ -1,9 +1,10 @@
-/* What matches in cells of an image tell together: see core/covariance.py. */
+/* Sums of matches over cells of an image: see core/covariance.py. */
 #include <string.h>
 
 #include "common.h"
 
-/* Parameters of a pose; terms of a match, the last of which are told of cells of all sides. */
+/* Parameters of a pose; terms of a match, the last OF_SIDES of which are summed for cells of
+   all sizes; the most sizes. */
 enum { POSE = 5, TERMS = 27, OF_SIDES = POSE + 2, MOST_SIDES = 8 };
 
 /* covariance._terms of one match. */
@@ -24,7 +25,7 @@ INLINE void terms_of(const double J[POSE], double weight, double r, double terms
     terms[entry] = weight;
 }
 
-/* Add the products of a cell's sums to those of its side. */
+/* Add the outer products of a cell's sums to those of its size. */
 INLINE void add_products(const double sums[OF_SIDES], double pulls[POSE][POSE],
                          double products[2])
 {
@@ -35,12 +36,12 @@ INLINE void add_products(const double sums[OF_SIDES], double pulls[POSE][POSE],
         products[i] += sums[POSE + i] * sums[POSE + i];
 }
 
-/* Sum up the terms of n matches by cells in cells in cells: covariance.sums_of_cells. J: (5, n);
-   weights, r: (n,); order: (n,) in which matches come by cells, and their codes in that, which are
-   the same in cells of number s, from 0 to `sides`, but for the last 2 s bits; small: the number of
-   those that all is told of. Gives how many of these there are, C, their sums (C, 27), and the
-   first (C,) of their matches in order; and of each side pulls (sides, 5, 5) and products
-   (sides, 2). */
+/* Sum the terms of n matches over nested cells: covariance.sums_of_cells. J: (5, n); weights,
+   r: (n,); order: (n,) of the matches along a space-filling curve, and their codes in that
+   order; codes in one cell of size s, from 0 to `sides`, agree in all but the last 2 s bits;
+   small: the size whose sums are returned. Returns the number C of its cells, their sums (C,
+   27), and the index (C,) of their first match in order; and for each size pulls (sides, 5, 5)
+   and products (sides, 2). */
 WIDE int djet_sums_of_cells(int n, const double *J, const double *weights, const double *r,
                            const int64_t *order, const uint64_t *codes, int sides, int small,
                            double (*sums)[TERMS], int64_t *first, double (*pulls)[POSE][POSE],
@@ -52,7 +53,7 @@ WIDE int djet_sums_of_cells(int n, const double *J, const double *weights, const
     memset(products, 0, (size_t)sides * sizeof *products);
     for (int k = 0; k <= n; k++) {
         const uint64_t differing = k == 0 ? 0 : k == n ? UINT64_MAX : codes[k] ^ codes[k - 1];
-        /* Cells that end here are parts of those of the next side. */
+        /* Cells that end here are parts of those of the next size. */
         for (int side = 0; side < sides && differing >> (2 * side); side++) {
             add_products(open[side], pulls[side], products[side]);
             for (int i = 0; i < OF_SIDES; i++)
@@ -78,7 +79,7 @@ WIDE int djet_sums_of_cells(int n, const double *J, const double *weights, const
     return count;
 }
 
-/* Invert a matrix that is positive definite. */
+/* Invert a positive definite matrix by Gauss-Jordan elimination. */
 INLINE void invert(double A[POSE][POSE])
 {
     for (int pivot = 0; pivot < POSE; pivot++) {
@@ -97,9 +98,9 @@ INLINE void invert(double A[POSE][POSE])
     }
 }
 
-/* How a pose would move without the matches of each of C cells: covariance.without_each. whole:
-   (5, 5) H of all of them; cells: (C, 27) sums. Gives moves (C, 5), and summed up the inverses
-   (5, 5) of what is left. */
+/* Change of a pose when each of C cells is left out in turn: covariance.without_each. whole:
+   (5, 5) H of all matches; cells: (C, 27) sums. Writes changes (C, 5), and the sum (5, 5) of
+   the inverse Hessians. */
 WIDE void djet_without_each(int C, const double whole[POSE][POSE], const double (*cells)[TERMS],
                             double (*moves)[POSE], double inverses[POSE][POSE])
 {

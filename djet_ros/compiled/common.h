@@ -1,12 +1,12 @@
-/* What all of these share. */
+/* Definitions common to all files. */
 #ifndef DJET_COMMON_H
 #define DJET_COMMON_H
 
 #include <math.h>
 #include <stdint.h>
 
-/* Functions that are built twice, the second time for wider instructions: a machine that has them
-   takes that one. Both sum up in one order, and round alike. */
+/* Functions built twice, the second time for AVX2, selected at run time. Both sum in the same
+   order and round alike. */
 #if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
 #define WIDE __attribute__((target_clones("avx2", "default")))
 #else

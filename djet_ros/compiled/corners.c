@@ -1,20 +1,19 @@
-/* How corner-like places of an image are: see core/corners.py. */
+/* Corner strength: see core/corners.py. */
 #include <stdlib.h>
 #include <string.h>
 
 #include "common.h"
 
-/* Rows of blocks that are next to one another, and products of slopes along x and y: xx, xy, yy. */
+/* Rows of blocks summed, and products of gradients along x and y: xx, xy, yy. */
 enum { NEAR = 3, PRODUCTS = 3 };
 
-/* A place beyond either end is that as far within: OpenCV's BORDER_REFLECT_101. */
+/* Mirror an index at both ends: OpenCV's BORDER_REFLECT_101. */
 static int mirrored(int place, int count)
 {
     return place < 0 ? -place : place < count ? place : 2 * count - 2 - place;
 }
 
-/* Sobel's slopes in a row of pixels, along x and y. across, down: (width + 2,), room for what that
-   takes. */
+/* Sobel gradients of a row of pixels, along x and y. across, down: (width + 2,) scratch memory. */
 INLINE void slopes_at(const uint8_t *image, int height, int width, int row,
                       int16_t *restrict across, int16_t *restrict down, int16_t *restrict dx,
                       int16_t *restrict dy)
@@ -36,7 +35,7 @@ INLINE void slopes_at(const uint8_t *image, int height, int width, int row,
     }
 }
 
-/* Add products of slopes (2 n,), in pairs. */
+/* Add products of gradients (2 n,), summed in pairs. */
 INLINE void add_pairs(const int16_t *restrict a, const int16_t *restrict b, int n,
                       int32_t *restrict sums)
 {
@@ -54,7 +53,7 @@ INLINE void add_rows(const int32_t *a, const int32_t *b, const int32_t *c, int n
     sums[n + 1] = sums[n - 1];
 }
 
-/* Slopes of a row of blocks by sums (3, n + 2) of products in three rows of pairs. */
+/* Corner strengths of a row of blocks, by sums (3, n + 2) of products over three rows of pairs. */
 INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
                       float *restrict slopes)
 {
@@ -70,9 +69,9 @@ INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
     }
 }
 
-/* Mean square slopes (height / 2, width / 2) of blocks in their weakest direction, 0 where it is
-   less than a share of that in the strongest: core.corners.corner_slopes. height, width: even;
-   sums, rows: room for (12, width / 2 + 1) and (4, width + 2). */
+/* Mean square gradients (height / 2, width / 2) of blocks in their weakest direction, 0 if that
+   is less than a share of the strongest one: core.corners.corner_slopes. height, width: even;
+   sums, rows: scratch memory (12, width / 2 + 1) and (4, width + 2). */
 WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float least_ratio,
                              float unit, int32_t *sums, int16_t *rows, float *slopes)
 {
@@ -93,7 +92,7 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
         }
         if (row == 0)
             continue;
-        /* Those above and below the one before are known now. */
+        /* The rows above and below the previous one are complete now. */
         const int32_t *near[NEAR];
         for (int i = 0; i < NEAR; i++)
             near[i] = sums + mirrored(row - 2 + i, blocks) % NEAR * PRODUCTS * n;
@@ -104,10 +103,10 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
     }
 }
 
-/* Corners are the strongest of all that are next to them, or of those that are so near. */
+/* Radius of the wider neighbourhood of a maximum. */
 enum { AROUND = 3 };
 
-/* Whether a value is the largest of all around it. */
+/* Return whether a value is the maximum of its wider neighbourhood. */
 INLINE int is_highest(const float *value, int width)
 {
     int higher = 0;
@@ -117,10 +116,9 @@ INLINE int is_highest(const float *value, int width)
     return !higher;
 }
 
-/* Slopes (height, width) above a least one that are the strongest of those next to them, `margin`
-   or more from the left and above, before a last column and row: core.corners._peaks. Gives how
-   many, their places in the flat array, and whether they are the strongest around too. memory:
-   (width,). */
+/* Local maxima of slopes (height, width) above `least`, from `margin` on in both axes, before a
+   last column and row: core.corners._peaks. Returns their number, indices into the flat array,
+   and whether they are maxima of the wider neighbourhood. memory: (width,). */
 WIDE int djet_peaks(const float *slopes, int width, float least, int margin, int after_column,
                     int after_row, uint8_t *restrict memory, int64_t *restrict places,
                     uint8_t *restrict around)
@@ -144,8 +142,8 @@ WIDE int djet_peaks(const float *slopes, int width, float least, int margin, int
     return count;
 }
 
-/* Pixels (n, 2) at which parabolas through peaks of slopes, at places (n,) of the flat array and
-   none of them at its border, are highest: core.corners._exact_peaks. */
+/* Sub-pixel maxima (n, 2) of parabolas through peaks of slopes, at indices (n,) of the flat
+   array, none of them at its border: core.corners._exact_peaks. */
 WIDE void djet_exact_peaks(const float *slopes, int width, int n, const int64_t *places,
                            double (*points)[2])
 {
@@ -156,24 +154,25 @@ WIDE void djet_exact_peaks(const float *slopes, int width, int n, const int64_t 
             const float here = at[0], before = at[-steps[axis]], after = at[steps[axis]];
             const float curved = 2 * here - before - after;
             const float off = (after - before) / (2 * (curved > 1e-9f ? curved : 1e-9f));
-            /* The middle of two pixels is half a pixel beyond the first. */
+            /* The centre of two pixels is half a pixel beyond the first. */
             points[k][axis] = 2 * ((double)whole[axis]
                                    + (off < -0.5f ? -0.5f : off > 0.5f ? 0.5f : off)) + 0.5;
         }
     }
 }
 
-/* Choose at most so many of n points, the best of each cell before others: core.corners.spread_out.
-   points: (n, 2) pixels; by_strength: (n,) their order; first: (n,) those that come before all
-   others; side: of cells, of which there are so many in a row and in all. memory: twice as many,
-   and (3, n). Gives how many are chosen, and which of them, in order. */
+/* Choose at most `most` of n points, the best of each cell before others:
+   core.corners.spread_out. points: (n, 2) pixels; by_strength: (n,) their order; first: (n,)
+   points preferred to all others; side: of cells, of which there are `columns` in a row and
+   `cells` in all. memory: twice as many, and (3, n). Returns how many are chosen, and their
+   indices, in order. */
 int djet_spread_out(int n, const int64_t (*points)[2], const int64_t *by_strength,
                     const uint8_t *first, int side, int columns, int cells, int most,
                     int32_t *memory, int64_t *chosen)
 {
     int32_t *in_cell = memory, *of_rank = in_cell + 2 * cells, *rank = of_rank + 2 * n;
     memset(memory, 0, (size_t)(2 * (cells + n)) * sizeof *memory);
-    /* By how many of its cell, and of its kind, a point comes behind. */
+    /* Rank of a point among those of its cell and preference. */
     for (int k = 0; k < n; k++) {
         const int64_t point = by_strength[k];
         const int late = !first[point];
@@ -196,9 +195,9 @@ int djet_spread_out(int n, const int64_t (*points)[2], const int64_t *by_strengt
     return count;
 }
 
-/* Sums of the sizes of curvatures in rows of blocks: core.corners._curved_blocks. Blocks are `side`
-   wide and high, in `across` columns; rows of them begin one pixel after so many rows of the image
-   (height, width). memory: (2, width + 2). */
+/* Sums of absolute curvatures in blocks: core.corners._curved_blocks. Blocks are `side` wide
+   and high, in `across` columns; rows of them begin every `apart` rows of the image (height,
+   width), one pixel below. memory: (2, width + 2). */
 WIDE void djet_curved_blocks(const uint8_t *image, int width, int rows, int apart, int side,
                              int across, int32_t *restrict memory, int32_t *restrict sums)
 {

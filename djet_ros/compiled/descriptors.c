@@ -1,10 +1,10 @@
 /* Descriptors and their distances: see core/hamming.py and core/features.py. */
 #include "common.h"
 
-/* How many tests there are, and 64-bit words of a descriptor. */
+/* Number of tests, and of 64-bit words of a descriptor. */
 enum { TESTS = 256, WORDS = TESTS / 64 };
 
-/* How far from a pixel both ends of each test are, in images of a width. */
+/* Offsets of both ends of each test from a pixel, in images of one width. */
 typedef struct {
     int32_t first[TESTS], second[TESTS];
 } Ends;
@@ -19,7 +19,7 @@ INLINE Ends ends_of(const int64_t (*tests)[4], int width)
     return ends;
 }
 
-/* The pixel next to a point; none where a descriptor would leave the image. */
+/* The pixel nearest to a point; null if its descriptor would leave the image. */
 INLINE const uint8_t *pixel_at(const uint8_t *gray, int height, int width, const double point[2],
                                int reach)
 {
@@ -28,9 +28,9 @@ INLINE const uint8_t *pixel_at(const uint8_t *gray, int height, int width, const
     return inside ? gray + (int64_t)y * width + (int64_t)x : 0;
 }
 
-/* In how many bits (n,) descriptors differ at the pixels next to x (n, 2) of one image (height,
-   width) and y (n, 2) of another; NaN where one of them has none. tests: (TESTS, 4), which look at
-   most `reach` pixels away. */
+/* Hamming distances (n,) of descriptors at the pixels nearest to x (n, 2) of one image (height,
+   width) and y (n, 2) of another; NaN if one of them has none. tests: (TESTS, 4), which reach
+   at most `reach` pixels. */
 WIDE void djet_match_distances(const uint8_t *there, const uint8_t *here, int height, int width,
                                int n, const double (*x)[2], const double (*y)[2],
                                const int64_t (*tests)[4], int reach, double *distances)
@@ -47,11 +47,10 @@ WIDE void djet_match_distances(const uint8_t *there, const uint8_t *here, int he
     }
 }
 
-/* Which feature of another image each of one is most similar to, and how similar: 64 less half of
-   the bits in which they differ, less the square of how far they are apart. Only those of `strips`
-   (m, 4) are compared, from a first one up to a last one of both images. Gives `nearest` and
-   `best_there` for the one image, -1 and -infinity where there is none, `best_here` for the other
-   one. */
+/* Most similar features of two images. Similarity: 64 less half of the Hamming distance, less
+   the squared distance in the image. Only features in the same of `strips` (m, 4) are compared:
+   ranges [first, last) in both images. Writes `nearest` and `best_there` for the one image, -1
+   and -infinity if there is none, and `best_here` for the other one. */
 WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int n_here,
                             const uint64_t (*there)[WORDS], const float (*x)[2],
                             const uint64_t (*here)[WORDS], const float (*y)[2], int64_t *nearest,
@@ -84,8 +83,8 @@ WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int 
         }
 }
 
-/* Descriptors (n, TESTS / 8) at pixels (n, 2) of an image, which have room for them. Of a byte, the
-   lowest bit comes first. */
+/* Descriptors (n, TESTS / 8) at pixels (n, 2) of an image, which has room for them; the lowest
+   bit of each byte first. */
 WIDE void djet_describe(const uint8_t *gray, int width, int n, const int64_t (*pixels)[2],
                         const int64_t (*tests)[4], uint8_t (*descriptors)[TESTS / 8])
 {

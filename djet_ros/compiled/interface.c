@@ -1,4 +1,4 @@
-/* What functions take and give: to be changed with it, here and in __init__.py. */
+/* Version of the functions' signatures: change it with them, here and in __init__.py. */
 int djet_interface(void)
 {
     return 9;

@@ -1,4 +1,4 @@
-/* Which of some points is next to each of others: see core/prediction.py. */
+/* Nearest neighbours in the image: see core/prediction.py. */
 #include <string.h>
 
 #include "common.h"
@@ -18,7 +18,7 @@ static Cells cells_around(int n, const double (*points)[2])
             most[axis] = fmax(most[axis], points[k][axis]);
         }
     const double width = most[0] - least[0], height = most[1] - least[1];
-    /* No more than (n + 1) of them either way, and 3 n + 1 in all. */
+    /* No more than (n + 1) of them along each axis, and 3 n + 1 in all. */
     double side = fmax(sqrt(width * height / n), fmax(width, height) / n);
     side = side > 0 ? side : 1;
     const Cells cells = {least[0], least[1], side, (int)(width / side) + 1,
@@ -41,8 +41,8 @@ static int row_of(const Cells *cells, double y)
     return place_in((y - cells->top) / cells->side, cells->rows);
 }
 
-/* Sort points (n, 2) by cells: `order` (n,), in which those of a cell begin at `first` of its number
-   and end where those of the next begin. */
+/* Sort points (n, 2) by cells: `order` (n,), in which those of cell c are at [first[c], first[c
+   + 1]). */
 static void sort_into(const Cells *cells, int n, const double (*points)[2], int32_t *first,
                       int32_t *order)
 {
@@ -58,8 +58,8 @@ static void sort_into(const Cells *cells, int n, const double (*points)[2], int3
     }
 }
 
-/* The indices (m,) of those of n points that are next to m others, all (n, 2), n > 0, and finite.
-   memory: room for 4 n + 2. */
+/* Indices (m,) of the nearest of n points to each of m others, all (n, 2), n > 0, and finite.
+   memory: 4 n + 2. */
 WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*others)[2],
                        int32_t *memory, int64_t *nearest)
 {
@@ -71,7 +71,7 @@ WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*o
         const int column = column_of(&cells, x), row = row_of(&cells, y);
         double least = INFINITY;
         nearest[k] = 0;
-        /* Square rings of cells around its own, until what is beyond them is farther off. */
+        /* Search square rings of cells around its own, until all beyond are farther away. */
         for (int ring = 0;; ring++) {
             const int left = column - ring, right = column + ring, top = row - ring,
                       bottom = row + ring;

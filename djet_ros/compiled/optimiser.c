@@ -1,12 +1,12 @@
-/* The joint optimiser: core/jet.py has the residuals and steps, core/sketch.py those of many
-   starts. Here sums over matches are in another order, and so round otherwise. */
+/* The joint optimiser: residuals and steps are those of core/jet.py, those of many starts of
+   core/sketch.py. Sums over matches have another order here, and round differently. */
 #include <string.h>
 
 #include "common.h"
 
 enum { NONE, HUBER, CAUCHY, GEMAN_MCCLURE };
 
-/* So many matches are worked on side by side; rows are filled up with some that say nothing. */
+/* Matches computed in parallel; rows are padded with matches without effect. */
 enum { LANES = 4 };
 typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
 
@@ -21,7 +21,7 @@ typedef struct {
     double scale;
 } Loss;
 
-/* Matches as a pose leaves them, rows of m. J: (5, m). */
+/* Residuals of matches at a pose, rows of m. J: (5, m). */
 enum { ROWS_LEFT = 9, ROWS_GIVEN = 10 };
 typedef struct {
     double *r, *sign, *weight, *curvature, *J;
@@ -85,8 +85,8 @@ static void sphere_tangents(const double t[3], double tangents[2][3])
     memcpy(tangents, values, sizeof values);
 }
 
-/* How E = [t]_x R changes with a pose's five parameters. */
-static void slopes_of(const Pose *pose, const double tangents[2][3], double slopes[5][9])
+/* Derivatives of E = [t]_x R by a pose's five parameters. */
+static void derivatives_of(const Pose *pose, const double tangents[2][3], double slopes[5][9])
 {
     double T[3][3], S[3][3], turned[3][3];
     cross_matrix(pose->t, T);
@@ -104,15 +104,15 @@ static void slopes_of(const Pose *pose, const double tangents[2][3], double slop
     }
 }
 
-/* Take the residuals at a pose, and J if it is wanted; the variances' own change is in that if they
-   are `exact`. */
-INLINE void look(const Problem *problem, const Pose *pose, const double tangents[2][3], int exact,
-                 int with_J, Left *left)
+/* Compute the residuals at a pose, and J on demand, which includes the derivative of the
+   variances if `exact`. */
+INLINE void residuals_at(const Problem *problem, const Pose *pose, const double tangents[2][3],
+                         int exact, int with_J, Left *left)
 {
     double T[3][3], E[3][3], slopes[5][9];
     cross_matrix(pose->t, T);
     multiply((const double (*)[3])T, pose->R, E);
-    slopes_of(pose, tangents, slopes);
+    derivatives_of(pose, tangents, slopes);
     const int m = problem->m;
     for (int k = 0; k < m; k += LANES) {
         const double *rays_x = problem->x + k, *rays_y = problem->y + k,
@@ -123,7 +123,7 @@ INLINE void look(const Problem *problem, const Pose *pose, const double tangents
         Lanes line[3];
         for (int i = 0; i < 3; i++)
             line[i] = E[i][0] * x[0] + E[i][1] * x[1] + E[i][2] * x[2];
-        /* The line's first components, times the covariance of its point. */
+        /* Covariance of the point times the line's normal. */
         const Lanes M[2] = {s[0] * line[0] + s[1] * line[1], s[1] * line[0] + s[2] * line[1]};
         const Lanes variance = line[0] * M[0] + line[1] * M[1], zero = {0};
         Lanes sign;
@@ -134,9 +134,9 @@ INLINE void look(const Problem *problem, const Pose *pose, const double tangents
         const Lanes r = (y[0] * line[0] + y[1] * line[1] + y[2] * line[2]) * of;
         Lanes w[3] = {y[0] * of, y[1] * of, y[2] * of};
         if (exact) {
-            const Lanes bent = r * sign / size;
-            w[0] -= bent * M[0];
-            w[1] -= bent * M[1];
+            const Lanes by_variance = r * sign / size;
+            w[0] -= by_variance * M[0];
+            w[1] -= by_variance * M[1];
         }
         store(left->r + k, r);
         store(left->sign + k, sign);
@@ -154,7 +154,7 @@ INLINE void look(const Problem *problem, const Pose *pose, const double tangents
     }
 }
 
-/* Sum up the loss, and tell each match's weight and curvature: jet.Loss. */
+/* Sum the loss, and compute each match's weight and curvature: jet.Loss. */
 INLINE double cost_of(Loss loss, int m, Left *left)
 {
     const double square = loss.scale * loss.scale;
@@ -188,8 +188,8 @@ INLINE double cost_of(Loss loss, int m, Left *left)
     return sum_of(sum);
 }
 
-/* Hessian and gradient. A match curves as its weight says, or as its loss does, if that is more
-   than a share of it. */
+/* Hessian and gradient. The curvature of a match is its weight, or with `by_loss` that of its
+   loss, but at least a share of its weight. */
 INLINE void sum_up(int m, const Left *left, int by_loss, double least_curved, double H[5][5],
                    double gradient[5])
 {
@@ -216,8 +216,8 @@ INLINE void sum_up(int m, const Left *left, int by_loss, double least_curved, do
     }
 }
 
-/* Solve (H + ridge) step = -gradient by elimination with pivots; 0 where there is nothing to go
-   by. */
+/* Solve (H + ridge) step = -gradient by elimination with pivoting; returns 0 if H is zero or
+   not finite. */
 static int damped_step(const double given[5][5], const double gradient[5], double damping,
                        double step[5])
 {
@@ -262,7 +262,7 @@ static int damped_step(const double given[5][5], const double gradient[5], doubl
     return 1;
 }
 
-/* jet.moved: the rotation from the left, then along the sphere. */
+/* jet.moved: rotation from the left, then t along the sphere. */
 static void move(const Pose *pose, const double tangents[2][3], const double step[5], Pose *moved)
 {
     double S[3][3], square[3][3], turn[3][3];
@@ -285,8 +285,8 @@ static void move(const Pose *pose, const double tangents[2][3], const double ste
         moved->t[i] = t[i] / length;
 }
 
-/* Rows of n, filled up. A match of no rays at all says nothing. */
-static Problem filled_up(int n, int m, const double *x, const double *y, const double *spread,
+/* Pad rows of n. A match of zero rays has no effect. */
+static Problem padded(int n, int m, const double *x, const double *y, const double *spread,
                          const double *blur, double *memory)
 {
     for (int row = 0; row < ROWS_GIVEN; row++) {
@@ -315,8 +315,8 @@ typedef struct {
 INLINE void arrive(const Problem *problem, Loss loss, int exact, int with_J, Place *place)
 {
     sphere_tangents(place->pose.t, place->tangents);
-    look(problem, &place->pose, (const double (*)[3])place->tangents, exact, with_J,
-         &place->left);
+    residuals_at(problem, &place->pose, (const double (*)[3])place->tangents, exact, with_J,
+                 &place->left);
     place->cost = cost_of(loss, problem->m, &place->left);
 }
 
@@ -327,14 +327,14 @@ static void swap(Place *one, Place *other)
     *other = kept;
 }
 
-/* Steps that end it when they are as small, a gain as small a share, a damping as large; and the
-   least share of a match's weight that it curves by. */
+/* Convergence: least step, least relative gain, largest damping; and the least curvature of a
+   match as a share of its weight. */
 typedef struct {
     double step, gain, damping, curved;
 } Limits;
 
-/* Levenberg-Marquardt steps from a place, which is moved; `there` is for trials. `exact` as in
-   look, and a match curves as its loss does then; only then J is told at the end. */
+/* Levenberg-Marquardt from `here`, which is updated; `there` is for trials. `exact` as in
+   residuals_at, also for curvatures by the loss; without it J is not computed at the end. */
 INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps, Limits limits,
                     double damping, Place *here, Place *there)
 {
@@ -366,21 +366,21 @@ INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps
     }
 }
 
-static int filled_to(int n)
+static int padded_size(int n)
 {
     return (n + LANES - 1) / LANES * LANES;
 }
 
-/* Minimise the summed loss from a pose: jet.minimise.
-   R (3, 3) and t (3,) are moved; limits: those of above, in their order; r, sign (n,), J (5, n)
-   and tangents (2, 3): those at the end; memory: (28, m) with m = n rounded up to LANES. */
+/* Minimise the summed loss from an initial pose: jet.minimise. R (3, 3) and t (3,) are updated;
+   limits: as in Limits; r, sign (n,), J (5, n) and tangents (2, 3): those at the end; memory:
+   (28, m) with m = n rounded up to LANES. */
 WIDE void djet_minimise(int n, const double *x, const double *y, const double *spread,
                         const double *blur, int kind, double scale, int most_steps,
                         double damping, const double *limits, double *R, double *t, double *r,
                         double *sign, double *J, double *tangents, double *memory)
 {
-    const int m = filled_to(n);
-    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
+    const int m = padded_size(n);
+    const Problem problem = padded(n, m, x, y, spread, blur, memory);
     const Loss loss = {kind, scale};
     const Limits of = {limits[0], limits[1], limits[2], limits[3]};
     Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
@@ -397,16 +397,16 @@ WIDE void djet_minimise(int n, const double *x, const double *y, const double *s
         memcpy(J + j * n, here.left.J + j * m, (size_t)n * sizeof(double));
 }
 
-/* Make some steps from each of S poses, with the variances of residuals held in each step:
-   sketch.refine_all. R: (S, 3, 3) and t: (S, 3) are moved; costs: (S,); r, sign: (S, n);
-   memory: as above. */
+/* Refine each of S poses by some steps, with the variances of residuals held fixed in each
+   step: sketch.refine_all. R: (S, 3, 3) and t: (S, 3) are updated; costs: (S,); r, sign: (S,
+   n); memory: as above. */
 WIDE void djet_refine_all(int n, const double *x, const double *y, const double *spread,
                           const double *blur, int kind, double scale, int most_steps,
                           double damping, int S, double *R, double *t, double *costs, double *r,
                           double *sign, double *memory)
 {
-    const int m = filled_to(n);
-    const Problem problem = filled_up(n, m, x, y, spread, blur, memory);
+    const int m = padded_size(n);
+    const Problem problem = padded(n, m, x, y, spread, blur, memory);
     const Loss loss = {kind, scale};
     const Limits none = {0, 0, INFINITY, 0};
     for (int start = 0; start < S; start++) {
@@ -423,7 +423,7 @@ WIDE void djet_refine_all(int n, const double *x, const double *y, const double 
     }
 }
 
-/* What a squared residual costs: jet.Loss. */
+/* Loss of a squared residual: jet.Loss. */
 INLINE double value_of(int kind, double square, double squared)
 {
     const double u = squared / square;
@@ -431,7 +431,8 @@ INLINE double value_of(int kind, double square, double squared)
            : kind == HUBER && u > 1 ? square * (2 * sqrt(u) - 1) : squared;
 }
 
-/* Add what way behind a camera costs to losses on lines: as below, of one pose and sign. */
+/* Add the cost of distances behind a camera to losses, of one pose and sign of t, as below;
+   returns the sum. */
 INLINE double add_losses(int n, int kind, double square, const double *restrict squared,
                          const double *restrict way, const double *restrict curves,
                          double towards, double *restrict losses)
@@ -446,8 +447,8 @@ INLINE double add_losses(int n, int kind, double square, const double *restrict 
     return sum;
 }
 
-/* How far along its line each match lies behind where points at infinity are seen, and its squared
-   residual. */
+/* Signed distance of each match along its epipolar line from the point at infinity, and its
+   squared residual. */
 INLINE void look_along(int n, const double *restrict x, const double *restrict y,
                        const double *restrict spread, const double *restrict blur,
                        const double *restrict R, const double *restrict t,
@@ -469,9 +470,9 @@ INLINE void look_along(int n, const double *restrict x, const double *restrict y
     }
 }
 
-/* Losses (S, n) at S poses, where points also have to lie in front of both cameras, by the one of
-   some signs of t with which they cost less: sketch.losses_in_front. r, curves: (S, n) residuals,
-   and their signs of curvature; memory: (3, n). */
+/* Losses (S, n) at S poses with chirality: points also have to lie in front of both cameras,
+   for the sign of t, among some, of least cost: sketch.losses_in_front. r, curves: (S, n)
+   residuals, and their signs of curvature; memory: (3, n). */
 WIDE void djet_losses_in_front(int n, const double *x, const double *y, const double *spread,
                                const double *blur, int kind, double scale, int S, const double *R,
                                const double *t, const double *r, const double *curves, int signs,

@@ -1,7 +1,7 @@
-/* Where patches are, as they are seen through their warps: see core/patches.py. */
+/* Patch alignment through known warps: see core/patches.py. */
 #include "between.h"
 
-/* RADIUS is that of core/patches.py; LANES patches are worked on side by side. */
+/* RADIUS is that of core/patches.py; LANES patches are aligned in parallel. */
 enum { RADIUS = 5, SIDE = 2 * RADIUS + 1, PIXELS = SIDE * SIDE, ROOM = SIDE + 2, NEXT = SIDE + 1 };
 
 typedef struct {
@@ -31,7 +31,7 @@ INLINE void take_mean_off(Lanes *values)
         values[p] -= sum / PIXELS;
 }
 
-/* Patches (ROOM x ROOM) around points, each dy from a point seen at x + inverse dy. */
+/* Sample patches (ROOM x ROOM) around points: dy of the other image at x + inverse dy. */
 INLINE void sample(Image image, const Lanes points[2], const Lanes inverse[2][2], Lanes *wide)
 {
     for (int j = 0; j < ROOM; j++)
@@ -84,7 +84,7 @@ INLINE void gather(const uint8_t *image, int width, const double *place, int l, 
             seen->around[j * NEXT + i][l] = first[(int64_t)j * width + i];
 }
 
-/* Sum up products of slopes and of patches at four pixels. */
+/* Sum products of gradients and of patches at four pixels. */
 INLINE void multiply(const Expected *expected, Seen *seen)
 {
     for (int y = 0; y < 2; y++)
@@ -100,7 +100,7 @@ INLINE void multiply(const Expected *expected, Seen *seen)
         }
 }
 
-/* Look at the same patches from elsewhere: few cross over to other pixels. */
+/* Move patches to new positions; few of them move to other pixels. */
 INLINE void follow(const uint8_t *image, int width, const double (*places)[2],
                    const Expected *expected, Seen *seen)
 {
@@ -124,7 +124,7 @@ INLINE double interpolated(const Seen *seen, int k, int l, double x, double y)
     return rows[0] + x * (rows[1] - rows[0]);
 }
 
-/* What is left of patches, once their brightness and contrast are fitted: sums of squares. */
+/* Residuals of patches after fitting their brightness and contrast: sums of squares. */
 INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double (*places)[2])
 {
     Lanes patches[PIXELS];
@@ -145,7 +145,7 @@ INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double 
     return products(patches, patches) - alike * alike / expected->contrast;
 }
 
-/* djet_place, of the patches of one image: those from one number up to another. */
+/* djet_place, for patches [from, to) of one image. */
 INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there_height,
                        int there_width, const uint8_t *here, int here_width,
                        const float (*points)[2], const float (*inverse)[2][2],
@@ -207,10 +207,11 @@ INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there
     }
 }
 
-/* Find patches of some gray images `there` in another one, next to `began` (n, 2), where there is
-   room for the steps. there: (I,) of one size, each of so many of the patches, one after the
-   other; tuning: least slope and noise, how many steps, and the farthest; inside: (n,) those that
-   may move. Gives places (n, 2), variances (n,) of a pixel, and inverses (n, 2, 2). */
+/* Align patches of some gray images `there` with another one, starting from `began` (n, 2),
+   where there is room for the steps. there: (I,) of one size, with `counts` patches each, in
+   order; tuning: regularisation, least noise, number of steps, and largest displacement;
+   inside: (n,) those that may move. Writes positions (n, 2), variances (n,) of a pixel, and
+   inverse normal matrices (n, 2, 2). */
 WIDE void djet_place(int I, const uint8_t *const *there, const int64_t *counts, int there_height,
                      int there_width, const uint8_t *here, int here_width,
                      const float (*points)[2], const float (*inverse)[2][2],

@@ -1,15 +1,15 @@
-/* The rotation that alone brings rays to others: see core/geometry.py, fit_rotation. */
+/* The pure rotation between two views: see core/geometry.py, fit_rotation. */
 #include <string.h>
 
 #include "common.h"
 
-/* A deviation below which all are taken to be none. */
+/* Lower bound of the median squared residual. */
 static const double LEAST = 1e-18;
 
-/* Share of what is beside it that an entry of a matrix is as good as nothing at. */
+/* Relative size of an off-diagonal entry that counts as zero. */
 static const double NOTHING = 1e-20;
 
-/* Turn a symmetric matrix (4, 4) by Jacobi's rotations until it is diagonal, and V with it. */
+/* Diagonalise a symmetric matrix (4, 4) by Jacobi rotations, and apply them to V. */
 static void diagonalise(double A[4][4], double V[4][4])
 {
     int turned = 1;
@@ -40,7 +40,7 @@ static void diagonalise(double A[4][4], double V[4][4])
     }
 }
 
-/* The rotation next to a matrix, by the quaternion that agrees with it most (Horn, JOSA A 1987). */
+/* The rotation nearest to a matrix, by the unit quaternion of Horn (JOSA A 1987). */
 static void nearest_rotation(const double M[3][3], double R[3][3])
 {
     double A[4][4] = {{M[0][0] + M[1][1] + M[2][2], M[2][1] - M[1][2], M[0][2] - M[2][0],
@@ -63,7 +63,7 @@ static void nearest_rotation(const double M[3][3], double R[3][3])
     memcpy(R, rotation, sizeof rotation);
 }
 
-/* The value that comes at a place when they are ordered, which is done in part (Hoare's FIND). */
+/* The value of a given rank, after a partial sort (Hoare's FIND). */
 static double selected(double *values, int n, int place)
 {
     for (int first = 0, last = n - 1; first < last;) {
@@ -90,7 +90,7 @@ static double selected(double *values, int n, int place)
     return values[place];
 }
 
-/* Rays (n, 3) of length one, components first. */
+/* Unit rays (n, 3), components first. */
 INLINE void unit_rays(int n, const double (*rays)[3], double *restrict to)
 {
     for (int k = 0; k < n; k++) {
@@ -101,8 +101,8 @@ INLINE void unit_rays(int n, const double (*rays)[3], double *restrict to)
     }
 }
 
-/* The rotation R (3, 3) that alone brings rays x (n, 3) to rays y, by so many rounds:
-   geometry.fit_rotation. memory: (9, n). */
+/* Fit the rotation R (3, 3) from rays x (n, 3) to rays y by iteratively reweighted least
+   squares: geometry.fit_rotation. memory: (9, n). */
 WIDE void djet_fit_rotation(int n, const double (*rays_x)[3], const double (*rays_y)[3],
                             int rounds, double R[3][3], double *memory)
 {
@@ -127,7 +127,7 @@ WIDE void djet_fit_rotation(int n, const double (*rays_x)[3], const double (*ray
                 squared[k] += off * off;
             }
         }
-        /* Half of them deviate by less than the median. */
+        /* Scale by the median. */
         memcpy(ordered, squared, (size_t)n * sizeof *ordered);
         const double median = n ? selected(ordered, n, n / 2) : 0;
         for (int k = 0; k < n; k++)

@@ -3,11 +3,11 @@
 
 #include "common.h"
 
-/* Sums of a square's weights, and of u, v, uu, uv, vv, r, ur, vr by these. */
+/* Sums over a square of weights, and of u, v, uu, uv, vv, r, ur, vr times these. */
 enum { SUMS = 9 };
 
-/* The value of a plane at u = v = 0, its slopes along both, and by how much these lessen the sum of
-   squares: slants._planes. */
+/* Value of a plane at u = v = 0, its slopes along both, and the decrease of the sum of squares
+   by these: slants._planes. */
 typedef struct {
     double level, along_u, along_v, told;
 } Plane;
@@ -27,15 +27,15 @@ static Plane plane_of(const double sums[SUMS], double usual)
     return plane;
 }
 
-/* Square of three standard deviations, within which points fit. */
+/* Square of three standard deviations, within which points are inliers. */
 static const double FITS = 9;
 
-/* Planes (n, 4) next to points at u, v >= 0 (n,) of inverse depths r (n,), in squares with a side
-   of two that overlap by half, and how far r is off these (n,), squared, times trusted (n,). Fitted
-   by so many rounds under a Cauchy loss. fitting: (n,) by how many points of its square a plane is
-   fitted to three standard deviations. columns, rows: of quarters that hold all points, with one
-   more on each side; memory: room for (14, rows columns). usual: slopes that are nothing out of the
-   ordinary, as a share of the level. */
+/* Planes (n, 4) around points at u, v >= 0 (n,) of inverse depths r (n,), in squares of side
+   two that overlap by half, and the squared residuals (n,) of r times `trusted` (n,). Fitted by
+   `rounds` of iteratively reweighted least squares with a Cauchy loss. fitting: (n,) numbers of
+   inliers in the square of each point. columns, rows: of quarters that hold all points, with
+   one more on each side; memory: (14, rows columns). usual: prior standard deviation of the
+   slopes, relative to the mean value. */
 WIDE void djet_planes(int n, const double *u, const double *v, const double *r,
                       const double *trusted, int columns, int rows, int rounds, double usual,
                       double *memory, double *off, double (*planes)[4], double *fitting)

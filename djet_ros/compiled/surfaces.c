@@ -1,23 +1,23 @@
-/* Graded descriptors seen through warps, and their distances around places: see core/graded.py
-   and core/hamming.py. */
+/* Graded descriptors seen through warps, and their distances in windows: see core/graded.py and
+   core/hamming.py. */
 #include "between.h"
 
-/* What there is at most: ends of tests, tests, pixels from the middle of a window to the farthest
-   end, and the side of all that is looked at. */
+/* Limits: test points, tests, pixels from the centre of a window to the farthest test point,
+   and the side of a patch. */
 enum { MOST_ENDS = 512, MOST_TESTS = 256, FARTHEST = 13 + 7, MOST_SIDE = 2 * FARTHEST + 1 };
 
-/* Points whose windows are worked on side by side, and the largest of these. */
+/* Points whose windows are computed in parallel, and the largest window. */
 enum { POINTS = 16, MOST_WINDOW = 15 };
 typedef int16_t Grades __attribute__((vector_size(POINTS * sizeof(int16_t))));
 typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
 
-/* djet_grades_through, of the patches of one image: those from one number up to another. */
+/* djet_grades_through, for patches [from, to) of one image. */
 INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int height, int width, int n,
                        const float *inverse, const float *nearer, float most_nearer,
                        const float *points, const float *contrast, int E, const float (*ends)[2],
                        int T, const int64_t *of_tests, int reach, int16_t *grades)
 {
-    /* Added and taken away again, it leaves whole numbers of all that are far below it. */
+    /* Adding and subtracting it rounds numbers far below it. */
     const float whole = 3 << 22;
     const Image image = {pixels, sizeof *pixels, height, width};
     for (int64_t first = from; first < to; first += LANES) {
@@ -45,10 +45,10 @@ INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int heig
     }
 }
 
-/* Grades (T, n) of T tests on patches seen through warps: dx = u / (1 - nearer . u), with
-   u = inverse dy, for the places dy of their ends. images: (I,) of one size, each of so many of
-   the patches, one after the other; inverse: (n, 2, 2); nearer: (n, 2), which is 0 where it does
-   not matter; contrast: (n,); ends: (E, 2); of_tests: (2, T) which a test has. */
+/* Grades (T, n) of T tests on patches seen through warps: dx = u / (1 - nearer . u), with u =
+   inverse dy, for the test points dy. images: (I,) of one size, with `counts` patches each, in
+   order; inverse: (n, 2, 2); nearer: (n, 2), 0 if negligible; contrast: (n,); ends: (E, 2)
+   distinct test points; of_tests: (2, T) indices of each test. */
 WIDE void djet_grades_through(int I, const int16_t *const *images, const int64_t *counts, int height,
                               int width, int n, const float *inverse, const float *nearer,
                               float most_nearer, const float *points, const float *contrast, int E,
@@ -60,7 +60,7 @@ WIDE void djet_grades_through(int I, const int16_t *const *images, const int64_t
                    most_nearer, points, contrast, E, ends, T, of_tests, reach, grades);
 }
 
-/* Copy what tests see around some centres, side x side pixels: points last. */
+/* Copy the patches of side x side pixels around some centres, points last. */
 INLINE void gather(const int16_t *image, int width, const int64_t (*centres)[2], int count,
                    int side, Grades *patches)
 {
@@ -74,7 +74,7 @@ INLINE void gather(const int16_t *image, int width, const int64_t (*centres)[2],
     }
 }
 
-/* By how much tests differ from their reference, as they do at all places of windows. */
+/* Add the differences of a test from its reference, at all pixels of windows. */
 INLINE void add_test(const Grades *p, const Grades *q, int side, int window, Grades reference,
                      int16_t reach, Sums *sums)
 {
@@ -90,14 +90,14 @@ INLINE void add_test(const Grades *p, const Grades *q, int side, int window, Gra
 }
 
 /* Distances (P, P, n) of T graded tests, P = 2 radius + 1, between references (T, n) and all
-   pixels of windows around centres (n, 2). tests: (T, 4), which look at most `far` pixels away;
-   all that they see lies in the image. */
+   pixels of windows around centres (n, 2). tests: (T, 4), which reach at most `far` pixels; all
+   test points lie in the image. */
 WIDE void djet_graded_surfaces(const int16_t *reference, const int16_t *image, int width, int n,
                                const int64_t (*centres)[2], int radius, int T,
                                const int64_t (*tests)[4], int far, int reach, float *distances)
 {
     const int window = 2 * radius + 1, side = 2 * (far + radius) + 1;
-    /* As many tests at once as can be summed up. */
+    /* As many tests at once as can be summed in 16 bits. */
     const int at_once = UINT16_MAX / (2 * reach);
     Grades patches[MOST_SIDE * MOST_SIDE];
     for (int first = 0; first < n; first += POINTS) {
