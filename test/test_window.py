@@ -217,7 +217,7 @@ def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
         here = here @ onward
         ways.append(onward[2, 3])
     assert ways[9] == pytest.approx(1, abs=0.02) and ways[10] == 0
-    assert ways[11] == pytest.approx(1 + WINDOW_TUNING.mended, abs=0.02)
+    assert ways[11] == pytest.approx(1 + WINDOW_TUNING.correction_share, abs=0.02)
     assert here[2, 3] == pytest.approx(40, abs=0.2)
 
 

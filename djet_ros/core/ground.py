@@ -36,7 +36,7 @@ class GroundTuning:
     # roads bend up and down, so that only the nearest part is flat: farthest distance, or if the
     # nearest visible ground is far already, its multiple, but not beyond the last
     flat: float = 6.0
-    times: float = 1.5
+    flat_factor: float = 1.5
     far: float = 14.0
 
     # Pixels. Chosen: fewer are not enough; more only cost time
@@ -50,12 +50,12 @@ class GroundTuning:
     # of the logarithm of a length: a step of a pixel or two
     step: float = 0.03
     # least correlation of ground; chosen: walls and cars mistaken for ground have less
-    seen: float = 0.6
+    min_correlation: float = 0.6
     # chosen: least correlation of images without known motion to be of the same place
-    same: float = 0.95
+    same_place: float = 0.95
     # chosen: distinctness of the best length: others, beyond so many neighbouring steps, have a
     # correlation lower by this
-    clearly: float = 0.1
+    distinctness: float = 0.1
     neighbours: int = 6
     # pixels; chosen: ground that moves by less, while other points show that the camera moves, is
     # an object that moves with the camera and hides the ground
@@ -72,10 +72,10 @@ class GroundTuning:
     # which the pitch has to be given, and the road's own slope
     lean: float = math.radians(3.0)
     # pixels; largest median displacement of cells of flat ground; chosen: walls have more
-    uneven: float = 0.6
+    max_unevenness: float = 0.6
     # chosen: rounds of Gauss-Newton, and the relative step of the plane at convergence
     rounds: int = 10
-    rests: float = 1e-3
+    converged: float = 1e-3
 
 
 _TUNING = GroundTuning()
@@ -119,7 +119,7 @@ class Ground:
         seen = self._sees(towards)
         if seen.any():
             nearest = float(self._ahead(towards[seen]).min())
-            self._reach = max(_TUNING.flat, _TUNING.times * nearest)
+            self._reach = max(_TUNING.flat, _TUNING.flat_factor * nearest)
         chosen = np.flatnonzero(self._sees(towards))
         self.is_in_view = len(chosen) >= _TUNING.least_pixels
         if not self.is_in_view:
@@ -188,7 +188,7 @@ class Ground:
         R = relative.R if turned else np.eye(3)
         correlation = _correlation(
             wanted, _sampled(there, self._project(R, np.zeros(3), self._normal)))
-        if correlation < (_TUNING.seen if turned else _TUNING.same):
+        if correlation < (_TUNING.min_correlation if turned else _TUNING.same_place):
             return None
         least = _TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
         return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]))
@@ -202,11 +202,11 @@ class Ground:
         found = np.array([_correlation(wanted, _sampled(there, self._project(
             relative.R, relative.t, length * self._normal))) for length in tried])
         best = int(found.argmax())
-        if found[best] < _TUNING.seen or best in (0, len(found) - 1):
+        if found[best] < _TUNING.min_correlation or best in (0, len(found) - 1):
             return None
         # Repetitive textures have several peaks; slow ground has one, but a broad one.
         peaks = found == maximum_filter1d(found, 2 * _TUNING.neighbours + 1, mode='nearest')
-        if (peaks & (found > found[best] - _TUNING.clearly)).sum() > 1:
+        if (peaks & (found > found[best] - _TUNING.distinctness)).sum() > 1:
             return None
         return np.asarray(tried[best] * self._normal)
 
@@ -247,13 +247,13 @@ class Ground:
             gradient[3:] += known[3:, 3:] @ theta
             step = -np.linalg.solve(total, gradient)
             m, theta = m + step[:3], theta + step[3:]
-            if np.linalg.norm(step[:3]) < _TUNING.rests * np.linalg.norm(m):
+            if np.linalg.norm(step[:3]) < _TUNING.converged * np.linalg.norm(m):
                 break
         shift = float(np.median(np.linalg.norm(
             places - self._project(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
-        if correlation < _TUNING.seen or shift < _TUNING.least_shift or m @ self._normal <= 0 \
-                or not self._unevenness(r, J, R, t, m) <= _TUNING.uneven:
+        if correlation < _TUNING.min_correlation or shift < _TUNING.least_shift \
+                or m @ self._normal <= 0 or not self._unevenness(r, J, R, t, m) <= _TUNING.max_unevenness:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]

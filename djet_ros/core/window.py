@@ -63,7 +63,7 @@ class WindowTuning:
     # that makes a frame a keyframe; 10 costs a third more and drifts as much
     parallax: float = 25.0
     # chosen: share of the landmarks that are lost that makes a frame a keyframe
-    gone: float = 0.4
+    lost: float = 0.4
     # chosen: side of the cells that landmarks are spread over, relative to cells of one landmark
     # each
     cell: float = 0.75
@@ -71,32 +71,32 @@ class WindowTuning:
     steps: int = 2
     # chosen: halvings of a step that would increase the cost: where the camera hardly moved, or
     # rotated by much, depths are so uncertain that a full step may lead anywhere
-    halvings: int = 6
+    max_halvings: int = 6
     # robust standard deviations beyond which an observation is an outlier, and the scale of the
     # loss
     outlier: float = 4.0
-    bend: float = 3.0
+    loss_scale: float = 3.0
     # pixels; chosen, below the noise on rendered streets, which is 0.04
     least_scale: float = 0.02
     # chosen: pixels between a landmark and a match of a pair up to which they are the same point
-    beside: float = 1.5
+    match_radius: float = 1.5
     # pixels; chosen: largest error of an inlier match; and largest relative error of a landmark's
     # depth
-    matched: float = 0.4
-    known: float = 0.15
+    match_error: float = 0.4
+    depth_error: float = 0.15
     # pixels; chosen: error of inliers that slants are fitted to
-    off: float = 0.1
+    slant_noise: float = 0.1
     # rad; chosen: negative parallax of a step that noise may give to a point at infinity
-    beyond: float = 0.01
+    negative_parallax: float = 0.01
     # chosen: fewer landmarks do not determine a length
-    few: int = 8
+    min_landmarks: int = 8
     # chosen: relative standard deviations of the length of a pair: from depths around it, and of a
     # guess; landmarks that both frames observe determine it far better
-    told: float = 0.02
-    guessed: float = 0.5
+    length_sigma: float = 0.02
+    guess_sigma: float = 0.5
     # chosen: share of the previous frame's refinement that a step corrects. With all of it the
     # track would jump; with none it would drift twice as much over a hundred frames
-    mended: float = 0.2
+    correction_share: float = 0.2
 
 
 WINDOW_TUNING = WindowTuning()
@@ -264,17 +264,17 @@ class Window:
         A weighted median over landmarks with a match nearby; if too few of them are in view, over
         the matches of the previous pair.
         """
-        unknown = guess, self._tuning.guessed
+        unknown = guess, self._tuning.guess_sigma
         if not relative.t.any():
             return unknown
         ratios, weights = self._ratios(relative)
-        if len(ratios) < self._tuning.few and self._latest is not None:
+        if len(ratios) < self._tuning.min_landmarks and self._latest is not None:
             ratios, weights = self._ratios_by(relative, *self._nearest(
                 relative.x[relative.inliers], *self._depths_of(*self._latest)))
-        if len(ratios) < self._tuning.few:
+        if len(ratios) < self._tuning.min_landmarks:
             return unknown
         length = _weighted_median(ratios, weights)
-        return (length, self._tuning.told) if length > 0 else unknown
+        return (length, self._tuning.length_sigma) if length > 0 else unknown
 
     def told_length(self, relative: RelativePose) -> tuple[float, float] | None:
         """
@@ -284,7 +284,7 @@ class Window:
         its standard error.
         """
         ratios, weights = self._ratios(relative)
-        if len(ratios) < self._tuning.few:
+        if len(ratios) < self._tuning.min_landmarks:
             return None
         length = _weighted_median(ratios, weights)
         # Standard error of the median, for the effective number of weights.
@@ -335,7 +335,7 @@ class Window:
             return np.empty(0), np.empty(0, np.int64)
         # Built in half the time of a balanced one, and as fast to query.
         tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-        away, match = tree.query(points, distance_upper_bound=self._tuning.beside)
+        away, match = tree.query(points, distance_upper_bound=self._tuning.match_radius)
         near = np.isfinite(away)
         return rho[near], match[near]
 
@@ -360,9 +360,10 @@ class Window:
         # By near landmarks, which have most parallax but may be another body, or by all with equal
         # weight.
         lengths = np.array([[_weighted_median(ratios, known / sigma)], [median(ratios)]])
-        noise = self._tuning.matched / self._K[0, 0] * sigma
+        noise = self._tuning.match_error / self._K[0, 0] * sigma
         off = np.abs(in_units - lengths * known)
-        agree = off < self._tuning.outlier * noise + self._tuning.known * np.abs(lengths) * known
+        agree = off < (self._tuning.outlier * noise
+                       + self._tuning.depth_error * np.abs(lengths) * known)
         return int(agree.sum(1).max()), len(known)
 
     def _choose_keyframe(self) -> None:
@@ -377,7 +378,7 @@ class Window:
         newest = len(self._views) - 1
         last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
         here = self._landmarks.of(self._landmarks.seen[:, newest])
-        few = len(here) < (1 - self._tuning.gone) * self._tuning.landmarks
+        few = len(here) < (1 - self._tuning.lost) * self._tuning.landmarks
         if not few:
             turn = self._poses.R[newest] @ self._poses.R[last].T
             turned, moved = (self._projected(places) for places in (
@@ -427,7 +428,7 @@ class Window:
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
         rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
-        ahead, off = rho > 0, tuning.off / self._K[0, 0] * sigma
+        ahead, off = rho > 0, tuning.slant_noise / self._K[0, 0] * sigma
         surfaces = x[ahead], rho[ahead], off[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].tested.shape)
         x, rho = x[usable], rho[usable]
@@ -465,8 +466,8 @@ class Window:
         np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
         # Relative to the newest step: the unit may be much longer or shorter.
         length = float(np.linalg.norm(self._poses.between[1][-1, -2]))
-        self._landmarks = self._landmarks.of(np.asarray(
-            self._landmarks.seen.any(1) & (self._landmarks.rho * length > -self._tuning.beyond)))
+        in_front = self._landmarks.rho * length > -self._tuning.negative_parallax
+        self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1) & in_front))
         return H
 
     def _line_search(self, observed: Observed, prior: OfPrior, step: Array, change: Array
@@ -474,7 +475,7 @@ class Window:
         """Apply a step of poses and landmarks, halved until the cost does not grow."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
         cost = self._cost(observed, scale) + prior.cost
-        for _ in range(self._tuning.halvings + 1):
+        for _ in range(self._tuning.max_halvings + 1):
             self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
             moved, there = self._observed(), self._prior.at(self._poses)
             if self._cost(moved, scale) + there.cost <= cost:
@@ -490,7 +491,8 @@ class Window:
 
     def _robust_losses(self, observed: Observed, scale: float) -> tuple[Array, Array]:
         """Return the losses (M,) of observations with a noise `scale`, and their weights."""
-        return Loss('geman_mcclure', self._tuning.bend * scale)((observed.residuals**2).sum(1))
+        loss = Loss('geman_mcclure', self._tuning.loss_scale * scale)
+        return loss((observed.residuals**2).sum(1))
 
     def _normalise_roots(self) -> None:
         """Scale the roots of precision in the newest frame to a median of one pixel."""
@@ -542,7 +544,7 @@ class Window:
         """
         before, newest = self._poses.camera(-2), self._poses.camera(-1)
         refined = np.linalg.inv(self._published) @ before
-        mended, share = np.eye(4), self._tuning.mended
+        mended, share = np.eye(4), self._tuning.correction_share
         mended[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
         mended[:3, 3] = share * refined[:3, 3]
         return np.asarray(mended @ np.linalg.inv(before) @ newest)
