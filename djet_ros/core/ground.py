@@ -253,7 +253,8 @@ class Ground:
             places - self._project(R, np.zeros(3), m), axis=1)))
         correlation = _correlation(wanted, found)
         if correlation < _TUNING.min_correlation or shift < _TUNING.least_shift \
-                or m @ self._normal <= 0 or not self._unevenness(r, J, R, t, m) <= _TUNING.max_unevenness:
+                or m @ self._normal <= 0 \
+                or not self._unevenness(r, J, R, t, m) <= _TUNING.max_unevenness:
             return None
         back = np.linalg.inv(total)
         covariance = (back @ (spread / noise**2 + prior) @ back)[:3, :3]
