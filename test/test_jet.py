@@ -63,7 +63,8 @@ def test_the_jacobian_is_that_of_central_differences(camera, kind, seed, blur):
     tangents, step = residuals.tangents, 1e-6
 
     def at(parameter, distance):
-        return epipolar_residuals(problem, *moved(R, t, tangents, distance * np.eye(5)[parameter]))
+        step = distance * np.eye(5)[parameter]
+        return epipolar_residuals(problem, *moved(R, t, tangents, step))
 
     for parameter in range(5):
         ahead, behind = at(parameter, step), at(parameter, -step)
@@ -241,8 +242,8 @@ def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name, kind):
     found = minimise(problem, *moved_pose(seen.R, seen.t, 0.01, rng), loss, 100)
 
     def cost(step):
-        there = epipolar_residuals(problem, *moved(found.R, found.t, found.residuals.tangents,
-                                                   step))
+        there = epipolar_residuals(problem, *moved(
+            found.R, found.t, found.residuals.tangents, step))
         return (there.sign * loss(there.r**2)[0]).sum()
 
     gradient = approx_fprime(np.zeros(5), cost, 1e-7)

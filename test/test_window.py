@@ -115,7 +115,8 @@ class NumbersWindow(Window):
         found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
-        wanted = seen[mine] & inside(self._projected(in_frame(K, self._poses, found, newest)))
+        pixels = self._projected(in_frame(K, self._poses, found, newest))
+        wanted = seen[mine] & inside(pixels)
         wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
         found.minima[wanted, -1], found.seen[wanted, -1] = places[mine[wanted]], True
         found.roots[wanted, -1] = np.eye(2)

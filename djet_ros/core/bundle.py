@@ -229,7 +229,8 @@ class Landmarks:
             straight = straightened(K, bent(K, pixels, before), after)
             u = rays(K, straight)[:, :2]
             back = bending(K, rays(K, pixels)[:, :2], before)
-            return straight, np.asarray(np.linalg.solve(back, bending(K, u, after)), float)
+            by_new = np.linalg.solve(back, bending(K, u, after))
+            return straight, np.asarray(by_new, float)
 
         found, by_found = moved(self.found)
         minima, by_minima = moved(self.minima.reshape(-1, 2))

@@ -42,7 +42,8 @@ _HETEROGENEITY = 2.0
 _NEGLIGIBLE = 1e-12
 
 
-def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Placed) -> JetProblem:
+def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Placed
+                ) -> JetProblem:
     """
     Fuse the N surface measurements of a problem with patch alignment.
 

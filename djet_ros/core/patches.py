@@ -100,7 +100,8 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     return Placed(places, covariances)
 
 
-def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Array) -> Placed:
+def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Array
+              ) -> Placed:
     """Align patches as `place_exactly`, with x (N, 2) ordered by several gray images."""
     inside = within(y, here.shape, _MARGIN)
     # Patches near the border are aligned elsewhere, and their result is discarded.

@@ -39,8 +39,8 @@ class SelfCalibration:
     Estimate of k1.
 
     mean, covariance: (2,) and (2, 2) of k1, if there is any, and of the systematic error that
-    looks like it, in pixels; first: prior standard deviation of k1; undone: k1 that images are
-    already corrected for, and unsure: its standard deviation when that was chosen.
+    looks like it, in pixels; first: prior standard deviation of k1; undone: k1 that images
+    are already corrected for, and unsure: its standard deviation when that was chosen.
     """
 
     mean: Array

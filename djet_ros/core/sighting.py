@@ -63,7 +63,8 @@ class Sighting:
         # about their prediction. A second, small window around the first estimate does not.
         mine, fits = self._around(mine, warps[mine], expected[mine], reach)
         close = fits.minima()
-        good = ~at(here.mask, close) & distances.describable(close, here.tested.shape, CLOSE // 2)
+        good = distances.describable(close, here.tested.shape, CLOSE // 2)
+        good &= ~at(here.mask, close)
         mine = mine[good]
         mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
         if not len(mine):
@@ -92,7 +93,8 @@ class Sighting:
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
         which = np.argsort(landmarks.anchors, kind='stable')
         which = which[wanted[which]]
-        R, t = (motions[newest, landmarks.anchors[which]] for motions in self.poses.between)
+        anchors = landmarks.anchors[which]
+        R, t = (motions[newest, anchors] for motions in self.poses.between)
         seen = expected[which], 1 / places[which, 2]
         lean = landmarks.rho[which, None] * landmarks.slopes[which]
         warps = np.empty((len(landmarks), 3, 2))
@@ -116,7 +118,8 @@ class Sighting:
         references = self.distances.shifted(
             [(self.views[anchor].tested, count) for anchor, count in zip(anchors, counts)],
             self.landmarks.found[mine], places, warps, contrasts)
-        fits, _ = with_minimum(self.distances.around(references, here, places, radius), 'drop')
+        fits = self.distances.around(references, here, places, radius)
+        fits, _ = with_minimum(fits, 'drop')
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 

@@ -259,7 +259,8 @@ class DescriptorDistances:
         References are taken between pixels, so that a minimum at y falls on a whole pixel, where
         the fit has no bias. warp: (N, 3, 2) from the patches around x to those around y.
         """
-        return self.around(self.shifted([(there, len(x))], x, y, warp, contrast), here, y, radius)
+        references = self.shifted([(there, len(x))], x, y, warp, contrast)
+        return self.around(references, here, y, radius)
 
     def shifted(self, there: Sequence[Shown], x: Array, y: Array, warp: Array,
                 contrast: float | Array) -> NDArray[Any]:
@@ -273,7 +274,7 @@ class DescriptorDistances:
 
     def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
                radius: int) -> Paraboloids:
-        """Fit paraboloids to the distances around y (N, 2), with references from `shifted`."""
+        """Fit paraboloids to the distances around y (N, 2) from shifted references (T, N)."""
         centres = np.rint(y).astype(np.int64)
         return _without_pixel_locking(
             fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))

@@ -133,8 +133,8 @@ class Window:
 
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
 
-    settled: (M, 3) landmarks, in the newest frame, that were refined for the last time; lens:
-    estimate of the distortion of the images.
+    settled: (M, 3) landmarks, in the newest frame, that were refined for the last time;
+    lens: estimate of the distortion of the images.
     """
 
     def __init__(self, config: EstimatorConfig, tuning: WindowTuning = WINDOW_TUNING) -> None:
