@@ -1,4 +1,4 @@
-"""Least squares over frames and landmarks: exact data is reproduced, and eliminated exactly."""
+"""Bundle adjustment: exact data is reproduced, and elimination is exact."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def scene(rng, frames=4, landmarks=40, k1=0.05):
     return poses, found
 
 
-def test_a_landmark_is_seen_where_its_point_in_space_is_projected():
+def test_a_landmark_is_observed_at_its_projection():
     poses, landmarks = scene(np.random.default_rng(0))
     for n in (0, 39):
         anchor = landmarks.anchors[n]
@@ -53,7 +53,7 @@ def test_a_landmark_is_seen_where_its_point_in_space_is_projected():
             there.ravel())
 
 
-def test_what_is_far_outside_of_the_image_is_not_folded_into_it():
+def test_points_far_outside_the_image_are_not_folded_into_it():
     far = np.array([[20.0, 0, 1], [0, -1e5, 1], [3, 3, -1]])
     assert (np.abs(projected(K, far, -0.05)) > 2000).any(1).all()
 
@@ -65,7 +65,7 @@ def test_exact_observations_leave_no_residual():
     assert np.abs(observed.off).max() < 0.1
 
 
-def test_jacobians_are_those_of_small_steps():
+def test_jacobians_are_those_of_finite_differences():
     poses, landmarks = scene(np.random.default_rng(2))
     landmarks.minima += 3.0
     observed = observe(K, poses, landmarks)
@@ -84,13 +84,13 @@ def test_jacobians_are_those_of_small_steps():
         abs=1e-9)
 
 
-def test_steps_undo_one_another():
+def test_a_step_and_its_inverse_cancel():
     poses, _ = scene(np.random.default_rng(5))
     step = np.random.default_rng(6).normal(size=24) * 0.05
     assert poses.moved(step).step_from(poses) == pytest.approx(step, abs=1e-12)
 
 
-def test_elimination_solves_the_same_equations_as_all_at_once():
+def test_elimination_equals_solving_the_full_system():
     poses, landmarks = scene(np.random.default_rng(7))
     landmarks.minima += np.random.default_rng(8).normal(size=landmarks.minima.shape)
     landmarks.points += np.random.default_rng(13).normal(size=landmarks.points.shape)
@@ -109,14 +109,14 @@ def test_elimination_solves_the_same_equations_as_all_at_once():
     W = np.repeat([*weights, *[0.7] * 40], 2)[:, None]
     e = np.concatenate([observed.residuals, observed.off]).ravel()
     J = J.reshape(-1, 144)
-    # The seven freedoms of the whole are held by a little information about each pose.
+    # The seven gauge freedoms are fixed by a little information on each pose.
     held = np.diag([*[1.0] * 24, *[0.0] * 120])
     whole = -np.linalg.solve((J * W).T @ J + held, (J * W).T @ e)
     reduced = eliminate(observed, weights, 0.7, 4)
     step = -np.linalg.solve(reduced.H + np.eye(24), reduced.g)
     assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
     assert reduced.change(step).ravel() == pytest.approx(whole[24:], rel=1e-4, abs=1e-6)
-    # With k1, and nothing else known: the freedoms of the whole don't matter to it.
+    # With k1, and no other information: the gauge does not affect it.
     J = np.column_stack([of_k1.ravel(), J])
     information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
     told = eliminate(observed, weights, 0.7, 4, lens=True).of_k1()
@@ -124,12 +124,12 @@ def test_elimination_solves_the_same_equations_as_all_at_once():
     assert told.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
 
 
-def test_noise_free_landmarks_bring_poses_and_depths_back():
+def test_poses_and_depths_are_recovered_without_noise():
     poses, landmarks = scene(np.random.default_rng(10))
     rng = np.random.default_rng(11)
     wrong = poses.moved(rng.normal(size=24) * [*[0.0] * 12, *[0.01] * 12])
     guessed = replace(landmarks, rho=landmarks.rho * rng.uniform(0.8, 1.2, 40))
-    # The first two poses hold where all is, and how large.
+    # The first two poses fix position and scale.
     held = np.diag([*[1e12] * 12, *[0.0] * 12])
     for _ in range(8):
         observed = observe(K, wrong, guessed)
@@ -141,7 +141,7 @@ def test_noise_free_landmarks_bring_poses_and_depths_back():
     assert guessed.rho == pytest.approx(landmarks.rho, rel=1e-5)
 
 
-def test_a_frame_takes_the_landmarks_that_are_anchored_in_it_along():
+def test_removing_a_frame_removes_the_landmarks_anchored_in_it():
     _, landmarks = scene(np.random.default_rng(12))
     left = landmarks.without_frame(0)
     assert len(left) == 20
@@ -150,9 +150,9 @@ def test_a_frame_takes_the_landmarks_that_are_anchored_in_it_along():
     assert landmarks.with_frame().seen.shape == (40, 5)
 
 
-def test_noise_of_the_patch_where_a_landmark_was_found_does_not_shorten_steps():
-    # All observations of a landmark have it in common, so with rays held it looks like parallax
-    # that does not grow, as if the camera went on slower than it began.
+def test_noise_of_the_anchor_patch_does_not_bias_steps():
+    # It is common to all observations of a landmark, so with a fixed ray it looks like parallax
+    # that does not grow, as if the camera became slower.
     rng = np.random.default_rng(14)
     poses, landmarks = scene(rng, 3, 16_000)
     length = np.linalg.norm(poses.t[2] - poses.R[2] @ poses.R[1].T @ poses.t[1])
@@ -170,7 +170,7 @@ def test_noise_of_the_patch_where_a_landmark_was_found_does_not_shorten_steps():
 
 
 @pytest.mark.parametrize('frames', [2, 3, 6])
-def test_noise_is_told_whatever_landmarks_make_up_for(frames):
+def test_the_noise_estimate_accounts_for_degrees_of_freedom(frames):
     rng = np.random.default_rng(15)
     poses, landmarks = scene(rng, frames, 3000)
     landmarks = landmarks.of(landmarks.anchors == 0)
@@ -184,7 +184,7 @@ def test_noise_is_told_whatever_landmarks_make_up_for(frames):
     assert noise_scale(observe(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)
 
 
-def test_the_slope_of_a_prior_is_that_of_its_cost():
+def test_the_gradient_of_a_prior_is_that_of_its_cost():
     rng = np.random.default_rng(7)
     half = rng.normal(size=(12, 12))
     since = Poses(rotation_exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))

@@ -1,4 +1,4 @@
-"""What is compiled says what its like in NumPy says, to rounding."""
+"""Compiled functions agree with their NumPy implementations to rounding."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Result = TypeVar('Result')
 
 LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
 
-# Before 5.0, OpenCV's sampling, by which NumPy goes, knows 32 places between two pixels.
+# Before 5.0, OpenCV's interpolation, which NumPy uses, rounds positions to 1/32 pixel.
 EXACT = int(cv2.__version__.split('.')[0]) >= 5
 PIXELS = 1e-3 if EXACT else 0.02
 
@@ -108,7 +108,7 @@ def problem(rng: np.random.Generator, count: int, indefinite: bool) -> tuple[Jet
 
 
 @pytest.mark.parametrize('count', [0, 1, 8, 9, 300])
-def test_patches_are_found_where_numpy_finds_them(count: int) -> None:
+def test_patch_alignment_equals_numpy(count: int) -> None:
     rng = np.random.default_rng(count)
     there, here = image(0), np.roll(image(0), 1, axis=1)
     # Some at the border, outside, and on flat ground.
@@ -125,9 +125,9 @@ def test_patches_are_found_where_numpy_finds_them(count: int) -> None:
     np.testing.assert_allclose(np.log(next(sizes)), np.log(next(sizes)), atol=300 * PIXELS)
 
 
-# Together in one pass, and more than that takes.
+# Together in one pass, and in more than one.
 @pytest.mark.parametrize('counts', [(3, 4, 9), (200, 90, 40)])
-def test_patches_of_several_images_are_those_of_each(counts: tuple[int, ...]) -> None:
+def test_patches_of_several_images_equal_those_of_each(counts: tuple[int, ...]) -> None:
     rng = np.random.default_rng(sum(counts))
     images, here = [image(seed) for seed in range(3)], image(3)
     x = rng.uniform(20, 180, (sum(counts), 2))
@@ -148,7 +148,7 @@ def test_surfaces_are_those_of_numpy_to_the_last_bit(
         count: int, radius: int, tests: int, scale: float, grading: float) -> None:
     rng, chosen = np.random.default_rng(1), pattern(tests, scale)
     fine, margin = smooth_finely(image(1), scale), reach(chosen) + radius
-    # The outermost places at which they are defined are among them.
+    # The outermost places with a descriptor are among them.
     centres = rng.integers(margin, (320 - margin, 200 - margin), (count, 2))
     centres[:1], centres[1:2] = margin, (319 - margin, 199 - margin)
     reference = rng.integers(-round(4 * grading) or -1, (round(4 * grading) or 1) + 1,
@@ -168,7 +168,7 @@ def test_slopes_of_corners_are_those_of_numpy_to_the_last_bit(size: tuple[int, i
 @pytest.mark.parametrize('size', [(320, 200), (321, 203), (36, 35), (30, 9)])
 def test_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
     noise = np.random.default_rng(0).integers(0, 256, size[::-1]).astype(np.uint8)
-    # Slopes of few values are as large as those beside them.
+    # With few values, many slopes equal their neighbours.
     for gray, steps in ((noise, 1e-3), (image(1, size), 1e-3), (noise, 300.0)):
         slopes = np.rint(corner_slopes(gray) / steps).astype(np.float32)
         for ours, numpys in zip(*both(partial(_peaks, slopes, 0.5, gray.shape))):
@@ -192,7 +192,7 @@ def test_noise_and_places_of_corners_are_those_of_numpy(size: tuple[int, int]) -
 def test_points_are_spread_out_as_numpy_does(count: int, most: int) -> None:
     rng = np.random.default_rng(count)
     points = rng.integers(0, (700, 300), (count, 2))
-    # Some are as strong as others.
+    # Some are equally strong.
     strengths = rng.integers(0, 99, count).astype(np.float32)
     first = rng.uniform(size=count) < 0.6
     np.testing.assert_array_equal(*both(partial(spread_out, points, strengths, most, first)))
@@ -234,7 +234,7 @@ def test_the_most_similar_features_are_those_of_numpy(strips: list[tuple[int, ..
 
 
 @pytest.mark.parametrize('count', [1, 9, 900])
-def test_planes_through_depths_are_those_of_numpy(count: int) -> None:
+def test_planes_through_depths_equal_numpy(count: int) -> None:
     rng = np.random.default_rng(count)
     u, v = rng.uniform(0, (12, 7), (count, 2)).T
     rho = 0.1 + 0.01 * u + 0.02 * v + 0.02 * (u > 6) + rng.normal(0, 2e-3, count)
@@ -259,9 +259,9 @@ def test_references_are_those_of_numpy_to_a_grade(counts: tuple[int, int]) -> No
 
 @pytest.mark.parametrize('count', [5, 8, 203])
 @pytest.mark.parametrize('indefinite', [False, True])
-def test_the_optimiser_takes_numpys_steps(loss: Loss, count: int, indefinite: bool) -> None:
+def test_the_optimiser_takes_the_steps_of_numpy(loss: Loss, count: int, indefinite: bool) -> None:
     matches, start = problem(np.random.default_rng(count), count, indefinite)
-    # More of them may lead apart what rounding began.
+    # More steps may amplify rounding.
     ours, numpys = both(lambda: minimise(matches, start.R, start.t, loss, 3))
     np.testing.assert_allclose(ours.R, numpys.R, atol=1e-8)
     np.testing.assert_allclose(ours.t, numpys.t, atol=1e-8)
@@ -297,7 +297,7 @@ def test_many_starts_are_refined_as_numpy_does(loss: Loss, steps: int) -> None:
 
 @pytest.mark.parametrize('indefinite', [False, True])
 @pytest.mark.parametrize('signs', [(1.0,), (1.0, -1.0)])
-def test_points_before_the_cameras_cost_what_numpy_says(
+def test_losses_with_chirality_equal_numpy(
         loss: Loss, indefinite: bool, signs: tuple[float, ...]) -> None:
     matches, start = problem(np.random.default_rng(6), 203, indefinite)
     seen = refine_all(matches, [*around(start, 10), Pose(np.eye(3), np.zeros(3))], loss, 1)
@@ -305,7 +305,7 @@ def test_points_before_the_cameras_cost_what_numpy_says(
     np.testing.assert_allclose(ours, numpys, rtol=1e-9, atol=1e-12)
 
 
-def test_matches_that_tell_nothing_move_no_pose() -> None:
+def test_degenerate_matches_move_no_pose() -> None:
     for rays in (np.zeros((3, 6)), np.full((3, 6), np.nan), np.empty((3, 0))):
         matches = JetProblem(rays, rays, np.ones(rays.shape), np.zeros(rays.shape[1]))
         for found in both(partial(minimise, matches, np.eye(3), np.array([0.0, 0, 1]), Loss())):
@@ -319,14 +319,14 @@ def test_rotations_are_fitted_as_numpy_does(count: int) -> None:
     x = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
     for turn in (np.zeros(3), np.array([0.1, -0.2, 0.3]), np.array([3.1, 0.0, 0.0])):
         y = x @ rotation_exp(turn).T + rng.normal(0, 1e-3, x.shape)
-        # Some of them have nothing to do with it.
+        # Some of them are outliers.
         y[:count // 4] += 0.3
         ours, numpys = both(partial(fit_rotation, x, y))
         np.testing.assert_allclose(ours, numpys, atol=1e-9)
 
 
 @pytest.mark.parametrize('count', [1, 2, 700])
-def test_what_cells_tell_is_summed_up_as_numpy_does(count: int) -> None:
+def test_sums_over_cells_equal_numpy(count: int) -> None:
     rng = np.random.default_rng(count)
     order, codes = _along_curve(rng.uniform((-90, -20), (1600, 900), (count, 2)))
     J, weights, r = rng.normal(size=(5, count)), rng.uniform(0, 1, count), rng.normal(size=count)
@@ -344,7 +344,7 @@ def test_residuals_of_a_window_are_those_of_numpy(seen: bool) -> None:
     rng = np.random.default_rng(6)
     poses, landmarks = scene(rng, frames=6, landmarks=57)
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
-    # Some far behind, at the camera, and beyond what k1 moves.
+    # Some far behind, at the camera, and beyond the limit of k1.
     landmarks.rho[:9] = -3.0
     landmarks.rho[9:12] = 1e9
     landmarks.points[12:20] *= 9
@@ -361,7 +361,7 @@ def test_landmarks_are_eliminated_as_numpy_does(lens: bool) -> None:
     rng = np.random.default_rng(5)
     poses, landmarks = scene(rng, frames=6, landmarks=57)
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
-    # One that nobody sees, and one whose place nothing holds.
+    # One without observations, and one whose anchor has no precision.
     landmarks.seen[11] = False
     landmarks.held[12] = 0
     observed = observe(BUNDLE_K, poses, landmarks)
@@ -391,7 +391,7 @@ def frames(request: pytest.FixtureRequest) -> list[Frame]:
 
 
 @pytest.mark.parametrize('name', ['best', 'fast', 'paper'])
-def test_pairs_come_out_the_same_with_and_without(frames: list[Frame], name: str) -> None:
+def test_pairs_have_the_same_pose_compiled_and_not(frames: list[Frame], name: str) -> None:
     estimator = TwoViewEstimator(preset(name))
     views = [frame.view(estimator) for frame in frames[:4]]
     for before, after in pairwise(views):
@@ -403,16 +403,16 @@ def test_pairs_come_out_the_same_with_and_without(frames: list[Frame], name: str
 
 @pytest.mark.skipif(not EXACT, reason='NumPy samples landmarks up to a 64th of a pixel beside')
 @pytest.mark.parametrize('name', ['best', 'fast', 'paper'])
-def test_a_track_differs_by_less_than_it_is_unsure_of(frames: list[Frame], name: str) -> None:
-    # Where a step of the flow is the last one hangs on the last digit of where it began.
+def test_a_track_differs_by_less_than_its_sigma(frames: list[Frame], name: str) -> None:
+    # Whether a step of the flow is the last one depends on the last digit of its start.
     for ours, numpys in zip(*both(lambda: motions(frames, name))):
         assert ours.status == numpys.status
         if ours.status == Status.OK:
-            # Preset paper goes without the flow.
+            # Preset paper does not use the flow.
             assert apart_by(ours, numpys) < (1e-3 if name == 'paper' else 0.5)
 
 
-def test_what_was_built_of_other_sources_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_of_other_sources_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, '_INTERFACE', compiled._INTERFACE + 1)
     with pytest.warns(UserWarning, match='of other sources, and left out; install djet_ros anew'):
         assert compiled._loaded() is None
@@ -427,7 +427,7 @@ print(compiled.library is None, Tracker(Config(), message_type).diagnosis().valu
 """
 
 
-def test_who_wants_to_can_do_without_and_the_diagnostics_say_so() -> None:
+def test_compiled_loops_can_be_disabled_and_the_diagnostics_report_it() -> None:
     answers = [subprocess.run(
         [sys.executable, '-c', SAID],
         env={**os.environ, 'DJET_COMPILED': told}, capture_output=True, text=True, check=True
@@ -435,8 +435,8 @@ def test_who_wants_to_can_do_without_and_the_diagnostics_say_so() -> None:
     assert answers == ['True NumPy', 'False compiled']
 
 
-def test_what_cannot_be_loaded_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-                                           ) -> None:
+def test_a_library_that_cannot_be_loaded_is_ignored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+                                                    ) -> None:
     damaged = tmp_path / '_loops.so'
     damaged.write_bytes(b'no library')
     monkeypatch.setattr(compiled, 'find_spec', lambda name: SimpleNamespace(origin=str(damaged)))

@@ -1,4 +1,4 @@
-"""Graded tests, against a sum over tests and pixels, and against the Hamming distance."""
+"""Graded tests, compared with a sum over tests and pixels, and with the Hamming distance."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_surfaces_are_the_sum_over_tests_at_each_pixel(grading, count, scale):
                 assert surfaces[v_y + 2, v_x + 2, k] == pytest.approx(expected, rel=1e-6)
 
 
-def test_where_all_tests_are_decided_the_distance_is_hammings():
+def test_with_saturated_tests_the_distance_is_the_hamming_distance():
     # With two levels a test is decided or undecided; undecided ones are 0 here and a bit there.
     rng = np.random.default_rng(72)
     image = np.where(rng.uniform(size=SIZE[::-1]) < 0.5, 0, 1020).astype(np.int16)
@@ -55,7 +55,7 @@ def test_where_all_tests_are_decided_the_distance_is_hammings():
     assert found == bits[both].sum() + 0.5 * (decided != (there[0] != there[1])[:, 0]).sum()
 
 
-def test_many_points_at_once_are_as_one_at_a_time():
+def test_many_points_give_the_same_as_one_at_a_time():
     rng = np.random.default_rng(73)
     image_a, image_b = smoothed(74), smoothed(75)
     points = rng.integers(REACH + 2, np.subtract(SIZE, REACH + 2), (5000, 2))
@@ -85,7 +85,7 @@ def test_without_grading_all_of_orbs_bits_are_compared():
 
 
 @pytest.mark.parametrize('noise', [2.0, 6.0])
-def test_graded_tests_find_a_place_in_noise_nearer_to_the_truth_than_bits(noise):
+def test_graded_tests_are_more_accurate_in_noise_than_bits(noise):
     rng = np.random.default_rng(78)
     clean = textured(rng, (320, 240))
     images = [np.clip(clean + rng.normal(0, noise, clean.shape), 0, 255).astype(np.uint8)
@@ -103,7 +103,7 @@ def test_graded_tests_find_a_place_in_noise_nearer_to_the_truth_than_bits(noise)
 
 
 @pytest.mark.parametrize('exposure', [0.4, 1.6])
-def test_a_change_of_exposure_changes_neither_places_nor_what_the_fit_leaves(exposure):
+def test_a_change_of_exposure_changes_neither_minima_nor_residuals(exposure):
     rng = np.random.default_rng(79)
     dim = 70 + 0.3 * (textured(rng, (320, 240)).astype(float) - 128)
     estimator = TwoViewEstimator()
@@ -118,12 +118,12 @@ def test_a_change_of_exposure_changes_neither_places_nor_what_the_fit_leaves(exp
             DescriptorSurface(before, view, x, EstimatorConfig()).around(x), 'project')
         left[name] = np.median(fitted.c / np.maximum(np.trace(fitted.A, axis1=1, axis2=2), 1e-9))
         errors[name] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
-    # Less light is told in fewer gray levels, so that noise weighs more.
+    # Less light has fewer gray levels, so that noise has more effect.
     assert errors['after'] < 2.5 * errors['same']
     assert left['after'] < 2.5 * left['same']
 
 
-def test_a_gray_level_is_seen_in_quarters_as_orb_sees_it_in_whole_ones():
+def test_fine_smoothing_is_orbs_to_a_quarter_of_a_gray_level():
     image = textured(np.random.default_rng(76), SIZE)
     fine = smooth_finely(image)
     assert fine.dtype == np.int16 and fine.max() <= 4 * 255

@@ -1,4 +1,4 @@
-"""The ground under the camera: how far it moved, how sure that is, and when nothing is said."""
+"""The ground under the camera: translation, uncertainty, and when there is no estimate."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -112,7 +112,7 @@ def floor():
 
 @pytest.mark.parametrize('way', [0.15, 0.8, 1.5])
 @pytest.mark.parametrize(('pitch', 'turn'), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.05)])
-def test_the_way_over_the_ground_is_seen_in_heights_of_the_camera(floor, way, pitch, turn):
+def test_the_translation_is_measured_in_camera_heights(floor, way, pitch, turn):
     heading = np.array([np.sin(turn / 2), np.cos(turn / 2)]) * way
     motion = moved(floor_pose(pitch), floor_pose(pitch, *heading, yaw=turn))
     seen = Ground(K, SIZE[::-1], pitch).motion(
@@ -123,7 +123,7 @@ def test_the_way_over_the_ground_is_seen_in_heights_of_the_camera(floor, way, pi
     assert (sigmas < [0.05 * way / HEIGHT, np.radians(1), np.radians(1)]).all()
 
 
-def test_the_camera_may_look_down_by_a_little_more_than_is_said(floor):
+def test_the_pitch_may_be_slightly_wrong(floor):
     pitch = np.radians(1.5)
     motion = moved(floor_pose(pitch), floor_pose(pitch, z=0.8))
     seen = Ground(K, SIZE[::-1], 0.0).motion(
@@ -132,7 +132,7 @@ def test_the_camera_may_look_down_by_a_little_more_than_is_said(floor):
     assert seen.value[1] == pytest.approx(pitch, abs=np.radians(0.5))
 
 
-def test_the_covariance_of_one_pair_is_that_of_many():
+def test_the_covariance_of_one_pair_is_consistent_over_many():
     """Other floors, other noise, and motions that are off by as much as they say."""
     rng, ground, errors = np.random.default_rng(3), Ground(K, SIZE[::-1], 0.0), []
     sigma = 4e-3
@@ -151,7 +151,7 @@ def test_the_covariance_of_one_pair_is_that_of_many():
     assert np.max(errors) < 25
 
 
-def test_less_texture_makes_less_sure(floor):
+def test_less_texture_gives_a_larger_covariance(floor):
     sigmas = []
     for contrast in (1.0, 0.05):
         before, after = (
@@ -165,7 +165,7 @@ def test_less_texture_makes_less_sure(floor):
     assert len(sigmas) == 1 or sigmas[1] > 2 * sigmas[0]
 
 
-def test_ground_without_texture_tells_nothing():
+def test_ground_without_texture_gives_no_estimate():
     plain = [np.random.default_rng(seed).normal(120, 1, SIZE[::-1]).astype(np.uint8)
              for seed in (1, 2)]
     assert Ground(K, SIZE[::-1], 0.0).motion(
@@ -174,7 +174,7 @@ def test_ground_without_texture_tells_nothing():
 
 @pytest.mark.parametrize('step', [pose(x=0.5), pose(z=1.5), pose(x=0.3, z=-0.8),
                                   pose(x=0.5, yaw=0.03), pose(x=-0.2, z=1.0)])
-def test_a_wall_is_no_ground(step):
+def test_a_wall_is_not_taken_for_ground(step):
     """One card, twelve metres ahead."""
     wall, estimator = Cards(), TwoViewEstimator()
     del wall._cards[1:]
@@ -183,7 +183,7 @@ def test_a_wall_is_no_ground(step):
         assert Ground(CARDS_K, (240, 320), 0.0).motion(*views, motion) is None
 
 
-def test_what_moves_with_the_camera_is_no_ground(floor):
+def test_objects_that_move_with_the_camera_are_not_taken_for_ground(floor):
     """A bonnet, or the shadow of the car itself: the same pixels in both images."""
     before, after = floor.gray(), floor.gray(z=0.8, seed=3)
     after[100:] = before[100:]
@@ -191,7 +191,7 @@ def test_what_moves_with_the_camera_is_no_ground(floor):
         view(before), view(after), moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
 
 
-def test_what_is_masked_is_no_ground_and_the_rest_tells(floor):
+def test_masked_pixels_are_ignored_and_the_rest_suffices(floor):
     """The right half of the picture moves with the camera; each image has a mask of its own."""
     before, after = floor.gray(seed=1), floor.gray(z=0.8, seed=2)
     before[:, 200:] = after[:, 200:] = floor.gray(seed=3)[:, 200:]
@@ -207,7 +207,7 @@ def test_what_is_masked_is_no_ground_and_the_rest_tells(floor):
     assert ground.motion(view(before), view(after), motion) is None
 
 
-def test_a_camera_that_sees_no_ground_says_nothing(floor):
+def test_a_camera_that_sees_no_ground_gives_no_estimate(floor):
     upwards = Ground(K, SIZE[::-1], np.radians(-30.0))
     assert not upwards.is_in_view
     assert upwards.motion(view(floor.gray()), view(floor.gray(z=0.8)),
@@ -215,17 +215,17 @@ def test_a_camera_that_sees_no_ground_says_nothing(floor):
 
 
 @pytest.mark.parametrize('size', [(1, 1), (20, 20), (40, 30)])
-def test_an_image_too_small_for_any_ground_says_nothing(size):
+def test_an_image_too_small_for_the_ground_gives_no_estimate(size):
     assert not Ground(K, size, 0.0).is_in_view
 
 
-def test_two_equal_images_of_a_moving_camera_say_nothing(floor):
+def test_two_equal_images_of_a_moving_camera_give_no_estimate(floor):
     views = [view(floor.gray())] * 2
     assert Ground(K, SIZE[::-1], 0.0).motion(
         *views, moved(floor_pose(0.0), floor_pose(0.0, z=0.8))) is None
 
 
-def test_turning_on_the_spot_is_no_way_at_all(floor):
+def test_a_pure_rotation_is_zero_translation(floor):
     R = np.linalg.inv(floor_pose(0.0, yaw=0.05)) @ floor_pose(0.0)
     seen = Ground(K, SIZE[::-1], 0.0).motion(
         view(floor.gray(seed=1)), view(floor.gray(yaw=0.05, seed=2)),
@@ -245,7 +245,7 @@ def see_pair(scale, floor, i, z, dz, status=Status.OK, gray=None):
     return scale.between(i * 10**8, (i + 1) * 10**8)
 
 
-def test_lengths_are_in_metres_and_as_sure_as_height_and_images_allow(floor):
+def test_lengths_are_metric_with_the_uncertainty_of_height_and_images(floor):
     sigmas = {}
     for share in (0.01, 0.05):
         scale = CameraHeightScale(HEIGHT, 0.0, share)
@@ -295,7 +295,7 @@ def test_standing_still_is_a_known_length(floor):
     assert see_pair(scale, floor, 20, 0.4, 0.5).value == pytest.approx(0.5, rel=0.04)
 
 
-def test_ground_that_leans_all_of_a_sudden_is_none(floor):
+def test_ground_that_tilts_suddenly_is_rejected(floor):
     """A ramp behind which something else may be: its way is not taken for a length."""
     scale = CameraHeightScale(HEIGHT, 0.0)
     for i in range(5):
@@ -309,7 +309,7 @@ def test_ground_that_leans_all_of_a_sudden_is_none(floor):
     assert after.sigma > before.sigma
 
 
-def test_a_plane_at_rest_leans_otherwise_against_a_camera_that_turns():
+def test_tilt_is_propagated_through_a_rotation():
     """By pitch alone as far as it nods, by roll as far as it tips; turning makes one the other."""
     nods, tips, turns = (rotation_exp(angle) for angle in 0.1 * np.eye(3)[[0, 2, 1]])
     sure = np.zeros((3, 3))
@@ -319,7 +319,7 @@ def test_a_plane_at_rest_leans_otherwise_against_a_camera_that_turns():
                                [0.05 * np.cos(0.1), 0.05 * np.sin(0.1)], atol=1e-4)
 
 
-def test_a_lean_is_as_sure_as_it_was_and_as_the_turn_is():
+def test_the_covariance_of_tilt_is_propagated_through_a_rotation():
     lean, R = np.array([0.2, -0.1]), rotation_exp(np.array([0.05, -0.2, 0.1]))
     covariance = np.diag([1.0, 2.0, 3.0]) * 1e-4
     after, by_lean, by_turn = turned(lean, R, covariance)
@@ -334,7 +334,7 @@ def test_a_lean_is_as_sure_as_it_was_and_as_the_turn_is():
 
 @pytest.mark.parametrize('pitches', [2 * np.sin(2 * np.pi * 1.5 * 0.1 * np.arange(21)),
                                      np.repeat([0.0, 2.0, 0.0], 7)])
-def test_a_vehicle_that_nods_goes_no_further(floor, pitches):
+def test_pitching_of_the_vehicle_does_not_bias_lengths(floor, pitches):
     """Thrice in two seconds, as when it bounces, or all of a sudden; pitches in degrees."""
     scale, lengths, way = CameraHeightScale(HEIGHT, 0.0), [], 0.8
     for i, pair in enumerate(pairwise(np.radians(pitches))):
@@ -348,7 +348,7 @@ def test_a_vehicle_that_nods_goes_no_further(floor, pitches):
 
 
 @pytest.mark.parametrize('radius', [400.0, -400.0])
-def test_a_vehicle_that_turns_with_the_road_tells_a_hill(radius):
+def test_a_vehicle_that_pitches_with_the_road_is_on_a_hill(radius):
     """
     A pair alone takes ground ahead for a plane that goes on below the camera.
 
@@ -388,7 +388,7 @@ def drive(street, **config):
     return [vo.process(Frame(gray, K, 10**9 + i * 10**8)) for i, gray in enumerate(images)][1:]
 
 
-def test_a_street_is_as_long_as_it_is(street):
+def test_the_length_of_a_street_is_measured(street):
     ways = np.linalg.norm(np.diff(np.array(street[2])[:, :3, 3], axis=0), axis=1)
     results = drive(street, **CAR)
     assert all(result.scale_known for result in results)
@@ -407,7 +407,7 @@ def test_a_wrong_height_is_a_wrong_length_in_proportion(street):
     assert wrong == pytest.approx(2 * right, rel=0.03)
 
 
-def test_the_choice_is_said_in_the_diagnostics(street):
+def test_the_scale_source_is_in_the_diagnostics(street):
     for name in ('none', 'camera_height'):
         tracker = Tracker(from_flat({'odometry.scale': name, 'odometry.camera_height': 1.65}),
                           message_type)

@@ -90,7 +90,7 @@ def test_hamming_surfaces_count_the_bits_that_differ_pixel_by_pixel(radius):
             assert surfaces[v_y + radius, v_x + radius].tolist() == expected
 
 
-def test_a_descriptor_is_at_distance_zero_from_itself_and_found_where_the_image_has_moved_to():
+def test_a_descriptor_has_distance_zero_to_itself_also_in_a_shifted_image():
     image = textured(np.random.default_rng(13), SIZE)
     moved = np.roll(image, (2, -1), axis=(0, 1))  # two down, one to the left
     points = np.array([[60, 50], [80, 70], [100, 40]])
@@ -109,7 +109,7 @@ def test_the_greatest_distance_of_256_does_not_overflow():
     assert (surfaces == 256).all()
 
 
-def test_many_points_at_once_are_as_one_at_a_time():
+def test_many_points_give_the_same_as_one_at_a_time():
     rng = np.random.default_rng(14)
     image_a, image_b = smooth(textured(rng, SIZE)), smooth(textured(rng, SIZE))
     points = rng.integers(REACH + 2, np.subtract(SIZE, REACH + 2), (5000, 2))
@@ -120,7 +120,7 @@ def test_many_points_at_once_are_as_one_at_a_time():
         assert np.array_equal(together[:, :, k], alone[:, :, 0])
 
 
-def test_few_points_are_tested_as_many_are():
+def test_few_points_give_the_same_as_many():
     rng = np.random.default_rng(3)
     image = rng.integers(0, 256, (120, 160), np.uint8)
     points = rng.integers(20, 100, (200, 2))
@@ -128,7 +128,7 @@ def test_few_points_are_tested_as_many_are():
         assert np.array_equal(one, other[:, :9])
 
 
-def test_patches_of_two_images_are_in_one_pass_what_each_has_by_itself():
+def test_warped_patches_of_two_images_in_one_pass_equal_those_of_each():
     rng = np.random.default_rng(5)
     images = rng.integers(0, 256, (2, 120, 160), np.uint8)
     points, warps = rng.uniform(20, 100, (700, 2)), np.tile(1.1 * np.eye(3, 2), (700, 1, 1))
@@ -139,7 +139,7 @@ def test_patches_of_two_images_are_in_one_pass_what_each_has_by_itself():
             np.testing.assert_allclose(other[:, some], one, atol=1e-3)
 
 
-def test_a_patch_seen_through_a_warp_is_tested_where_its_inverse_says():
+def test_a_warped_patch_is_sampled_at_the_inverse_warp():
     smoothed = smooth(pictures()['textured'])
     points = np.array([[60, 50], [90, 60], [70, 70], [80, 66]])
     warps = np.array([np.eye(3, 2), 1.25 * np.eye(3, 2), [[0.9, 0.2], [-0.1, 1.1], [0, 0]],

@@ -1,4 +1,4 @@
-"""The joint optimiser: its residuals, their derivatives, the robust losses, and where it ends."""
+"""The joint optimiser: its residuals, their derivatives, the robust losses, and convergence."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_residuals_of_circles_are_the_distances_to_the_epipolar_lines_in_pixels(
     assert np.allclose(residuals.r, distances, rtol=1e-9)
 
 
-def test_near_the_epipole_a_residual_counts_the_less_the_nearer():
+def test_residuals_are_down_weighted_near_the_epipole():
     # straight ahead the epipole is the principal point, and lines run outwards from it
     across = np.array([1.0, 5.0, 30.0, 400.0])
     x = K[:2, 2] + across[:, None] * (1, 0)
@@ -120,7 +120,7 @@ def test_near_the_epipole_a_residual_counts_the_less_the_nearer():
     assert np.allclose(blurred.r / sharp.r, across / np.hypot(across, 5))
 
 
-def test_a_surface_without_any_curvature_has_no_say():
+def test_a_flat_surface_has_no_weight():
     seen = two_views(np.random.default_rng(5))
     surfaces = circles(seen.y + 0.5)
     surfaces.A[:7] = 0
@@ -130,7 +130,7 @@ def test_a_surface_without_any_curvature_has_no_say():
     assert np.abs(residuals.jacobian[:, :7]).max() < 0.01 * np.abs(residuals.jacobian).max()
 
 
-def test_some_of_the_matches_have_the_residuals_that_they_have_among_all():
+def test_a_subset_of_matches_has_the_same_residuals():
     rng = np.random.default_rng(6)
     x, y = rng.uniform(0, 1000, (2, 20, 2))
     problem, pose = jet_problem(K, x, random_surfaces(rng, y, 'bowls')), random_pose(rng)
@@ -141,7 +141,7 @@ def test_some_of_the_matches_have_the_residuals_that_they_have_among_all():
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_a_moved_pose_is_a_pose_and_as_far_away_as_the_step_is_long(seed):
+def test_a_step_gives_a_valid_pose_at_its_own_distance(seed):
     rng = np.random.default_rng(seed)
     R, t = random_pose(rng)
     step = 1e-3 * rng.normal(size=5)
@@ -183,7 +183,7 @@ def test_a_loss_grows_with_the_residual_and_is_its_square_while_that_is_small(na
     assert np.allclose(loss(small)[0], small, rtol=1e-3)
 
 
-def test_the_losses_differ_in_how_much_a_gross_error_may_cost():
+def test_losses_differ_in_the_cost_of_a_gross_outlier():
     gross = np.array([1e6])
     none, huber, cauchy, geman = (Loss(name, 2.0)(gross)[0][0] for name in LOSSES)
     assert none == 1e6
@@ -218,7 +218,7 @@ def test_minimising_never_ends_above_the_cost_of_the_start(name, kind):
 @pytest.mark.parametrize('name', LOSSES)
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
 @pytest.mark.parametrize('camera', [K, SKEWED])
-def test_without_noise_the_exact_pose_is_found_from_some_degrees_away(camera, t, name):
+def test_without_noise_the_exact_pose_is_found_from_degrees_away(camera, t, name):
     rng = np.random.default_rng(8)
     seen = two_views(rng, t=t, K=camera)
     problem = jet_problem(camera, seen.x, circles(seen.y))
@@ -251,7 +251,7 @@ def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name, kind):
     assert np.linalg.norm(gradient) < 1e-2 * np.linalg.norm(uphill)
 
 
-def test_a_third_of_gross_errors_does_not_move_a_robust_loss_and_ruins_the_plain_one():
+def test_a_third_of_outliers_biases_only_least_squares():
     rng = np.random.default_rng(10)
     seen = two_views(rng)
     y = seen.y.copy()
@@ -277,7 +277,7 @@ def test_the_robust_scale_is_the_standard_deviation_of_the_inliers():
     assert robust_scale(residuals) == pytest.approx(0.7, rel=0.1)
 
 
-def test_the_core_scale_is_that_of_the_right_matches_where_most_are_false():
+def test_the_clipped_scale_is_that_of_the_inliers_even_if_most_are_outliers():
     rng = np.random.default_rng(13)
     right = rng.normal(0, 0.1, 10_000)
     false = rng.uniform(-20, 20, 15_000)
@@ -293,7 +293,7 @@ def test_the_core_scale_of_exact_matches_is_zero_after_any_number_of_rounds(monk
     assert core_scale(np.append(np.zeros(10), [3.0, 5.0, 9.0])) == 0.0
 
 
-def test_matches_that_determine_nothing_leave_the_pose_finite():
+def test_degenerate_matches_leave_the_pose_finite():
     one = two_views(np.random.default_rng(12), count=1)
     for count in (1, 30):
         x, y = np.tile(one.x, (count, 1)), np.tile(one.y, (count, 1))

@@ -1,4 +1,4 @@
-"""Places by surfaces and by gray levels: joined as two measurements of one thing are."""
+"""Fusion of surfaces and patch alignment as two Gaussian measurements."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from two_view import K, two_views, TwoViews
 
-# By what a surface counts as less exact than it is, because gray levels see the same pixels.
+# Inflation of a surface's covariance, because gray levels see the same pixels.
 TOGETHER = 2.0
 
 
@@ -63,16 +63,16 @@ def rotation_errors(poses: Callable[[np.random.Generator, TwoViews], Iterable[Po
     return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
-def test_two_measurements_of_a_place_are_joined_as_gaussians_are() -> None:
+def test_two_measurements_are_fused_as_gaussians() -> None:
     rng = np.random.default_rng(20)
     views = two_views(rng, 400)
     x, y, R, t = views.x, views.y, views.R, views.t
     y_star, S = ellipses(rng, y, 0.3)
     found, T = ellipses(rng, y, 0.2)
     alone = jet_problem(K, x, surfaces(y_star, S))
-    # Nothing but the shapes and the ratios of covariances is told.
+    # Only the shapes and ratios of covariances are known.
     joined = with_places(alone, at(alone, R, t), K, Placed(found, 7 * T))
-    # How exact each is, in pixels: from its distances to the true lines.
+    # The standard deviation of each, in pixels, by the distances to the true lines.
     lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
     normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     S, T = (shape * core_scale(((at_places - y) * normals).sum(1) / np.sqrt(
@@ -96,8 +96,8 @@ def test_two_measurements_of_a_place_are_joined_as_gaussians_are() -> None:
 
 
 @pytest.mark.parametrize('sigma', [0.1, 0.3, 1.0])
-def test_a_pose_of_surfaces_and_places_is_about_as_exact_as_that_of_the_better(sigma: float
-                                                                               ) -> None:
+def test_a_fused_pose_is_about_as_accurate_as_the_better_of_both(sigma: float
+                                                                 ) -> None:
     def poses(rng: np.random.Generator, views: TwoViews) -> list[Pose]:
         y_star, S = ellipses(rng, views.y, 0.3)
         found = views.y + rng.normal(0, sigma, views.y.shape)
@@ -111,7 +111,7 @@ def test_a_pose_of_surfaces_and_places_is_about_as_exact_as_that_of_the_better(s
     assert both < 1.1 * min(surface, place)
 
 
-def test_sharp_places_count_for_more() -> None:
+def test_measurements_are_weighted_by_their_precision() -> None:
     """Where one half of the matches is ten times as exact, the pose is that of this half."""
     def poses(rng: np.random.Generator, views: TwoViews) -> list[Pose]:
         sigma = np.where(np.arange(200) % 2, 0.05, 0.5)
@@ -127,7 +127,7 @@ def test_sharp_places_count_for_more() -> None:
     assert weighed < 0.5 * unweighed
 
 
-def test_places_that_agree_count_for_more_where_matches_differ_in_noise() -> None:
+def test_agreeing_measurements_have_more_weight_if_the_noise_varies() -> None:
     rng = np.random.default_rng(22)
     views = two_views(rng, 400)
     x, y, R, t = views.x, views.y, views.R, views.t
@@ -140,7 +140,7 @@ def test_places_that_agree_count_for_more_where_matches_differ_in_noise() -> Non
     assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
 
 
-def test_what_was_found_elsewhere_moves_the_pose_little() -> None:
+def test_outliers_of_the_alignment_hardly_change_the_pose() -> None:
     def poses(rng: np.random.Generator, views: TwoViews) -> Iterator[Pose]:
         y_star, S = ellipses(rng, views.y, 0.2)
         found = views.y + rng.normal(0, 0.2, views.y.shape)
@@ -156,7 +156,7 @@ def test_what_was_found_elsewhere_moves_the_pose_little() -> None:
     assert some_wrong < 1.3 * right
 
 
-def test_where_a_surface_has_no_minimum_it_stays_as_it_is() -> None:
+def test_matches_without_a_minimum_are_not_fused() -> None:
     rng = np.random.default_rng(21)
     views = two_views(rng, 60)
     x, y, R, t = views.x, views.y, views.R, views.t
@@ -173,16 +173,16 @@ def test_where_a_surface_has_no_minimum_it_stays_as_it_is() -> None:
     assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()
 
 
-def test_without_a_pose_two_places_tell_by_themselves_how_exact_they_are() -> None:
+def test_without_a_pose_the_differences_calibrate_the_covariances() -> None:
     """Covariances are in pixels, whatever unit surfaces come in; the joined place is better."""
     rng = np.random.default_rng(25)
     y = rng.uniform(0, 400, (4000, 2))
     y_star, S = ellipses(rng, y, 0.3)
-    # What both see alike, and what each errs for itself.
+    # Common errors, and those of each.
     found, T = ellipses(rng, y, 0.15)
     alike_off = 0.05 * rng.normal(size=y.shape)
     y_star, found = y_star + alike_off, found + alike_off
-    # Errors by gray levels are twice as large as they say.
+    # Errors of the alignment are twice as large as stated.
     places, C = joined_places(y_star, 1000 * S, Placed(found, T / 4))
     errors = [np.sqrt(np.mean((one - y)**2)) for one in (y_star, found, places)]
     assert errors[2] < min(errors[:2])
@@ -190,7 +190,7 @@ def test_without_a_pose_two_places_tell_by_themselves_how_exact_they_are() -> No
     assert 0.5 < np.median(squared) / (2 * np.log(2)) < 2
 
 
-def test_places_that_are_the_same_have_covariances_still() -> None:
+def test_equal_positions_have_a_covariance() -> None:
     y, eye = np.full((5, 2), 40.0), np.tile(np.eye(2), (5, 1, 1))
     places, C = joined_places(y, 3 * eye, Placed(y, 1e-4 * eye))
     assert np.array_equal(places, y)

@@ -1,4 +1,4 @@
-"""What a calibration leaves of the lens: what turns say of it, and what says nothing."""
+"""Estimation of lens distortion: determined by turns, and no estimate otherwise."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ TURNS = np.linspace(0.02, 0.06, 20)
 
 
 @pytest.mark.parametrize(('matches', 'kept'), [(0, 0), (7, 7), (300, 300), (301, 151)])
-def test_of_a_pair_so_many_matches_are_kept_at_most(matches: int, kept: int) -> None:
+def test_the_matches_of_a_pair_are_limited(matches: int, kept: int) -> None:
     places = np.random.default_rng(1).uniform((0, 0), SIZE, (matches, 2))
     seen = RelativePose(Status.OK, x=places, placed=places, voting=np.ones(matches, bool))
     pair = MatchedPair.of(seen, K)
@@ -88,10 +88,10 @@ def test_of_a_pair_so_many_matches_are_kept_at_most(matches: int, kept: int) -> 
 
 
 @pytest.mark.parametrize('k1', [0.0, 0.015, -0.02, 0.05])
-def test_turns_tell_the_coefficient_and_how_sure_it_is(k1: float) -> None:
+def test_turns_determine_k1_and_its_standard_error(k1: float) -> None:
     fits = [fitted(seen_pairs(seed, TURNS, k1)) for seed in range(4)]
     errors = np.array([(fit.k1 - k1) / fit.sigma for fit in fits])
-    # By ten groups each, errors are of a Student distribution with nine degrees of freedom.
+    # With ten groups each, errors follow a Student distribution with nine degrees of freedom.
     assert np.abs(errors).max() < 4 and abs(errors.mean()) < 2
     assert all(1e-3 < fit.sigma < 5e-3 for fit in fits)
     assert fits[0].noise == pytest.approx(NOISE, rel=0.2)
@@ -99,18 +99,18 @@ def test_turns_tell_the_coefficient_and_how_sure_it_is(k1: float) -> None:
 
 
 @pytest.mark.parametrize('k1', [-0.35, -0.33, -0.3, -0.1, 0.2])
-def test_a_wide_lens_may_be_without_any_calibration(k1: float) -> None:
-    # At the outermost matches, -0.35 leaves a third of the slope, and -0.393 none.
+def test_a_wide_lens_is_estimated_without_any_calibration(k1: float) -> None:
+    # At the outermost matches, -0.35 leaves a third of the radial derivative, and -0.393 none.
     fit = lens.trusted_fit(seen_pairs(0, np.linspace(0.02, 0.06, 24), k1), CAMERA)
     assert abs(fit.k1 - k1) < 4 * fit.sigma and fit.sigma < 6e-3
 
 
-def test_next_to_where_the_image_folds_no_number_is_given() -> None:
+def test_near_a_fold_of_the_image_there_is_no_estimate() -> None:
     with pytest.raises(DjetError, match='no k1 was found'):
         lens.trusted_fit(seen_pairs(0, TURNS, -0.389), CAMERA)
 
 
-def test_a_shift_of_all_that_is_seen_in_one_place_is_within_the_error() -> None:
+def test_systematic_displacements_of_cells_are_within_the_standard_error() -> None:
     rng, pairs = np.random.default_rng(0), seen_pairs(0, TURNS, 0.0)
     fit = fitted(pairs)
     side = np.sqrt(520 * 360 / LARGE_CELLS) / K[0, 0]
@@ -124,19 +124,19 @@ def test_a_shift_of_all_that_is_seen_in_one_place_is_within_the_error() -> None:
     assert 0 < np.sqrt(np.mean(np.square(moves))) < fit.sigma
 
 
-def test_noise_alone_is_no_coefficient_on_a_straight_way() -> None:
-    # Distances among undistorted points would say 0.1 here, as they shrink with the image.
+def test_noise_on_a_straight_path_is_not_taken_for_distortion() -> None:
+    # Distances between undistorted points would give 0.1 here, as they shrink with the image.
     for fit in (fitted(seen_pairs(seed, [0.0] * 20, 0.0)) for seed in range(3)):
         assert abs(fit.k1) < 4 * fit.sigma
 
 
-def test_of_a_distortion_a_turn_leaves_more_than_a_straight_way() -> None:
+def test_the_pose_absorbs_less_distortion_in_a_turn_than_on_a_straight_path() -> None:
     straight, turned = (linearise(pair, CAMERA, 0.0).share
                         for pair in seen_pairs(0, [0.0, 0.05], 0.0))
     assert turned > 3 * straight
 
 
-def test_rings_around_the_middle_say_the_same() -> None:
+def test_rings_around_the_centre_agree() -> None:
     fit = fitted(seen_pairs(0, TURNS, 0.02))
     k1, sigma = by_radius(fit, np.array([0.2, 0.3, 0.4, 0.5, 5.0, 9.0]))
     assert (np.abs(k1 - 0.02) < 4 * sigma)[:4].all()
@@ -194,7 +194,7 @@ def row_of(said: str) -> str:
     return next(line for line in said.splitlines() if line.startswith('D: '))
 
 
-def test_a_right_calibration_is_left_as_it_is(
+def test_a_correct_calibration_is_kept(
         whip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'lens.yaml').write_text('of an earlier run')
     assert main(['lens', str(whip), '--output', str(tmp_path), '--overwrite']) == 0
@@ -203,7 +203,7 @@ def test_a_right_calibration_is_left_as_it_is(
     assert [path.name for path in tmp_path.iterdir()] == ['lens.png']
 
 
-def test_a_wrong_calibration_is_told_and_corrected(
+def test_a_wrong_calibration_is_detected_and_corrected(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'lens'
     assert main(['lens', str(distorted), '--output', str(output)]) == 0
@@ -211,7 +211,7 @@ def test_a_wrong_calibration_is_told_and_corrected(
     flag, k1 = said.splitlines()[-1 - said.count('plot: ')].split()
     assert float(k1) == pytest.approx(-0.02, abs=1e-3)
     assert 'raw images anew' in said and 'odometry.residual_k1' in said
-    # With that flag next to nothing is left.
+    # With that flag next to nothing remains.
     assert main(['lens', str(distorted), flag, k1]) == 0
     again = capsys.readouterr().out
     assert f'({float(k1):.4g} so far)' in again and 'not worth correcting' in again
@@ -227,7 +227,7 @@ def test_a_wrong_row_of_a_calib_txt_is_told_by_the_right_one(
     said = capsys.readouterr().out
     assert 'row of its calib.txt' in said and '--residual-k1' not in said
     assert float(row_of(said).split()[1]) == pytest.approx(-0.02, abs=1e-3)
-    # The parameter is for images that have none by their calibration.
+    # The parameter is for images without distortion by their calibration.
     assert main(['lens', str(wrong), '--residual-k1', '0.01']) == 2
     assert 'odometry.residual_k1 is 0.01, but' in capsys.readouterr().err
 
@@ -290,7 +290,7 @@ def test_a_driver_gets_a_file_where_its_images_are_raw(
 
 def test_of_rectified_images_a_driver_gets_no_file(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # As if somebody had rectified them, by whatever there was.
+    # As if rectified with an unknown calibration.
     assert main(['lens', str(raw_bag), '--rectified', 'true', '--output', str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert '--residual-k1 -0.0' in said and 'lens.yaml' not in said
@@ -335,7 +335,7 @@ def test_swung_fast_and_blurred_a_right_calibration_stays_right(
     assert not report.worth_correcting
 
 
-def test_where_the_camera_does_not_turn_no_number_is_given(
+def test_without_rotation_there_is_no_estimate(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     road = render_sequence('road', tmp_path, 5, size=(480, 144))
     assert main(['lens', str(road), '--output', str(tmp_path / 'out')]) == 2
@@ -351,7 +351,7 @@ def test_of_a_short_recording_it_says_that_it_is_short(whip: Path) -> None:
         lens.examine(recording, Config(), lambda: None)
 
 
-def test_what_moves_with_the_camera_can_be_left_out(whip: Path, tmp_path: Path) -> None:
+def test_objects_that_move_with_the_camera_can_be_masked(whip: Path, tmp_path: Path) -> None:
     bonnet = np.full((360, 480), 255, np.uint8)
     bonnet[240:] = 0
     cv2.imwrite(str(tmp_path / 'bonnet.png'), bonnet)
@@ -359,7 +359,7 @@ def test_what_moves_with_the_camera_can_be_left_out(whip: Path, tmp_path: Path) 
         mask_file=str(tmp_path / 'bonnet.png'))))
     rows = np.concatenate([report.camera.pixels(one.pair.y, 0.0)[0][:, 1]
                            for one in report.fit.linearised])
-    # Where gray levels have a match may be a pixel from its corner.
+    # The aligned position of a match may be a pixel from its corner.
     assert rows.max() < 242 and not report.worth_correcting
 
 
@@ -381,7 +381,7 @@ def test_results_of_others_are_not_replaced(
     assert (tmp_path / 'lens.yaml').read_text() == 'mine'
 
 
-def test_the_slow_turn_of_kitti_03_tells_what_its_rectification_left(kitti: Path) -> None:
+def test_the_slow_turn_of_kitti_03_determines_the_remaining_distortion(kitti: Path) -> None:
     sequence = KittiSequence(kitti / 'sequences' / '03', start=50, end=116)
     report = lens.examine(SequenceRecording(sequence), Config(), lambda: None)
     assert report.worth_correcting
@@ -389,7 +389,7 @@ def test_the_slow_turn_of_kitti_03_tells_what_its_rectification_left(kitti: Path
     assert 0 < report.fit.sigma < 0.003
 
 
-def test_the_straight_street_of_kitti_06_tells_nothing(kitti: Path) -> None:
+def test_the_straight_street_of_kitti_06_does_not_determine_k1(kitti: Path) -> None:
     sequence = KittiSequence(kitti / 'sequences' / '06', end=12)
     with pytest.raises(DjetError, match='0 of 11 pairs are informative .* record turns'):
         lens.examine(SequenceRecording(sequence), Config(), lambda: None)
@@ -401,7 +401,7 @@ def test_what_is_no_distortion_is_refused() -> None:
     farther = [replace(pair, pose=Pose(pair.pose.R @ pair.pose.R, pair.pose.t)) for pair in pairs]
     with pytest.raises(DjetError, match='degrees, not'):
         lens.trusted_fit(farther, CAMERA)
-    # No lens is another one where the camera turns more.
+    # The lens does not change where the camera rotates more.
     uneven = seen_pairs(1, [0.03] * 80, 0.05) + seen_pairs(2, [0.06] * 20, -0.05)
     with pytest.raises(DjetError, match='standard errors'):
         lens.trusted_fit(uneven, CAMERA)

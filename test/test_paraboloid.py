@@ -209,13 +209,13 @@ def test_on_upright_and_level_lines_the_optimum_is_that_of_a_parabola():
                        [[0.35, -2]], atol=1e-12)
 
 
-def test_where_the_surface_is_flat_along_the_line_the_nearest_point_of_the_line_is_taken():
+def test_on_a_surface_that_is_flat_along_the_line_the_nearest_point_is_taken():
     A, g = np.array([[[3.0, 0], [0, 0]]]), np.array([[2.0, 0]])
     v = constrained_minimum(A, np.array([[1.0, 0]]), g, np.array([3.0]))
     assert np.allclose(v, [[1.5, 0]])
 
 
-def test_the_least_value_on_a_line_is_that_of_the_bowl_and_a_squared_distance_beside_it():
+def test_the_minimum_on_a_line_is_the_surface_minimum_plus_a_squared_distance():
     """Q(v_opt) = Q(v*) + (y*^T l)^2 / (g^T A'^-1 g): what makes JET a least-squares problem."""
     rng = np.random.default_rng(10)
     count = 200
@@ -245,7 +245,7 @@ def test_surfaces_without_a_minimum_are_those_with_an_eigenvalue_that_is_not_pos
     assert told[:3].tolist() == [True, True, False]
 
 
-def test_projection_gives_every_surface_a_minimum_and_leaves_bowls_as_they_are():
+def test_projection_gives_every_surface_a_minimum_and_keeps_positive_definite_ones():
     rng = np.random.default_rng(12)
     A = bowls(rng, 60)
     A[:20] *= -1
@@ -264,7 +264,7 @@ def test_projection_gives_every_surface_a_minimum_and_leaves_bowls_as_they_are()
     assert np.allclose(project_to_positive(saddle).A[0] @ up, 5 * up)
 
 
-def test_places_without_a_surface_have_no_say_in_how_surfaces_are_projected():
+def test_unusable_surfaces_do_not_affect_the_projection():
     """Such as are out of the image, or hidden."""
     rng = np.random.default_rng(14)
     A = np.append(1e3 * bowls(rng, 20), np.tile(np.eye(2), (40, 1, 1)), 0)

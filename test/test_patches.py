@@ -1,4 +1,4 @@
-"""Where patches are: exactly, however they are stretched, and whatever brightens them."""
+"""Patch alignment: accurate under any warp and any change of brightness."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ WARPS = {'none': np.eye(2), 'larger': 1.08 * np.eye(2),
 
 
 @pytest.mark.parametrize('name', WARPS)
-def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
+def test_warped_patches_are_aligned_to_a_fiftieth_of_a_pixel(
         points: np.ndarray, name: str) -> None:
     warp, shift = WARPS[name], np.array([3.3, -1.7])
     there, here = image(np.eye(2), np.zeros(2)), image(warp, shift)
@@ -57,7 +57,7 @@ def test_patches_are_found_through_their_warp_to_a_fiftieth_of_a_pixel(
     assert np.quantile(off, 0.95) < 0.06
 
 
-def test_patches_of_two_images_are_expected_in_one_pass_as_each_by_itself(
+def test_templates_of_two_images_in_one_pass_equal_those_of_each(
         points: np.ndarray) -> None:
     images = [image(warp, np.zeros(2)).astype(np.float32)
               for warp in (WARPS['none'], WARPS['a roll'])]
@@ -69,7 +69,7 @@ def test_patches_of_two_images_are_expected_in_one_pass_as_each_by_itself(
         np.testing.assert_allclose(together.inverses[some], alone.inverses, rtol=1e-3)
 
 
-def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None:
+def test_the_flow_is_biased_where_the_image_grows(points: np.ndarray) -> None:
     """What the warp is good for: the same patches, taken to shift as a whole."""
     warp = WARPS['a road']
     there, here = image(np.eye(2), np.zeros(2)), image(warp, np.zeros(2))
@@ -78,14 +78,14 @@ def test_the_flow_of_the_image_is_off_where_it_grows(points: np.ndarray) -> None
     assert np.median(np.linalg.norm(as_a_whole - true, axis=1)) > 0.1
 
 
-def test_haze_moves_nothing(points: np.ndarray) -> None:
+def test_haze_does_not_bias_the_alignment(points: np.ndarray) -> None:
     there = image(np.eye(2), np.zeros(2))
     hazy = (there * 0.8 + 40).astype(np.uint8)
     found = place_exactly(there, hazy, points, points, as_seen(np.eye(2), len(points))).places
     assert np.median(np.linalg.norm(found - points, axis=1)) < 0.02
 
 
-def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None:
+def test_patches_that_would_move_far_or_are_at_the_border_stay(points: np.ndarray) -> None:
     there, here = image(np.eye(2), np.zeros(2)), image(np.eye(2), np.array([4.0, 0.0]))
     eye = as_seen(np.eye(2), len(points))
     found = place_exactly(there, here, points, points, eye).places
@@ -96,9 +96,9 @@ def test_what_would_go_far_or_is_at_the_border_stays(points: np.ndarray) -> None
     assert (place_exactly(flat, flat, points, points, eye).places == points).all()
 
 
-def test_errors_are_to_covariances_as_elsewhere_in_the_image(points: np.ndarray) -> None:
+def test_errors_are_proportional_to_covariances_over_the_image(points: np.ndarray) -> None:
     """Where there is more noise, and along which way a patch has slopes, they tell themselves."""
-    # Noise grows from left to right; beyond x = 200 the pattern varies from left to right alone.
+    # Noise grows from left to right; beyond x = 200 the pattern has only horizontal gradients.
     there = image(np.eye(2), np.zeros(2)).astype(float)
     there[:, 200:] = there[120, 200:] + 0.2 * (there[:, 200:] - there[120, 200:])
     here = there + np.random.default_rng(3).normal(size=there.shape) * np.linspace(1, 6, SIZE[0])
@@ -111,14 +111,14 @@ def test_errors_are_to_covariances_as_elsewhere_in_the_image(points: np.ndarray)
     across = points[told, 0] - 200
     parts = [np.median(np.abs(off[part] / sigma[part]), axis=0) / 0.6745
              for part in (across < -60, (across > -60) & (across < 0), across > 0)]
-    # Larger than they say, for what lies between pixels is smoothed.
+    # Larger than stated, since interpolation smooths.
     assert np.min(parts) > 0.7 and np.max(parts) < 2
-    # Sizes themselves differ by far more.
+    # The sizes differ by far more.
     sizes = [np.median(np.abs(off[part, 1])) for part in (across < -60, across > 0)]
     assert sizes[1] > 4 * sizes[0]
 
 
-def test_a_patch_without_any_slope_tells_nothing(points: np.ndarray) -> None:
+def test_a_patch_without_gradient_is_undetermined(points: np.ndarray) -> None:
     flat = np.full(SIZE[::-1], 90, np.uint8)
     there = image(np.eye(2), np.zeros(2))
     eye = as_seen(np.eye(2), len(points))

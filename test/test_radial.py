@@ -1,4 +1,4 @@
-"""What radial distortion does to points and images, held against OpenCV."""
+"""Radial distortion of points and images, compared with OpenCV."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ K = np.array([[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
 
 
 @pytest.mark.parametrize('k1', [-0.05, 0.0, 0.05])
-def test_a_pixel_is_straightened_to_where_a_pinhole_shows_it(k1: float) -> None:
+def test_undistorted_pixels_are_those_of_a_pinhole(k1: float) -> None:
     pixels = np.random.default_rng(16).uniform((0, 0), (640, 480), (100, 2))
     where = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K)
-    # Not to the last digit: a landmark's point begins there, and where it was found holds it.
+    # Not exactly: a landmark's point only starts there, and its residual in the anchor holds it.
     assert straightened(K, pixels, k1) == pytest.approx(where[:, 0], abs=0.05)
 
 
 @pytest.mark.parametrize('k1', [-0.05, 0.0, 0.05])
-def test_a_pixel_is_bent_as_a_lens_does_and_its_neighbours_with_it(k1: float) -> None:
+def test_distorted_pixels_and_their_jacobians_are_those_of_the_lens(k1: float) -> None:
     pixels = np.random.default_rng(17).uniform((0, 0), (640, 480), (100, 2))
     places = np.column_stack([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones(100)])
     where = cv2.projectPoints(places, np.zeros(3), np.zeros(3), K, np.array([k1, 0, 0, 0]))[0]
@@ -39,20 +39,20 @@ def clouds() -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize('k1', [-0.05, 0.05])
-def test_an_image_is_straightened_as_opencv_does_it(k1: float) -> None:
+def test_an_image_is_undistorted_as_by_opencv(k1: float) -> None:
     gray = clouds()
     straight, unseen = straight_image(gray, K, k1)
     expected, whole = (cv2.undistort(image, K, np.array([k1, 0, 0, 0]))
                        for image in (gray, np.full_like(gray, 255)))
-    # Beside the rim OpenCV goes on in black.
+    # Beyond the border OpenCV fills with black.
     assert np.abs(straight.astype(int) - expected)[whole == 255].max() <= 2
-    # A lens that shows the rim farther out shows less of the world, and none of what is beyond.
+    # A lens that moves the border outwards shows less of the world, and no unseen pixels.
     seen = np.ones(gray.shape, bool) if unseen is None else ~unseen
     assert (unseen is not None) == (k1 > 0)
     assert (seen != (whole > 0)).mean() < 0.01
 
 
-def test_what_is_straightened_by_and_by_is_as_if_it_were_at_once() -> None:
+def test_undistortion_in_steps_equals_one_step() -> None:
     gray = clouds()
     once, _ = straight_image(gray, K, 0.03)
     partly, _ = straight_image(gray, K, 0.02)
@@ -61,7 +61,7 @@ def test_what_is_straightened_by_and_by_is_as_if_it_were_at_once() -> None:
     assert np.abs(once.astype(int) - twice)[inner].max() <= 3
 
 
-def test_what_is_left_out_is_where_it_is_seen_in_the_straight_image() -> None:
+def test_the_mask_is_undistorted_with_the_image() -> None:
     left_out = np.zeros((480, 640), bool)
     left_out[30:90, 40:120] = True
     _, hidden = straight_image(clouds(), K, -0.05, left_out)

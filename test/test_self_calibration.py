@@ -1,4 +1,4 @@
-"""What windows tell of a distortion: nothing at first, and in the end what turns say."""
+"""Online estimation of distortion: undetermined on straight roads, determined in turns."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Numbers = NDArray[np.float64]
 
 K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
 
-# Pixels that a k1 of one leaves of itself in a window: see SelfCalibration.told.
+# Pixels that a k1 of one leaves in the residuals of a window: see SelfCalibration.told.
 STRAIGHT, TURN = 0.5, 8.0
 
 
@@ -38,21 +38,21 @@ def heard(windows: list[tuple[float, float, float]]) -> SelfCalibration:
     return lens
 
 
-def test_before_anything_is_told_the_calibration_is_right() -> None:
+def test_a_priori_there_is_no_distortion() -> None:
     lens = SelfCalibration.unknown(K, (376, 1241))
     assert lens.k1 == 0
-    # It may be off by a hundredth of where the corner is.
+    # A priori the corner may be off by one percent.
     corner = np.array([1241 - 620, 376 - 180]) / 700
     assert lens.sigma * (corner @ corner) == pytest.approx(0.01)
 
 
-def test_what_straight_roads_tell_alike_is_not_taken_for_a_distortion() -> None:
+def test_a_systematic_error_on_straight_roads_is_not_taken_for_distortion() -> None:
     lens = heard([(0.02, 0.005**2, STRAIGHT)] * 500)
     assert abs(lens.k1) < 0.005
     assert lens.sigma > 0.5 * lens.first
 
 
-def test_turns_tell_it_from_what_looks_like_it_on_straight_roads() -> None:
+def test_turns_separate_distortion_from_systematic_errors() -> None:
     roads = [(0.02, 0.005**2, STRAIGHT)] * 50
     lens = heard(roads + [(0.01, 0.001**2, TURN)] * 20)
     assert lens.k1 == pytest.approx(0.01, abs=2 * lens.sigma)
@@ -60,24 +60,24 @@ def test_turns_tell_it_from_what_looks_like_it_on_straight_roads() -> None:
     assert lens.mean[1] == pytest.approx(0.005, abs=2 * np.sqrt(lens.covariance[1, 1]))
 
 
-def test_noise_makes_no_distortion() -> None:
+def test_noise_is_not_taken_for_distortion() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         lens = heard([(0.004 * rng.normal(), 0.004**2, TURN) for _ in range(30)])
         assert abs(lens.k1) < 0.2 * lens.sigma
 
 
-def test_windows_without_any_noise_do_not_make_it_sure() -> None:
-    # No lens is off by k1 alone.
+def test_noise_free_windows_do_not_make_k1_certain() -> None:
+    # No lens deviates by k1 alone.
     exact = heard([(0.01, 0.0, TURN)] * 2)
     assert exact.sigma > 0.1 * exact.first
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
 
 
-def test_images_are_straightened_once_it_is_certain_and_again_when_more_is_known() -> None:
+def test_images_are_corrected_for_a_significant_k1_and_again_at_half_its_variance() -> None:
     rng, lens, undone = np.random.default_rng(1), SelfCalibration.unknown(K, (376, 1241)), []
     for _ in range(300):
-        # Of what is undone by now, windows see no more.
+        # Windows do not see what is corrected already.
         lens = lens.told(0.01 - lens.undone + 0.004 * rng.normal(), 0.004**2, TURN)
         if lens.due:
             lens = lens.straightened()
@@ -92,7 +92,7 @@ def test_images_are_straightened_once_it_is_certain_and_again_when_more_is_known
     assert lens.k1 == pytest.approx(0.01, abs=2.5 * lens.sigma)
 
 
-def test_a_lens_that_is_right_is_never_straightened() -> None:
+def test_without_distortion_images_are_never_corrected() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
         lens = SelfCalibration.unknown(K, (376, 1241))
@@ -143,15 +143,15 @@ def told(bent: Bent) -> tuple[Tracker, list[OdometryResult]]:
     return bent.tracked()
 
 
-def test_images_of_a_turn_tell_what_the_calibration_leaves_and_that_is_said(
+def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
         bent: Bent, told: tuple[Tracker, list[OdometryResult]]) -> None:
     tracker, results = told
     found, sigma = map(float, tracker.diagnosis().values['distortion left (k1)'].split(' +- '))
     assert found == pytest.approx(0.015, abs=2.5 * sigma)
     assert sigma < 0.003
     assert [one.name for one in tracker.complaints_of_content] == ['distortion left']
-    # Pairs come out as before until it is certain, and better from then on, as images are
-    # straightened; where lengths are of no interest nobody learns of it.
+    # Poses of pairs are unchanged until it is significant, and better from then on, as images are
+    # corrected; without a scale by landmarks it is not estimated.
     _, unknowing = bent.tracked(scale='none')
     apart = np.array([np.abs(one.motion[:3, :3] - other.motion[:3, :3]).max()
                       for one, other in zip(results, unknowing)])
@@ -162,13 +162,13 @@ def test_images_of_a_turn_tell_what_the_calibration_leaves_and_that_is_said(
     assert gained.mean() > 2 * gained.std() / np.sqrt(len(gained))
 
 
-def test_a_backend_hears_by_what_lens_each_image_was_seen(
+def test_the_back_end_gets_the_lens_of_each_image(
         told: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
     """Live by messages, later by the results: loops are seen alike."""
     _, results = told
     lenses = [one.k1 for one in results]
     assert not any(lenses[:30])
-    # What is certain of it.
+    # The significant part of it.
     assert 0 < lenses[-1] < 0.018
     make, heard, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []
     with ResultsFolder(tmp_path / 'results', Config()) as folder:
@@ -183,10 +183,10 @@ def test_a_backend_hears_by_what_lens_each_image_was_seen(
     assert [step.k1 for step in read_steps(tmp_path / 'results')] == lenses
 
 
-def test_a_distortion_that_was_found_is_that_of_one_camera(bent: Bent) -> None:
+def test_the_estimate_is_reset_with_another_camera(bent: Bent) -> None:
     tracker, _ = bent.tracked()
     assert 'distortion left (k1)' in tracker.diagnosis().values
-    # The same camera says it again, as drivers do.
+    # The same camera sends it again, as drivers do.
     tracker.camera_info(camera_info(bent.K, bent.size))
     assert 'distortion left (k1)' in tracker.diagnosis().values
     other = camera_info(bent.K, bent.size)
@@ -197,18 +197,18 @@ def test_a_distortion_that_was_found_is_that_of_one_camera(bent: Bent) -> None:
     assert tracker.last is not None and tracker.last.status in (Status.OK, Status.TIME_JUMP)
 
 
-def test_the_same_images_are_straightened_alike_to_the_last_bit(
+def test_corrected_images_are_reproducible_to_the_last_bit(
         bent: Bent, told: tuple[Tracker, list[OdometryResult]]) -> None:
     (_, first), (one, second) = told, bent.tracked()
     assert all(np.array_equal(a.pose, b.pose) for a, b in zip(first, second))
-    # After a reset nothing is known of the lens.
+    # After a reset the lens is unknown.
     one.reset()
     for number, picture in enumerate(bent.images[:5]):
         one.image(image(picture, stamp_ns=(number + 1) * 10**8))
     assert one.last is not None and np.array_equal(one.last.pose, first[4].pose)
 
 
-def test_of_a_good_calibration_nothing_is_said() -> None:
+def test_a_good_calibration_is_not_reported() -> None:
     tracker, _ = Bent(0.0).tracked()
     assert 'distortion left (k1)' not in tracker.diagnosis().values
     assert tracker.complaints_of_content == []

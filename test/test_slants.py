@@ -1,4 +1,4 @@
-"""How surfaces lean: exact planes are told, and what is beyond an edge does not bend them."""
+"""Slants of surfaces: exact planes are estimated, points beyond a depth edge have no effect."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 K = np.array([[700.0, 0, 600], [0, 650, 180], [0, 0, 1]])
 
 
-def test_the_warp_of_a_plane_tells_where_its_points_are_seen() -> None:
+def test_the_slant_warp_maps_points_of_a_plane() -> None:
     R, t = rotation_exp(np.array([0.02, -0.05, 0.03])), np.array([0.3, -0.1, -0.8])
     x, rho, lean = np.array([710.0, 260.0]), 0.12, np.array([-2e-4, 6e-4])
 
@@ -27,7 +27,7 @@ def test_the_warp_of_a_plane_tells_where_its_points_are_seen() -> None:
         assert y[0] + np.divide(moved, 1 + deeper) == pytest.approx(seen(np.array(step))[0])
 
 
-def test_a_road_is_told_from_its_points() -> None:
+def test_the_slant_of_a_road_is_estimated_from_its_points() -> None:
     rng = np.random.default_rng(0)
     x = rng.uniform((0, 230), (1200, 370), (600, 2))
     rho = (x[:, 1] - 180) / (650 * 1.65)  # exact, for a camera 1.65 m above it
@@ -40,7 +40,7 @@ def test_a_road_is_told_from_its_points() -> None:
     assert np.median(np.abs(noisy - found).max(1)) < 1e-3
 
 
-def test_what_is_beyond_an_edge_does_not_lean() -> None:
+def test_points_beyond_a_depth_edge_do_not_bias_the_slant() -> None:
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 300, (900, 2))
     behind = x[:, 0] > 150
@@ -50,7 +50,7 @@ def test_what_is_beyond_an_edge_does_not_lean() -> None:
     assert np.median(np.abs(found)) < 1e-3
 
 
-def test_all_points_of_a_road_tell_its_slope_at_once() -> None:
+def test_the_slant_is_estimated_at_all_points_at_once() -> None:
     rng = np.random.default_rng(2)
     x = rng.uniform((0, 230), (1200, 370), (1200, 2))
     rho, slope = (x[:, 1] - 180) / (650 * 1.65), 1 / (650 * 1.65)
@@ -60,18 +60,18 @@ def test_all_points_of_a_road_tell_its_slope_at_once() -> None:
     assert found[inner] == pytest.approx(np.tile([0, slope], (inner.sum(), 1)), abs=0.1 * slope)
     noisy = slopes_of_all(x, rho + rng.normal(size=1200) * sigma, sigma)
     assert np.median(np.abs(noisy - found)[inner].max(1)) < 0.1 * slope
-    # The sign of t is open, and so is that of all depths.
+    # The sign of t is free, and so is that of all depths.
     assert slopes_of_all(x, -rho, sigma) == pytest.approx(-found)
 
 
-def test_of_all_points_those_beyond_an_edge_do_not_bend_what_others_tell() -> None:
+def test_of_all_points_those_beyond_a_depth_edge_do_not_bias_the_rest() -> None:
     rng = np.random.default_rng(3)
     x = rng.uniform(0, 300, (900, 2))
     rho = np.where(x[:, 0] > 150, 0.05, 0.2)
     assert np.median(np.abs(slopes_of_all(x, rho, 0.01 * rho)) / rho[:, None]) < 1e-3
 
 
-def test_all_points_face_the_camera_where_they_are_few_or_scattered() -> None:
+def test_few_or_scattered_points_are_fronto_parallel() -> None:
     x = np.arange(20.0)[:, None] * [200.0, 0.0]
     assert not slopes_of_all(x, np.ones(20), np.full(20, 0.01)).any()
     for few in (0, 3):
@@ -82,14 +82,14 @@ def test_all_points_face_the_camera_where_they_are_few_or_scattered() -> None:
     assert (lean != 0).any(1).mean() < 0.05
 
 
-def test_points_without_neighbours_face_the_camera() -> None:
+def test_points_without_neighbours_are_fronto_parallel() -> None:
     x = np.arange(20.0)[:, None] * [200.0, 0.0]
     assert not slopes(x, np.ones(20), np.full(20, 0.01), x).any()
     assert slopes(x[:3], np.ones(3), np.ones(3), x).shape == (20, 2)
     assert slopes(x, np.ones(20), np.ones(20), x[:0]).shape == (0, 2)
 
 
-def test_all_points_of_a_road_lean_with_it_and_what_stands_on_it_does_not() -> None:
+def test_points_of_a_road_are_slanted_and_upright_objects_are_not() -> None:
     rng = np.random.default_rng(2)
     x = rng.uniform((0, 230), (1200, 370), (900, 2))
     rho = (x[:, 1] - 180) / (650 * 1.65)

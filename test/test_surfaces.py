@@ -1,4 +1,4 @@
-"""The three residual surfaces: each against the paper's formula, summed point by point."""
+"""The three residual surfaces, compared with the paper's formulas, summed point by point."""
 
 from __future__ import annotations
 
@@ -73,19 +73,19 @@ def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_ne
         assert fitted.c[k] == pytest.approx(c, abs=1e-8)
 
 
-def test_the_reference_point_stays_between_pixels_though_its_descriptor_is_of_the_next_one(pair):
+def test_the_reference_point_stays_sub_pixel_though_its_descriptor_is_of_a_whole_pixel(pair):
     x = np.array([[60.4, 50.0], [90.0, 70.6]])
     image = textured(np.random.default_rng(33), SIZE)
     for config, ahead in ((EstimatorConfig(), x - np.rint(x)), (preset('paper'), 0.0)):
         surface = DescriptorSurface(view(image, config), view(image, config), x, config)
         assert np.array_equal(surface.x, x)
-        # As printed, the part of a pixel is forgotten.
+        # As in the paper, the sub-pixel part is discarded.
         assert np.allclose(surface.around(x).centres, np.rint(x) + ahead)
 
 
-def test_references_between_pixels_have_their_minimum_nearer_to_where_the_image_went():
+def test_references_between_pixels_reduce_the_bias_of_the_minimum():
     """By parts of a pixel, which a fit around whole pixels is drawn away from."""
-    # Without what lies between pixels: that does not move with an image.
+    # Without interpolation, which does not shift with the image.
     still = cv2.GaussianBlur(textured(np.random.default_rng(39), (320, 240)), (0, 0), 1.0)
     shift = np.array([3.375, -1.75])
     moved = cv2.warpAffine(still, np.column_stack([np.eye(2), shift]), (320, 240),
@@ -102,7 +102,7 @@ def test_references_between_pixels_have_their_minimum_nearer_to_where_the_image_
     assert errors[2] < 0.7 * errors[0]
 
 
-def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
+def test_a_descriptor_surface_has_its_minimum_at_the_image_shift():
     image = textured(np.random.default_rng(33), SIZE)
     moved = np.roll(image, (1, -2), axis=(0, 1))  # one down, two to the left
     grid = np.stack(np.meshgrid(np.arange(30, 130, 10), np.arange(30, 90, 10)), -1)
@@ -117,7 +117,7 @@ def test_a_descriptor_surface_has_its_minimum_where_the_image_has_moved_to():
 
 
 @pytest.mark.parametrize('warped', [False, True])
-def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(pair, warped):
+def test_a_reused_descriptor_surface_equals_a_new_one(pair, warped):
     rng = np.random.default_rng(34)
     x = rng.uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
     warp = np.repeat([np.diag([1.1, 0.95, 0])[:, :2]], 30, axis=0) if warped else None
@@ -137,7 +137,7 @@ def test_asking_a_descriptor_surface_again_elsewhere_gives_what_a_new_one_would(
 @pytest.mark.parametrize('warp', [np.diag([1.1, 0.95, 0])[:, :2], np.eye(3, 2)],
                          ids=['stretched', 'as it is'])
 @pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
-def test_a_surface_forgets_how_it_was_seen_before_where_nobody_knows_how_it_is_seen(
+def test_a_surface_without_a_warp_ignores_earlier_warps(
         pair, kind, warp):
     x = np.random.default_rng(37).uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
     asked, new = (kind(*pair, x, EstimatorConfig()) for _ in range(2))
@@ -165,7 +165,7 @@ def warped(warp):
 
 
 @pytest.mark.parametrize('name', WARPS)
-def test_descriptors_are_found_nearer_to_the_truth_where_the_reference_is_warped(name):
+def test_warped_references_reduce_the_error_of_minima(name):
     previous, current, x, (y, warps) = warped(WARPS[name])
     errors = {}
     for warp in (None, warps):
@@ -177,7 +177,7 @@ def test_descriptors_are_found_nearer_to_the_truth_where_the_reference_is_warped
 
 @pytest.mark.parametrize('kind', [DescriptorSurface, PhotometricSurface])
 @pytest.mark.parametrize('name', WARPS)
-def test_patches_look_more_alike_where_the_reference_is_warped(kind, name):
+def test_warped_references_reduce_the_residual(kind, name):
     previous, current, x, (y, warps) = warped(WARPS[name])
     plain, seen = (np.median(kind(previous, current, x, EstimatorConfig()).around(y, warp).c)
                    for warp in (None, warps))
@@ -185,7 +185,7 @@ def test_patches_look_more_alike_where_the_reference_is_warped(kind, name):
 
 
 @pytest.mark.parametrize('turn', [(0.0, 0.3, 0.0), (0.2, -0.2, 0.1)])
-def test_after_a_large_turn_places_are_off_together_unless_patches_are_seen_in_perspective(turn):
+def test_after_a_large_rotation_minima_are_biased_unless_warps_are_projective(turn):
     camera = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
     R = Rotation.from_rotvec(turn).as_matrix()
     H = camera @ R @ np.linalg.inv(camera)
@@ -197,7 +197,7 @@ def test_after_a_large_turn_places_are_off_together_unless_patches_are_seen_in_p
         here = cv2.perspectiveTransform(there[None], H)[0]
         both = ((here > 40) & (here < (600, 440))).all(1)
         x, y = there[both], here[both]
-        # Of what is far away, depth grows by the turn alone.
+        # Far points: their depth changes by rotation alone.
         grown = 1 / (np.column_stack([x, np.ones(len(x))]) @ H[2])
         for name, rows in zip(off, (1, 0)):
             warp = patch_warp(camera, R, y, grown) * [[1], [1], [rows]]
@@ -208,7 +208,7 @@ def test_after_a_large_turn_places_are_off_together_unless_patches_are_seen_in_p
     assert together['perspective'] < 0.25 * together['derivatives alone']
 
 
-def test_no_warp_changes_nothing_on_whole_pixels(pair):
+def test_the_identity_warp_changes_nothing_on_whole_pixels(pair):
     x = np.array([[60.0, 50.0], [90.0, 71.0]])
     config = EstimatorConfig(window=3, grading=0.0)
     pair = [view(one.gray, config) for one in pair]
@@ -342,7 +342,7 @@ def test_in_an_image_smaller_than_a_window_no_point_has_a_surface(pair, kind):
         assert not surface.around(points).usable.any()
 
 
-def test_contrasts_of_several_images_are_those_of_each():
+def test_contrast_ratios_of_several_images_are_those_of_each():
     here, there = np.random.default_rng(2).lognormal(sigma=2, size=(2, 18))
     counts = np.array([1, 4, 2, 11])
     parts = zip(*(np.split(strengths, np.cumsum(counts)[:-1]) for strengths in (here, there)))

@@ -1,4 +1,4 @@
-"""The window on exact numbers: a known way and world, and places that err by a known noise."""
+"""The window on simulated data: a known path and world, and observations with known noise."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Image = NDArray[np.uint8]
 K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
 WIDTH, HEIGHT = 1200, 360
 
-# Pixels from the border within which nothing is seen, and how sure a pair is, in rad.
+# Pixels from the border without observations, and the standard deviation of a pair, in rad.
 _BORDER, _SURE = 15, 1e-4
 
 
 class Street:
     """
-    Points (N, 3) beside and on a street, seen from a camera that goes a metre ahead each frame.
+    Points (N, 3) beside and on a street, seen from a camera that moves one metre per frame.
 
-    noise: pixels, of each place in each frame; turned: rad, by which each pair's rotation is off;
-    curve: rad, by which the street turns each metre from the thirtieth to the ninetieth; k1:
-    distortion of the camera's lens.
+    noise: pixels, of each observation; turned: rad, error of each pair's rotation; curve: rad,
+    rotation of the street per metre from the thirtieth to the ninetieth; k1: distortion of the
+    camera's lens.
     """
 
     def __init__(self, seed: int, frames: int, noise: float, turned: float = 0.0,
@@ -140,12 +140,12 @@ def blank() -> Any:
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])
-def test_the_window_tells_the_noise_of_its_observations_and_keeps_the_right_ones(
+def test_the_window_estimates_its_noise_and_keeps_inliers(
         noise: float) -> None:
     window = NumbersWindow(Street(0, 60, noise))
     for _ in range(60):
         window.go()
-    # Those of the newest frame too, before poses follow them.
+    # Those of the newest frame too, before poses are refined.
     assert np.median(window.told) == pytest.approx(noise, rel=0.1)
     # Beyond 4 standard deviations in two numbers lie 3 of 10 000, and some leave with the sign of
     # their depth.
@@ -153,7 +153,7 @@ def test_the_window_tells_the_noise_of_its_observations_and_keeps_the_right_ones
     assert window.taken > 30 * WINDOW_TUNING.landmarks
 
 
-def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
+def test_only_keyframes_stay_in_the_window() -> None:
     window, chosen = NumbersWindow(Street(0, 30, 0.05)), [True]
     for _ in range(30):
         window.go()
@@ -163,7 +163,7 @@ def test_the_frames_that_stay_are_those_that_were_called_keyframes() -> None:
     assert 5 < sum(chosen) < 25
 
 
-def test_noise_does_not_change_the_scale() -> None:
+def test_noise_does_not_bias_the_scale() -> None:
     lengths = []
     for seed in range(4):
         window = NumbersWindow(Street(seed, 150, 0.3))
@@ -184,7 +184,7 @@ def test_a_track_is_the_same_in_any_unit(unit: float) -> None:
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_a_track_turns_astray_by_less_than_half_of_what_its_pairs_do(seed: int) -> None:
+def test_the_rotation_drifts_less_than_half_of_that_by_pairs(seed: int) -> None:
     window = NumbersWindow(Street(seed, 60, 0.1, turned=5e-4))
     chained, here, off = np.eye(3), np.eye(4), []
     for _ in range(60):
@@ -198,7 +198,7 @@ def test_a_track_turns_astray_by_less_than_half_of_what_its_pairs_do(seed: int) 
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_a_track_goes_on_by_as_much_as_a_step_is_long_however_far_it_has_come(seed: int) -> None:
+def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) -> None:
     window, off, sigmas = NumbersWindow(Street(seed, 160, 0.2, turned=1e-3)), [], []
     for _ in range(160):
         window.go()
@@ -208,7 +208,7 @@ def test_a_track_goes_on_by_as_much_as_a_step_is_long_however_far_it_has_come(se
     assert np.std(off[-50:]) < np.median(sigmas)
 
 
-def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
+def test_unpublished_motion_is_made_up_for_without_a_jump() -> None:
     window, here = NumbersWindow(Street(0, 40, 0.02)), np.eye(4)
     ways = []
     for number in range(40):
@@ -224,18 +224,18 @@ def test_what_was_not_told_of_a_step_is_made_up_for_without_a_jump() -> None:
 
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('k1', [-0.015, 0.015])
-def test_in_a_turn_a_window_finds_what_distortion_is_left_and_lengths_hardly_drift_by_it(
+def test_in_a_turn_the_window_estimates_k1_and_lengths_hardly_drift(
         seed: int, k1: float) -> None:
     window = NumbersWindow(Street(seed, 120, 0.1, curve=0.02, k1=k1))
     lengths = [window.go() for _ in range(120)]
     assert window.lens.sigma < 0.003
     assert window.lens.k1 == pytest.approx(k1, abs=2 * window.lens.sigma)
-    # By 5 % where nobody knows of it.
+    # By 5 % without the estimate.
     assert np.mean(lengths[-15:]) == pytest.approx(np.mean(lengths[:15]), rel=0.02)
 
 
 @pytest.mark.parametrize('k1', [-0.015, 0.015])
-def test_a_window_goes_on_where_images_are_straightened_on_the_way(k1: float) -> None:
+def test_a_window_continues_when_images_are_corrected(k1: float) -> None:
     window, lengths = NumbersWindow(Street(0, 120, 0.1, curve=0.02, k1=k1)), []
     while not window.lens.due:
         lengths.append(window.go())
@@ -243,7 +243,7 @@ def test_a_window_goes_on_where_images_are_straightened_on_the_way(k1: float) ->
     taken, thrown = window.taken, window.thrown
     window.straighten(blank())
     lengths += [window.go() for _ in range(120 - len(lengths))]
-    # Nothing that it knew is at odds with what it sees by now.
+    # Earlier observations agree with the new ones.
     assert np.median(window.told[-10:]) == pytest.approx(noise, rel=0.1)
     assert window.thrown - thrown < 0.015 * (window.taken - taken)
     assert window.lens.k1 == pytest.approx(k1, abs=2 * window.lens.sigma)
@@ -253,7 +253,7 @@ def test_a_window_goes_on_where_images_are_straightened_on_the_way(k1: float) ->
 
 @pytest.mark.parametrize('curve', [0.0, 0.02])
 @pytest.mark.parametrize('seed', range(3))
-def test_a_lens_without_distortion_is_left_as_it_is(seed: int, curve: float) -> None:
+def test_without_distortion_k1_stays_zero(seed: int, curve: float) -> None:
     window = NumbersWindow(Street(seed, 120, 0.1, curve=curve))
     for _ in range(120):
         window.go()
