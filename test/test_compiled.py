@@ -414,7 +414,7 @@ def test_a_track_differs_by_less_than_its_sigma(frames: list[Frame], name: str) 
 
 def test_a_build_of_other_sources_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, '_INTERFACE', compiled._INTERFACE + 1)
-    with pytest.warns(UserWarning, match='of other sources, and left out; install djet_ros anew'):
+    with pytest.warns(UserWarning, match='of other sources; ignored, reinstall djet_ros'):
         assert compiled._loaded() is None
 
 
@@ -440,5 +440,5 @@ def test_a_library_that_cannot_be_loaded_is_ignored(monkeypatch: pytest.MonkeyPa
     damaged = tmp_path / '_loops.so'
     damaged.write_bytes(b'no library')
     monkeypatch.setattr(compiled, 'find_spec', lambda name: SimpleNamespace(origin=str(damaged)))
-    with pytest.warns(UserWarning, match='left out; install djet_ros anew'):
+    with pytest.warns(UserWarning, match='ignored, reinstall djet_ros'):
         assert compiled._loaded() is None

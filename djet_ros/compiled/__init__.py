@@ -49,10 +49,10 @@ def _loaded() -> ctypes.CDLL | None:
         # ctypes releases the GIL during calls.
         built = ctypes.CDLL(found.origin)
     except OSError as error:  # built for another machine, or damaged
-        warn(f'{error}, and left out; install djet_ros anew', stacklevel=2)
+        warn(f'{error}; ignored, reinstall djet_ros', stacklevel=2)
         return None
     if not hasattr(built, 'djet_interface') or built.djet_interface() != _INTERFACE:
-        warn(f'{found.origin} is of other sources, and left out; install djet_ros anew',
+        warn(f'{found.origin} is built of other sources; ignored, reinstall djet_ros',
              stacklevel=2)
         return None
     return built
@@ -379,13 +379,13 @@ def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[
     """
     m, n, frames = len(seen[0]), len(anchors), len(between[0])
     anchor = np.empty(m, np.int64)
-    told = tuple(np.empty(shape) for shape in (
+    results = tuple(np.empty(shape) for shape in (
         (m, 2), (n, 2), (n, 2), (m, 3, 3), (m, 3), (m, 3), m, (m, 3), (m, 2, 2)))
     _call('djet_observe', c_int(m), c_int(n), c_int(frames),
           *(_ptr(one, np.int64) for one in (*seen, anchors)), *map(_ptr, between),
           *map(_ptr, landmarks), *map(_ptr, K), _ptr(np.array(tuning, float)),
-          _ptr(anchor, np.int64), *map(_ptr, told))
-    return anchor, told
+          _ptr(anchor, np.int64), *map(_ptr, results))
+    return anchor, results
 
 
 def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],

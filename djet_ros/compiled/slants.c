@@ -9,7 +9,7 @@ enum { SUMS = 9 };
 /* Value of a plane at u = v = 0, its slopes along both, and the decrease of the sum of squares
    by these: slants._planes. */
 typedef struct {
-    double level, along_u, along_v, told;
+    double level, along_u, along_v, improvement;
 } Plane;
 
 static Plane plane_of(const double sums[SUMS], double usual)

@@ -70,7 +70,7 @@ class GroundTuning:
 
     # The fit. Standard deviation in rad of the normal about that of level ground: the 2 degrees to
     # which the pitch has to be given, and the road's own slope
-    lean: float = math.radians(3.0)
+    tilt: float = math.radians(3.0)
     # pixels; largest median displacement of cells of flat ground; chosen: walls have more
     max_unevenness: float = 0.6
     # chosen: rounds of Gauss-Newton, and the relative step of the plane at convergence
@@ -235,15 +235,15 @@ class Ground:
                 return None
             J, r = np.where(inside[:, None], J, 0.0), np.where(inside, r, 0.0)
             hessian, gradient, spread = self._normal_equations(J, r, inside)
-            lean, offset = _whitened_tilt(m, self._normal)
+            tilt, offset = _whitened_tilt(m, self._normal)
             prior = known.copy()
-            prior[:3, :3] += lean.T @ lean
+            prior[:3, :3] += tilt.T @ tilt
             # The noise variance that relates residuals to priors.
             noise = max(float(np.trace(np.linalg.solve(hessian + 1e-9 * np.eye(8), spread))) / 8,
                         1e-9)
             total = hessian / noise + prior
             gradient /= noise
-            gradient[:3] += lean.T @ offset
+            gradient[:3] += tilt.T @ offset
             gradient[3:] += known[3:, 3:] @ theta
             step = -np.linalg.solve(total, gradient)
             m, theta = m + step[:3], theta + step[3:]
@@ -269,8 +269,8 @@ class Ground:
         longer = (self._project(R, t, 1.01 * m) - self._project(R, t, m)) / 0.01
         slope = (J[:, :3] @ m) / np.maximum(np.linalg.norm(longer, axis=1), 1e-9)
         sums, squares = (np.bincount(self._cells, values) for values in (slope * r, slope**2))
-        told = squares > 0.2 * float(np.median(squares[squares > 0]))
-        return float(np.median(np.abs(sums[told] / squares[told])))
+        textured = squares > 0.2 * float(np.median(squares[squares > 0]))
+        return float(np.median(np.abs(sums[textured] / squares[textured])))
 
     def _jacobian(self, gradients: list[Array], R: Array, t: Array, m: Array,
                   tangents: Array) -> Array:
@@ -320,7 +320,7 @@ def _whitened_tilt(m: Array, normal: Array) -> tuple[Array, Array]:
 
     Returns its derivative (2, 3) by the plane, and the tilt (2,) itself.
     """
-    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _TUNING.lean
+    across = np.stack([[1.0, 0.0, 0.0], np.cross([1.0, 0.0, 0.0], normal)]) / _TUNING.tilt
     length = float(np.linalg.norm(m))
     n = m / length
     return across @ (np.eye(3) - np.outer(n, n)) / length, across @ n
@@ -329,9 +329,9 @@ def _whitened_tilt(m: Array, normal: Array) -> tuple[Array, Array]:
 def _motion_of_plane(m: Array, covariance: Array) -> GroundMotion:
     """Return length, pitch and roll of a plane m (3,), with their covariance from its (3, 3)."""
     length = float(np.linalg.norm(m))
-    lean, by_plane = _tilt(m)
+    tilt, by_plane = _tilt(m)
     J = np.vstack([m / length, by_plane])
-    return GroundMotion(np.array([length, *lean]), J @ covariance @ J.T)
+    return GroundMotion(np.array([length, *tilt]), J @ covariance @ J.T)
 
 
 def _tilt(m: Array) -> tuple[Array, Array]:
@@ -344,15 +344,15 @@ def _tilt(m: Array) -> tuple[Array, Array]:
     return np.array([np.arctan2(z, y), np.arctan2(x, upright)]), J
 
 
-def turned(lean: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
+def turned(tilt: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """
     Propagate pitch and roll of a plane through a rotation of the camera.
 
-    lean: (2,) pitch and roll in rad before; R: (3, 3) rotation, ``x_after = R x_before``, with the
+    tilt: (2,) pitch and roll in rad before; R: (3, 3) rotation, ``x_after = R x_before``, with the
     covariance (3, 3) of its rotation vector. Returns the (2,) after, their derivative (2, 2) by
     those before, and their covariance (2, 2) by the rotation.
     """
-    pitch, roll = lean
+    pitch, roll = tilt
     normal = np.array([np.sin(roll), np.cos(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch)])
     _, before = _tilt(normal)
     after, J = _tilt(R @ normal)

@@ -133,7 +133,7 @@ def looks_through(warp: Array, tests: Tests
     """
     Invert warps (N, 3, 2): return W^-1 (N, 2, 2), c^T W^-1 (N, 2), and a mask (N,).
 
-    The mask tells for which warps the projective part matters.
+    The mask selects the warps whose projective part matters.
     """
     inverse = inverses(warp[:, :2])
     nearer = np.einsum('ni,nij->nj', warp[:, 2], inverse)
@@ -265,10 +265,10 @@ def match_distances(smoothed_a: Image, x: Array, smoothed_b: Image, y: Array,
     of the two is too close to the border for a descriptor.
     """
     if known is not None:
-        anew = ~(np.rint(known[0]) == np.rint(y)).all(1)
+        stale = ~(np.rint(known[0]) == np.rint(y)).all(1)
         distances = known[1].copy()
-        distances[anew] = match_distances(smoothed_a, x.compress(anew, axis=0), smoothed_b,
-                                          y.compress(anew, axis=0))
+        distances[stale] = match_distances(smoothed_a, x.compress(stale, axis=0), smoothed_b,
+                                           y.compress(stale, axis=0))
         return distances
     if compiled.library is not None and smoothed_a.shape == smoothed_b.shape:
         return compiled.match_distances(smoothed_a, x, smoothed_b, y, TESTS, reach(TESTS))

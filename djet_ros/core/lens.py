@@ -51,7 +51,7 @@ _MIN_PARALLAX_RATIO = 6.0
 
 # chosen: rounds, of which three are enough for small k1; and the step of k1, in standard errors,
 # below which it has converged. It may fluctuate by half of that, as each round estimates the noise
-# anew.
+# again.
 _ROUNDS, _SETTLED = 20, 0.1
 
 # Largest displacement of the outermost matches by one step of k1, relative to their radius. The

@@ -96,9 +96,9 @@ class Sighting:
         anchors = landmarks.anchors[which]
         R, t = (motions[newest, anchors] for motions in self.poses.between)
         seen = expected[which], 1 / places[which, 2]
-        lean = landmarks.rho[which, None] * landmarks.slopes[which]
+        slope = landmarks.rho[which, None] * landmarks.slopes[which]
         warps = np.empty((len(landmarks), 3, 2))
-        warps[which] = patch_warp(self.K, R, *seen) + slant_warp(self.K, t, *seen, lean)
+        warps[which] = patch_warp(self.K, R, *seen) + slant_warp(self.K, t, *seen, slope)
         return which[comparable(warps[which])], expected, warps
 
     def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int

@@ -65,9 +65,9 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
         plane = np.linalg.solve(back @ J + prior, back @ value[:, :, None])
         squares = (value - (J @ plane)[:, :, 0])**2 * trusted
         weights = trusted / (1 + squares / 4)
-    here, lean = plane[:, 0, 0], plane[:, 1:, 0]
+    here, slope = plane[:, 0, 0], plane[:, 1:, 0]
     flat = ((there & (squares < _INLIER)).sum(1) >= _MIN_POINTS) & (here > 0)
-    found = lean / (_REACH * np.where(flat, here, 1.0)[:, None])
+    found = slope / (_REACH * np.where(flat, here, 1.0)[:, None])
     flat &= np.abs(found).max(1) < _MAX_SLOPE
     return np.where(flat[:, None], found, 0.0)
 
@@ -86,8 +86,8 @@ def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
     u, v = x.T / _HALF_SIDE - np.floor(x.min(0) / _HALF_SIDE)[:, None]
     trusted = 1 / np.maximum(sigma**2 + (_NONPLANARITY * rho)**2, 1e-18)
     planes, off, fitting = planes_at(u, v, rho, trusted)
-    found, told = planes[:, 1:3] / _HALF_SIDE, planes[:, 3]
-    flat = ((off < _INLIER) & (fitting >= _MIN_POINTS) & (told > _SIGNIFICANT)
+    found, improvement = planes[:, 1:3] / _HALF_SIDE, planes[:, 3]
+    flat = ((off < _INLIER) & (fitting >= _MIN_POINTS) & (improvement > _SIGNIFICANT)
             & (np.abs(found).max(1) < _MAX_SLOPE * np.abs(rho)))
     return np.where(flat[:, None], found, 0.0)
 

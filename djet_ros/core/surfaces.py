@@ -2,7 +2,7 @@
 The three residual surfaces: descriptor (D-JET), photometric (P-JET), re-projection (RP-E).
 
 They differ only in the paraboloid that they fit around a point of the current image; the optimiser
-(`core.jet`) treats all of them alike.
+(`core.jet`) treats all of them equally.
 """
 
 from __future__ import annotations
@@ -145,11 +145,11 @@ class DescriptorSurface(_ImageSurface):
         warped = largest(warp - self._warp) > _WARP_TOLERANCE
         usable = self._usable(np.rint(y), CLOSE // 2)
         # Most matches do not move from one round to the next.
-        anew = usable & (moved | warped | ~self._latest.usable)
-        self._warp = np.where(anew[:, None, None], warp, self._warp)
-        self._is_warped |= anew
-        there, here, seen = (values.compress(anew, axis=0) for values in (self.x, y, warp))
-        return self._merged(anew, usable, y, self._distances.between_pixels(
+        stale = usable & (moved | warped | ~self._latest.usable)
+        self._warp = np.where(stale[:, None, None], warp, self._warp)
+        self._is_warped |= stale
+        there, here, seen = (values.compress(stale, axis=0) for values in (self.x, y, warp))
+        return self._merged(stale, usable, y, self._distances.between_pixels(
             self._previous.tested, there, self._current, here, seen,
             self._contrast_around(y, usable), CLOSE // 2))
 
@@ -160,14 +160,14 @@ class DescriptorSurface(_ImageSurface):
         usable = self._usable(centres, radius)
         # A surface that was sampled through a warp has to be sampled again even at the same place.
         elsewhere = (centres + self._offset != self._latest.centres).any(1)
-        anew = usable & (elsewhere | self._is_warped)
-        self._warp[anew], self._is_warped[anew] = np.eye(3, 2), False
+        stale = usable & (elsewhere | self._is_warped)
+        self._warp[stale], self._is_warped[stale] = np.eye(3, 2), False
         pixels = np.rint(self.x).astype(np.int64)
         references = self._distances.reference(
-            self._previous.tested, pixels[anew], self._contrast_around(centres, usable))
-        surfaces = self._distances.surfaces(references, self._current, centres[anew], radius)
-        return self._merged(anew, usable, y, fit_paraboloids(
-            surfaces, centres[anew] + self._offset[anew], self._config.window_sigma))
+            self._previous.tested, pixels[stale], self._contrast_around(centres, usable))
+        surfaces = self._distances.surfaces(references, self._current, centres[stale], radius)
+        return self._merged(stale, usable, y, fit_paraboloids(
+            surfaces, centres[stale] + self._offset[stale], self._config.window_sigma))
 
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
         """Estimate the contrast ratio at the initial matches, once."""
@@ -179,10 +179,10 @@ class DescriptorSurface(_ImageSurface):
                 np.rint(y[there]).astype(np.int64))
         return self._contrast
 
-    def _merged(self, anew: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
+    def _merged(self, stale: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
                 fitted: Paraboloids) -> Paraboloids:
         """Merge newly fitted paraboloids, of the matches in a mask (N,), into the latest ones."""
-        self._latest = replace(_replaced(self._latest, fitted, anew), usable=usable)
+        self._latest = replace(_replaced(self._latest, fitted, stale), usable=usable)
         # A match that never had a surface stays at y.
         latest = self._latest.centres
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))

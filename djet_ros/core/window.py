@@ -2,7 +2,7 @@
 A sliding window of keyframes and shared landmarks, which ties the lengths of steps together.
 
 A landmark has an inverse depth in its anchor, the frame that created it, and the descriptor of its
-patch there. Each later frame samples the landmark's surface anew (`core.sighting`): features are
+patch there. Each later frame samples the landmark's surface again (`core.sighting`): features are
 not detected again, so tracks do not drift. `djet_ros.core.bundle` refines poses and depths
 jointly. A frame that leaves the window is marginalised into a prior on the others, with its
 landmarks (Leutenegger et al., "Keyframe-based visual-inertial odometry using nonlinear
@@ -502,8 +502,8 @@ class Window:
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
             self._landmarks.roots[seen, -1] = roots / median(sizes)
             # The anchor's patch is as noisy as the first one that observes it.
-            anew = seen & ~self._landmarks.held.any((1, 2))
-            self._landmarks.held[anew] = self._landmarks.roots[anew, -1]
+            new = seen & ~self._landmarks.held.any((1, 2))
+            self._landmarks.held[new] = self._landmarks.roots[new, -1]
 
     def _observed(self) -> Observed:
         """Return all observations, and update the noise scale."""
@@ -557,12 +557,12 @@ class Window:
         divided by that number. The prior of marginalised frames keeps the k1 of its time.
         """
         observed = observe(self._K, self._poses, self._landmarks)
-        told = self._reduced(observed, lens=True).of_k1()
+        k1 = self._reduced(observed, lens=True).of_k1()
         _, weights = self._robust_losses(observed, self._scale)
-        if told.curvature > 0:
+        if k1.curvature > 0:
             self.lens = self.lens.told(
-                self._poses.k1 + told.step, self._tuning.keyframes / told.curvature,
-                self._scale * np.sqrt(told.curvature / weights.sum()))
+                self._poses.k1 + k1.step, self._tuning.keyframes / k1.curvature,
+                self._scale * np.sqrt(k1.curvature / weights.sum()))
             self._poses = replace(self._poses, k1=self.lens.left)
 
     def _marginalise_landmarks(self, chosen: NDArray[np.bool_]) -> None:
