@@ -38,8 +38,8 @@ _MAX_DAMPING = 1e6
 
 # chosen: least curvature of a match in the Hessian, as a share of its IRLS weight. With the
 # weights alone (as in iteratively reweighted least squares) steps are too short; with the second
-# derivative of the robust loss alone they are too long where many matches are outliers. 0.3 takes
-# three steps in place of four.
+# derivative of the robust loss alone they are too long where many matches are outliers. This
+# takes three quarters of the steps.
 LEAST_CURVED = 0.3
 
 # In the order of the arguments of djet_minimise.
