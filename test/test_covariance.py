@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from djet_ros.core.covariance import as_far_as_claimed, by_calibration, pose_covariance
+from djet_ros.core.covariance import calibration_covariance, pose_covariance, widened_by_profile
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents, unit
@@ -69,7 +69,7 @@ def test_a_wrong_calibration_moves_a_pose_as_its_covariance_says(camera, t):
         wrong = minimise(problem(calibrated(camera, **{name: off})), views.R, views.t, loss)
         moves.append(np.append(rotation_log(wrong.R @ there.R.T), wrong.t - there.t))
     moves = np.transpose(moves)
-    told = by_calibration(right, camera, there.pose, there.residuals, loss, off)
+    told = calibration_covariance(right, camera, there.pose, there.residuals, loss, off)
     size = np.sqrt(np.diag(moves @ moves.T))
     assert size[:3].max() > 1e-5 and size[3:].max() > 1e-4
     np.testing.assert_array_less(np.abs(told - moves @ moves.T), 0.05 * np.outer(size, size))
@@ -224,11 +224,11 @@ def test_what_is_claimed_beyond_where_matches_cease_to_agree_is_less_sure(share,
     J = epipolar_residuals(problem, views.R, views.t).jacobian
     # Of noise of a tenth of where the loss bends: what is claimed is within that, or far beyond.
     claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
-    told, _ = as_far_as_claimed(claimed, problem, pose, loss)
+    told, _ = widened_by_profile(claimed, problem, pose, loss)
     wider = np.linalg.eigvals(np.linalg.solve(claimed, told)).real
     assert wider.min() > least - 1e-9 and wider.max() < most
     # A sum of squares rises as its curvature says, as long as the pose is bent by a little only.
-    squares, _ = as_far_as_claimed(claimed, problem, pose, Loss())
+    squares, _ = widened_by_profile(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
 
 
@@ -242,7 +242,7 @@ def test_a_pose_beside_its_minimum_is_unsure_towards_it_to_whichever_side_that_l
     variances, axes = np.linalg.eigh(claimed)
     for variance, axis in zip(variances, axes.T):
         pose = Pose(*moved(views.R, views.t, residuals.tangents, way * np.sqrt(variance) * axis))
-        told, _ = as_far_as_claimed(claimed, problem, pose, Loss())
+        told, _ = widened_by_profile(claimed, problem, pose, Loss())
         assert axis @ told @ axis > 50 * variance
 
 

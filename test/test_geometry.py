@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from djet_ros.core.geometry import (
+    depth_ratio,
     direction_angle,
     epipolar_lines,
     essential,
     fit_rotation,
     fundamental,
-    growth,
     in_front,
     inverse_depths,
     inverses,
@@ -138,18 +138,18 @@ def test_chirality_is_told_for_each_point_by_itself():
 
 
 @pytest.mark.parametrize('t', [FORWARD, BACKWARD, SIDEWAYS])
-def test_growth_is_depth_before_over_depth_after(t):
+def test_depth_ratio_is_depth_before_over_depth_after(t):
     seen = two_views(np.random.default_rng(6), t=t, near=3, far=30)
     depths = seen.points[:, 2], (seen.points @ seen.R.T + seen.t)[:, 2]
     for sign in (1, -1):  # t and -t have the same essential matrix
-        found = growth(seen.R, sign * seen.t, rays(K, seen.x), rays(K, seen.y))
+        found = depth_ratio(seen.R, sign * seen.t, rays(K, seen.x), rays(K, seen.y))
         assert np.allclose(found, depths[0] / depths[1])
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
 def test_a_patch_that_faces_one_camera_is_warped_as_its_points_move(t):
     seen = two_views(np.random.default_rng(7), t=t, near=3, far=30)
-    grown = growth(seen.R, seen.t, rays(K, seen.x), rays(K, seen.y))
+    grown = depth_ratio(seen.R, seen.t, rays(K, seen.x), rays(K, seen.y))
     warp = patch_warp(K, seen.R, seen.y, grown)
     for step in ((1e-4, 0), (0, 1e-4), (13, 13), (-13, 4)):
         there, _ = project(K, (rays(K, seen.x + step) * seen.points[:, 2:]) @ seen.R.T + seen.t)

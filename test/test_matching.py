@@ -9,7 +9,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.hamming import match_distances
-from djet_ros.core.matching import match_foreseen, match_widely
+from djet_ros.core.matching import match_predicted, match_widely
 from djet_ros.core.starts import Known
 from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
@@ -108,7 +108,7 @@ def test_as_many_matches_are_enough_as_there_are_features_for_them(more: int) ->
     places = np.tile(previous.features.points, (more, 1))
     before = RelativePose(Status.OK, R=rotation_exp(TURN), x=places, y=places, y_opt=places,
                           inliers=np.ones(more * count, bool), sought=more * count)
-    assert match_foreseen(previous, current, before, Known(), 0.15) is not None
+    assert match_predicted(previous, current, before, Known(), 0.15) is not None
     # Had a third as many features told as many, three times as many would be expected.
-    assert match_foreseen(previous, current, replace(before, sought=count // 3), Known(),
-                          0.15) is None
+    assert match_predicted(previous, current, replace(before, sought=count // 3), Known(),
+                           0.15) is None

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from threading import Barrier, BrokenBarrierError, Event, get_ident
 
 import cv2
-from djet_ros.core.parallel import both, each, started_beside
+from djet_ros.core.parallel import each, run_both, started_beside
 import pytest
 
 
@@ -32,21 +32,22 @@ def test_two_things_are_under_way_at_once_where_opencv_may_take_two_threads(thre
 
     if threads == 1:
         with pytest.raises(BrokenBarrierError):
-            both(meet, meet)
+            run_both(meet, meet)
     else:
-        here, there = both(meet, meet)
+        here, there = run_both(meet, meet)
         assert here == get_ident() != there
 
 
 @pytest.mark.parametrize('bad', [0, 1])
 def test_an_error_in_either_of_two_things_comes_out(threads: int, bad: int) -> None:
     with pytest.raises(ZeroDivisionError):
-        both(lambda: 1 // bad, lambda: 1 // (1 - bad))
+        run_both(lambda: 1 // bad, lambda: 1 // (1 - bad))
 
 
 def test_many_things_within_one_another_wait_for_none_that_was_not_begun(threads: int) -> None:
     def count(depth: int) -> int:
-        return 1 if depth == 0 else sum(both(lambda: count(depth - 1), lambda: count(depth - 1)))
+        return 1 if depth == 0 else sum(run_both(lambda: count(depth - 1),
+                                                 lambda: count(depth - 1)))
 
     assert count(6) == 2**6
 
@@ -65,7 +66,7 @@ def test_an_error_in_what_was_begun_comes_out_where_it_is_needed(threads: int) -
 
 
 def test_what_was_begun_leaves_the_other_core_to_what_is_done_meanwhile(threads: int) -> None:
-    here, there = started_beside(lambda: both(get_ident, get_ident))()
+    here, there = started_beside(lambda: run_both(get_ident, get_ident))()
     assert here == there
 
 

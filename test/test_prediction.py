@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 from djet_ros.core.corners import detect_corners
 from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
-from djet_ros.core.prediction import foresee, likely_rotation, predict
+from djet_ros.core.prediction import likely_rotation, predict_at_infinity, predict_constant_motion
 from djet_ros.core.types import RelativePose, Status
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_big_turns_are_told_without_any_motion_before(degrees):
     R, H, previous, current = turned_pair(degrees)
     found = likely_rotation(previous, current, K, [], 30.0)
     assert np.rad2deg(rotation_angle(R, found)) < 2
-    there = predict(previous, current, K, [], 30.0)
+    there = predict_at_infinity(previous, current, K, [], 30.0)
     truth = cv2.perspectiveTransform(previous.points[None], H)[0]
     assert np.median(np.linalg.norm(there - truth, axis=1)) < 15
 
@@ -42,13 +42,14 @@ def test_where_there_is_nothing_to_match_nothing_turns():
     _, _, previous, _ = turned_pair((0, 0, 0))
     none = detect_corners(np.zeros((300, 400), np.uint8), 100, 1.0)
     assert (likely_rotation(previous, none, K, [], 30.0) == np.eye(3)).all()
-    assert predict(none, previous, K, [], 30.0).shape == (0, 2)
+    assert predict_at_infinity(none, previous, K, [], 30.0).shape == (0, 2)
 
 
 def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
     _, _, previous, _ = turned_pair((0, 0, 0))
     none = some(previous, slice(0, 0))
-    behind = predict(previous, none, K, [rotation_exp(np.array([0.0, 3.0, 0.0]))], 30.0)
+    R = rotation_exp(np.array([0.0, 3.0, 0.0]))
+    behind = predict_at_infinity(previous, none, K, [R], 30.0)
     assert np.isfinite(behind).all()
 
 
@@ -72,17 +73,17 @@ def driven_through(depths):
 
 def test_a_camera_that_goes_on_as_before_sees_what_is_foreseen():
     features, before, truth = driven_through(np.random.default_rng(6).uniform(5, 50, 200))
-    foreseen = foresee(features, K, before.R, before)
+    foreseen = predict_constant_motion(features, K, before.R, before)
     assert np.abs(foreseen - truth).max() < 1e-6
     # By the turn alone they are seen elsewhere.
-    turned = predict(features, features, K, [before.R], 30.0, sure=True)
+    turned = predict_at_infinity(features, features, K, [before.R], 30.0, sure=True)
     assert np.median(np.linalg.norm(turned - truth, axis=1)) > 3
 
 
 def test_what_was_not_seen_before_moves_as_what_is_beside_it():
     features, before, truth = driven_through(np.full(200, 20.0))
     known = np.arange(200) % 4 > 0
-    foreseen = foresee(features, K, before.R, replace(before, inliers=known))
+    foreseen = predict_constant_motion(features, K, before.R, replace(before, inliers=known))
     assert np.abs(foreseen - truth)[known].max() < 1e-6
     assert 1e-6 < np.linalg.norm(foreseen - truth, axis=1)[~known].max() < 2
 
@@ -90,6 +91,6 @@ def test_what_was_not_seen_before_moves_as_what_is_beside_it():
 def test_after_a_mere_turn_the_next_one_is_foreseen():
     features, before, _ = driven_through(np.full(50, 1e9))
     still = replace(before, t=np.zeros(3))
-    turned = predict(features, features, K, [before.R], 30.0, sure=True)
-    assert np.allclose(foresee(features, K, before.R, still), turned)
-    assert np.abs(foresee(features, K, before.R, before) - turned).max() < 1e-3
+    turned = predict_at_infinity(features, features, K, [before.R], 30.0, sure=True)
+    assert np.allclose(predict_constant_motion(features, K, before.R, still), turned)
+    assert np.abs(predict_constant_motion(features, K, before.R, before) - turned).max() < 1e-3

@@ -7,27 +7,27 @@ from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
-from djet_ros.core.basins import lowest_around
-from djet_ros.core.covariance import difference, spanning, squared_distance
+from djet_ros.core.basins import lowest_nearby_minimum
+from djet_ros.core.covariance import pose_difference, squared_distance, widened_to_span
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import jet_problem, Loss, minimise
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
-    apart,
+    continues_motion,
     false_alarms,
-    goes_on,
-    lie_on_a_plane,
-    other_of_a_plane,
+    is_planar,
+    planar_twin,
     preferences,
     Rival,
+    unsigned_distance,
 )
 from djet_ros.core.sketch import losses_at
-from djet_ros.core.starts import all_round
+from djet_ros.core.starts import hemisphere_starts
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
-from djet_ros.core.verdict import _judged, as_turn
+from djet_ros.core.verdict import _compare_with_rivals, as_turn
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -178,7 +178,7 @@ def test_a_sky_that_keeps_its_pixels_while_the_camera_drives_straight_on_is_of_t
 def squared_error(result: RelativePose, seen: TwoViews) -> float:
     """Give the squared error of a pose over its covariance, 5 on average."""
     return squared_distance(result.covariance_5,
-                            difference(result.R, result.t, Pose(seen.R, seen.t)))
+                            pose_difference(result.R, result.t, Pose(seen.R, seen.t)))
 
 
 def plane_of_two_motions() -> tuple[np.ndarray, np.ndarray]:
@@ -227,7 +227,7 @@ def test_no_picture_of_a_plane_alone_is_sure_of_the_wrong_one_of_its_motions(see
         result = estimator.estimate(*(estimator.view(gray, CLOSE_UP) for gray in pictures))
         assert result.status in (Status.OK, Status.AMBIGUOUS)
         # Where it is wrong, its ellipsoid spans both.
-        off = difference(result.R, result.t, Pose(R, unit(t)))
+        off = pose_difference(result.R, result.t, Pose(R, unit(t)))
         assert squared_distance(result.covariance_5, off) < chi2.ppf(0.999, 5)
         sure += result.status is Status.OK and np.linalg.norm(off) < 0.02
     # The other motion has some of what is seen behind it, often.
@@ -243,34 +243,34 @@ def test_who_drives_towards_a_wall_is_not_sure_of_the_wrong_one_of_its_motions(s
              for gray in pictures_towards_a_wall(np.random.default_rng([seed, 11]), t, 14)]
     for pair in pairwise(views):
         before = estimator.estimate(*pair, before)
-        off = difference(before.R, before.t, Pose(np.eye(3), unit(t)))
+        off = pose_difference(before.R, before.t, Pose(np.eye(3), unit(t)))
         assert squared_distance(before.covariance_5, off) < chi2.ppf(1 - 1e-5, 5)
 
 
 def test_each_motion_of_a_plane_is_the_other_one_of_the_other() -> None:
     x, y = plane_of_two_motions()
     one = Pose(Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix(), unit([0.2, 0.1, -0.3]))
-    other = other_of_a_plane(one, K, x, y, NOISE)
+    other = planar_twin(one, K, x, y, NOISE)
     assert other is not None
-    assert apart(one, other.pose) > 0.1
-    back = other_of_a_plane(other.pose, K, x, y, NOISE)
+    assert unsigned_distance(one, other.pose) > 0.1
+    back = planar_twin(other.pose, K, x, y, NOISE)
     assert back is not None
-    assert apart(one, back.pose) < 0.01
+    assert unsigned_distance(one, back.pose) < 0.01
     y[:30] += 2.0
-    assert other_of_a_plane(one, K, x, y, NOISE) is None
+    assert planar_twin(one, K, x, y, NOISE) is None
 
 
 def test_what_stands_out_of_a_plane_tells_its_motions_apart() -> None:
     x, y = plane_of_two_motions()
-    assert lie_on_a_plane(x, y, NOISE)
+    assert is_planar(x, y, NOISE)
     y[:30] += 2.0  # one of seven, ten standard deviations
-    assert not lie_on_a_plane(x, y, NOISE)
+    assert not is_planar(x, y, NOISE)
 
 
 def going_on(x: np.ndarray, y: np.ndarray, before: Pose) -> RelativePose:
     """Estimate from matches that were found where a motion before foresaw them."""
     return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_pair(
-        Pair(uniform_view(), uniform_view(), x, y, before, ahead=before))
+        Pair(uniform_view(), uniform_view(), x, y, before, predicted=before))
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
@@ -363,9 +363,9 @@ def test_a_covariance_that_spans_a_pose_is_that_of_errors_where_it_may_be_true()
     rng = np.random.default_rng(5)
     A, t = rng.normal(size=(5, 5)) * 0.01, unit(rng.normal(size=3))
     R = rotation_exp(rng.normal(size=3))
-    off = difference(R, t, Pose(rotation_exp(rng.normal(size=3) * 0.3) @ R,
-                                -unit(t + rng.normal(size=3) * 0.3)))
-    five, six = spanning(A @ A.T, t, off, 1 / 9)
+    off = pose_difference(R, t, Pose(rotation_exp(rng.normal(size=3) * 0.3) @ R,
+                                     -unit(t + rng.normal(size=3) * 0.3)))
+    five, six = widened_to_span(A @ A.T, t, off, 1 / 9)
     assert squared_distance(five, off) < 9  # a third of it is one standard deviation at least
     assert np.linalg.eigvalsh(five - A @ A.T).min() > -1e-12
     assert np.linalg.norm(six[3:, 3:] @ t) < 1e-12  # t keeps its length
@@ -383,9 +383,10 @@ def test_a_motion_far_off_that_is_true_of_less_than_one_pair_of_a_hundred_blurs_
     seen = two_views(np.random.default_rng(7), count=100)
     around, aside = np.cross(seen.t, (0, 0, 1)), np.radians(60)
     rival = Rival(Pose(seen.R, rotation_exp(aside * unit(around)) @ seen.t), preference)
-    track = SimpleNamespace(rivals=(rival,), beside=(), guess=two_bodies)
+    track = SimpleNamespace(rivals=(rival,), nearby=(), body_ambiguous=two_bodies)
     own = np.radians(0.2)**2 * np.eye(5), np.zeros((6, 6))
-    _, (covariance, _) = _judged(Pose(seen.R, seen.t), own, track, seen.x, None, other_way=False)
+    _, (covariance, _) = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
+                                              sign_open=False)
     claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
     # As far as it is off, as often as it is the true one; else what is known of the pose alone.
     probable = norm.cdf(-preference / 2) if spanned else 0.0
@@ -397,13 +398,13 @@ def test_only_what_is_like_the_motion_before_goes_on() -> None:
     before, turned = Pose(np.eye(3), unit(np.array([0.0, 0, -1]))), rotation_exp(
         np.array([0, 0.02, 0]))
     alike, unlike = Pose(turned, before.t), Pose(np.eye(3), unit(np.array([1.0, 0, -1])))
-    assert goes_on(before, alike, unlike)
-    assert not goes_on(before, unlike, alike)
-    assert not goes_on(before, alike, Pose(turned.T, before.t))  # as like as the other
+    assert continues_motion(before, alike, unlike)
+    assert not continues_motion(before, unlike, alike)
+    assert not continues_motion(before, alike, Pose(turned.T, before.t))  # as like as the other
 
 
 def test_directions_all_round_leave_no_large_gap() -> None:
-    starts = np.array([pose.t for pose in all_round(np.eye(3), 10)])
+    starts = np.array([pose.t for pose in hemisphere_starts(np.eye(3), 10)])
     assert np.allclose(np.linalg.norm(starts, axis=1), 1)
     sphere = unit(np.random.default_rng(6).normal(size=(500, 3)))
     assert np.degrees(np.arccos(np.abs(sphere @ starts.T).max(1)).max()) < 45
@@ -427,11 +428,11 @@ def test_of_minima_beside_one_another_the_lowest_is_taken_and_no_pose_is_sure_of
     right, wrong = (one, other) if ours > others else (other, one)
     for pose in (right, wrong):
         end = minimise(problem, pose.R, pose.t, loss)
-        solution, beside = lowest_around(problem, x, end, loss)
-        assert apart(solution.pose, right) < 0.003
+        solution, beside = lowest_nearby_minimum(problem, x, end, loss)
+        assert unsigned_distance(solution.pose, right) < 0.003
         assert all(0 < rival.preference < 2.33 for rival in beside)
-    assert apart(end.pose, right) > 0.003
-    assert min(apart(rival.pose, end.pose) for rival in beside) < 1e-9
+    assert unsigned_distance(end.pose, right) > 0.003
+    assert min(unsigned_distance(rival.pose, end.pose) for rival in beside) < 1e-9
 
 
 def test_a_lone_minimum_has_none_beside_it() -> None:
@@ -441,4 +442,4 @@ def test_a_lone_minimum_has_none_beside_it() -> None:
     problem = jet_problem(K, views.x, ReprojectionSurface(views.x, y).around(y))
     loss = Loss('geman_mcclure', 0.2)
     end = minimise(problem, views.R, views.t, loss)
-    assert lowest_around(problem, views.x, end, loss) == (end, ())
+    assert lowest_nearby_minimum(problem, views.x, end, loss) == (end, ())

@@ -1,11 +1,11 @@
-"""Basins of the joint optimisation: which starting pose leads to the right one."""
+"""Basins of attraction of the joint optimisation: which starts lead to the right minimum."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from djet_ros.core.covariance import differences, SURPRISING
+from djet_ros.core.covariance import CHI2_999, pose_differences
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import Turn
 from djet_ros.core.geometry import fit_rotation
@@ -19,73 +19,75 @@ from djet_ros.core.jet import (
     Solution,
 )
 from djet_ros.core.paraboloid import median, quantile
-from djet_ros.core.rivals import apart, DECIDED, preferences, refined_rivals, Rival
+from djet_ros.core.rivals import DECIDED, preferences, refined_rivals, Rival, unsigned_distance
 from djet_ros.core.sketch import (
     costs_in_front,
-    Held,
     losses_at,
     moved_all,
     refine_all,
+    RotationPrior,
     Sketch,
 )
-from djet_ros.core.starts import all_round, around, thinned
+from djet_ros.core.starts import around, hemisphere_starts, thinned
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
-# pixels; chosen, far below any noise: perfect data must not shrink the loss to nothing
-LEAST_SCALE = 0.02
+# pixels; chosen, far below any noise: on perfect data the scale of the loss must not become zero
+MIN_SCALE = 0.02
 
 
 @dataclass(frozen=True)
 class BasinTuning:
-    """Constants of the choice, each with where it comes from ("chosen" was not searched)."""
+    """Constants of the choice, each with its origin ("chosen" is an empirical value)."""
 
     # robust standard deviations; chosen: a second motion in the scene fits many matches loosely,
-    # the camera's own fits most of them closely, so a loss that bends here tells basins apart
+    # the camera's own fits most of them closely, so a loss with this scale tells basins apart
     tight: float = 1.0
-    # chosen: where a start lies says little of its basin, so all make a few steps on some matches
+    # chosen: the loss at a start says little of its basin, so all starts make a few steps on some
+    # matches
     steps_to_sketch: int = 4
     matches_to_sketch: int = 800
-    # chosen: it costs little to refine all starts on so few, and there basins lie closer
+    # chosen: with so few matches all starts are refined, which is cheap; basins are closer there
     few_matches: int = 400
-    # chosen: around the motion ahead, on still fewer: most are of the world, or others are asked
-    matches_ahead: int = 200
-    # chosen: and steps on the way there, from all directions and then from the cheapest
-    steps_ahead: tuple[int, int] = (4, 2)
-    # chosen: directions all round from which basins are looked for then, and around the motion
-    # before
+    # chosen: around the predicted motion, on still fewer: most matches are of the static world, or
+    # other starts are used
+    matches_predicted: int = 200
+    # chosen: and steps there, from all directions and then from the cheapest
+    steps_predicted: tuple[int, int] = (4, 2)
+    # chosen: translation directions on a hemisphere as starts in these cases
     directions: int = 10
-    # chosen: and by many matches, which lie in a plane or are in doubt less often: RANSAC may miss
-    # the right one where the camera went a hundredth of the distance
-    directions_of_many: int = 20
-    # chosen: the cheapest that lie in different basins are refined
+    # chosen: and with many matches, which are planar or undecided less often: RANSAC may miss the
+    # right basin if the camera moved by a hundredth of the depth
+    many_directions: int = 20
+    # chosen: number of the cheapest distinct basins that are refined
     refined_starts: int = 3
-    # rad; chosen: poses nearer than this lie in one basin
+    # rad; chosen: poses closer than this are in one basin
     same_basin: float = 0.02
-    # chosen: steps before costs are compared, by which nearly all rest; after 7 some had not yet
-    # come to the right basin, and were passed over
+    # chosen: steps before costs are compared, by which nearly all converge; after 7 some had not
+    # reached the right basin, and were missed
     steps_to_compare: int = 15
-    # rad; chosen: what a rotation that was measured is not trusted with, and for how many matches'
-    # worth of surprise it counts
-    turn_slack: float = 2e-4
-    turn_weight: float = 1000.0
-    # rad; chosen: standard deviation of a rotation that is not yet refined to the end
-    turn_fits: float = 5e-4
-    # standard deviations, the usual three, within which a rotation is the measured one
-    agreeing: float = 3.0
-    # chosen: basins that are left to themselves to see whether they turn away
-    turned_starts: int = 5
-    # standard deviations that normal, independent errors would have; chosen: from so far on either
-    # side other minima are looked for, beyond what errors alike let the right one be away
-    beside: float = 20.0
+    # rad; chosen: standard deviation added to a measured rotation, and its weight in matches
+    rotation_slack: float = 2e-4
+    rotation_weight: float = 1000.0
+    # rad; chosen: standard deviation of a rotation before the optimiser has converged
+    rotation_noise: float = 5e-4
+    # standard deviations within which a rotation is consistent with the measured one, the usual
+    # three
+    rotation_gate: float = 3.0
+    # chosen: number of basins that are refined without the measured rotation, to see whether they
+    # rotate away
+    rotation_starts: int = 5
+    # standard deviations for normal, independent errors; chosen: start distance to either side
+    # from which other minima are sought, beyond what correlated errors displace the right one by
+    nearby_distance: float = 20.0
     # chosen: steps from there
-    steps_beside: int = 6
-    # squared distance: what is nearer is the same minimum
-    same_minimum: float = SURPRISING
-    # standard deviations by which matches prefer the basin ahead to all others: one wrong of three
-    # millions
-    clear: float = 5.0
+    steps_nearby: int = 6
+    # squared Mahalanobis distance below which two minima are the same
+    same_minimum: float = CHI2_999
+    # standard deviations by which matches have to prefer the first basin to all others for an
+    # early decision: an error of one in three million
+    clear_preference: float = 5.0
 
 
 BASIN_TUNING = BasinTuning()
@@ -94,117 +96,120 @@ BASIN_TUNING = BasinTuning()
 @dataclass(frozen=True)
 class Basin:
     """
-    A pose, the scale of the residuals there, these themselves, and the poses of other basins.
+    A pose, the scale of the residuals and the residuals there, and the poses of other basins.
 
-    others_move: whether most matches tell another motion.
+    camera_in_minority: whether most matches follow another motion than the camera's.
     """
 
     pose: Pose
     scale: float
     residuals: Residuals
-    others_move: bool = False
+    camera_in_minority: bool = False
     rivals: tuple[Pose, ...] = ()
 
 
-def right_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                config: EstimatorConfig, prior: Pose | None, turn: Turn | None) -> Basin:
+def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
+                 config: EstimatorConfig, prior: Pose | None, measured: Turn | None) -> Basin:
     """
-    Choose among starts, and directions all round, by what they come to.
+    Choose the basin of the camera's motion among starts and a hemisphere of directions.
 
-    places: (N, 2) pixels of the matches; prior: the motion before, which decides where the matches
-    do not; turn: a rotation that was measured, which all of them have to have.
+    places: (N, 2) pixels of the matches; prior: the previous motion, which decides if the matches
+    do not; measured: a measured rotation, with which the pose has to be consistent.
     """
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_to_sketch))
-    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), LEAST_SCALE)
+    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), MIN_SCALE)
     tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
-    if turn is not None:
-        # Whatever moves as most matches do tells their noise, and what fits the turn fits it well.
+    if measured is not None:
+        # The majority of the matches gives the noise, and what fits the measured rotation fits it
+        # well.
         scale = max(refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch).scales().min(),
-                    LEAST_SCALE)
+                    MIN_SCALE)
         tight = replace(tight, scale=min(config.loss_scale, BASIN_TUNING.tight) * scale)
-        starts = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare,
-                                             _held(turn, scale)), tight,
-                            BASIN_TUNING.turned_starts)
+        sketch = refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare,
+                            _rotation_prior(measured, scale))
+        starts = _cheapest_basins(some, sketch, tight, BASIN_TUNING.rotation_starts)
     elif len(problem.blur) > BASIN_TUNING.few_matches:
-        starts = [*starts, *all_round(starts[0].R, BASIN_TUNING.directions_of_many)]
-        starts = _promising(some, refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch),
-                            tight, BASIN_TUNING.refined_starts)
+        starts = [*starts, *hemisphere_starts(starts[0].R, BASIN_TUNING.many_directions)]
+        sketch = refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch)
+        starts = _cheapest_basins(some, sketch, tight, BASIN_TUNING.refined_starts)
     else:
-        starts = [*starts, *all_round(starts[0].R, BASIN_TUNING.directions)]
-    return _likeliest_basin(problem, places, starts, tight, prior, turn)
+        starts = [*starts, *hemisphere_starts(starts[0].R, BASIN_TUNING.directions)]
+    return _refine_and_choose(problem, places, starts, tight, prior, measured)
 
 
-def _likeliest_basin(problem: JetProblem, places: Array, starts: list[Pose], tight: Loss,
-                     prior: Pose | None, turn: Turn | None = None) -> Basin:
-    """Refine starts on all matches, and take the one that comes to the least, as right_basin."""
+def _refine_and_choose(problem: JetProblem, places: Array, starts: list[Pose], tight: Loss,
+                       prior: Pose | None, measured: Turn | None = None) -> Basin:
+    """Refine starts on all matches, and choose the one of least cost as in `choose_basin`."""
     refined = refine_all(problem, starts, tight, BASIN_TUNING.steps_to_compare)
-    possible, others_move = np.ones(len(refined), bool), False
-    if turn is not None and (turned_so := _turned_so(turn, refined)).any():
-        others_move = not turned_so[costs_in_front(problem, refined, tight).argmin()]
-        possible = turned_so
-    basins = _promising(problem, refined, tight, BASIN_TUNING.refined_starts, possible)
+    possible, camera_in_minority = np.ones(len(refined), bool), False
+    if measured is not None and (consistent := _has_rotation(measured, refined)).any():
+        camera_in_minority = not consistent[costs_in_front(problem, refined, tight).argmin()]
+        possible = consistent
+    basins = _cheapest_basins(problem, refined, tight, BASIN_TUNING.refined_starts, possible)
     best = basins.pop(likeliest(losses_at(problem, basins, tight), places, basins, prior))
-    # All matches are placed equally well, whatever they move with.
+    # The noise of the matches does not depend on the motion that they follow.
     residuals = epipolar_residuals(problem, best.R, best.t)
-    scale = min(map(core_scale, refined.r)) if others_move else core_scale(residuals.r)
-    return Basin(best, max(scale, LEAST_SCALE), residuals, others_move, tuple(basins))
+    scale = min(map(core_scale, refined.r)) if camera_in_minority else core_scale(residuals.r)
+    return Basin(best, max(scale, MIN_SCALE), residuals, camera_in_minority, tuple(basins))
 
 
-def basin_ahead(problem: JetProblem, places: Array, ahead: Pose,
-                config: EstimatorConfig) -> Basin:
+def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
+                           config: EstimatorConfig) -> Basin:
     """
-    Choose among the basins around the motion before: its own, and of directions all round.
+    Choose among the basins around the predicted motion: its own, and a hemisphere of directions.
 
-    ahead: t zeros where its direction is not known. Some matches lead to the basins, and all
-    choose. Where these are not clearly for one, basins are led to until they rest, for some may
-    have been on the way to one and the same; where that does not help, all matches lead them on.
-    Where a turn alone explains the matches, none of that matters.
+    predicted: t is zeros if its direction is unknown. A subset of the matches finds the basins,
+    and all matches choose. If they do not clearly prefer one, the basins are refined to
+    convergence, as some may lead to the same minimum; if that does not help, they are refined on
+    all matches. If a rotation alone explains the matches, the choice does not matter.
     """
-    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_ahead))
+    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_predicted))
     tight = Loss()
-    basins = starts = around(ahead, BASIN_TUNING.directions)
-    for steps in (0, *BASIN_TUNING.steps_ahead):
+    basins = starts = around(predicted, BASIN_TUNING.directions)
+    for steps in (0, *BASIN_TUNING.steps_predicted):
         found = refine_all(some, basins, tight, steps)
-        scale = max(found.scales().min(), LEAST_SCALE)
+        scale = max(found.scales().min(), MIN_SCALE)
         tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
         if steps:
-            basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
+            basins = _cheapest_basins(some, found, tight, BASIN_TUNING.refined_starts)
     if ((len(basins) > 1 and _is_clear(problem, places, basins, tight))
-            or _mere_turn(problem, config.min_parallax)):
+            or _is_pure_rotation(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
-    # All of them again: those that cost least so far may be, or all have been, of one valley.
+    # Include all starts again: the cheapest so far may all be of one valley.
     found = refine_all(some, [*basins, *starts], tight, BASIN_TUNING.steps_to_compare)
-    basins = _promising(some, found, tight, BASIN_TUNING.refined_starts)
+    basins = _cheapest_basins(some, found, tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
-    return _likeliest_basin(problem, places, basins, tight, ahead if ahead.t.any() else None)
+    prior = predicted if predicted.t.any() else None
+    return _refine_and_choose(problem, places, basins, tight, prior)
 
 
 def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:
-    """Tell whether matches clearly prefer the first of some basins to the others."""
+    """Return whether matches clearly prefer the first of some basins to the others."""
     preferred = preferences(losses_at(problem, basins, loss), places, 0)
-    return bool((preferred[1:] >= BASIN_TUNING.clear).all())
+    return bool((preferred[1:] >= BASIN_TUNING.clear_preference).all())
 
 
-def _mere_turn(problem: JetProblem, parallax: float) -> bool:
-    """Tell whether a turn alone brings three quarters of the matches to within some pixels."""
+def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
+    """Return whether a rotation alone brings three quarters of the matches close to y."""
     rays_x, rays_y = problem.rays_x.T, problem.rays_y.T
     turned = rays_x @ fit_rotation(rays_x, rays_y).T
-    off = np.linalg.norm(turned[:, :2] / turned[:, 2:] - rays_y[:, :2], axis=1)
-    # A typical residual surface is of a pixel.
+    offsets = np.linalg.norm(turned[:, :2] / turned[:, 2:] - rays_y[:, :2], axis=1)
+    # Size of a pixel in viewing-ray units, as for a surface of typical sharpness.
     pixel = np.sqrt(median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
-    return bool(quantile(off, 0.75) < parallax * pixel)
+    return bool(quantile(offsets, 0.75) < parallax * pixel)
 
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:
-    """Give the basin of a pose that has no rival."""
+    """Return the basin of a single pose, without rivals."""
     residuals = epipolar_residuals(problem, pose.R, pose.t)
-    return Basin(pose, max(core_scale(residuals.r), LEAST_SCALE), residuals)
+    return Basin(pose, max(core_scale(residuals.r), MIN_SCALE), residuals)
 
 
-def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Sequence[Pose],
-           loss: Loss, prior: Pose | None) -> tuple[Solution, tuple[Rival, ...]]:
-    """Take the likeliest of a solution and its rivals, and tell how much it is preferred."""
+def choose_among_rivals(problem: JetProblem, places: Array, solution: Solution,
+                        rivals: Sequence[Pose], loss: Loss, prior: Pose | None
+                        ) -> tuple[Solution, tuple[Rival, ...]]:
+    """Choose the likeliest of a solution and its rivals, with its preferences over the others."""
     poses = [solution.pose, *refined_rivals(problem, rivals, loss)]
     losses = losses_at(problem, poses, loss)
     best = likeliest(losses, places, poses, prior)
@@ -215,35 +220,36 @@ def judged(problem: JetProblem, places: Array, solution: Solution, rivals: Seque
     preferred = preferences(losses, places, best)
     return solution, tuple(
         Rival(pose, float(preference)) for pose, preference in zip(poses, preferred)
-        if apart(poses[best], pose) > BASIN_TUNING.same_basin)
+        if unsigned_distance(poses[best], pose) > BASIN_TUNING.same_basin)
 
 
-def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: Loss
-                  ) -> tuple[Solution, tuple[Rival, ...]]:
+def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution, loss: Loss
+                          ) -> tuple[Solution, tuple[Rival, ...]]:
     """
-    Take the lowest of the minima that lie beside a solution, and give the others as its rivals.
+    Return the lowest of the minima near a solution, and the others as its rivals.
 
-    A loss that redescends has one for each group of matches that a pose takes for right. Where few
-    decide about a direction, these lie side by side along it, within what is one basin elsewhere.
-    So some matches are led back from either side along the two directions that are told least, to
-    the minimum that they were at, but for few; the others are refined on all.
+    A redescending loss has a minimum for each group of matches that a pose takes for inliers. If
+    few matches determine a direction, several lie side by side along it, within what is one basin
+    elsewhere. So a subset of the matches is refined from either side along the two least
+    determined directions, which nearly always leads back to the same minimum; the other ones are
+    refined on all matches.
     """
     information = _information(solution.residuals, loss)
     if not np.isfinite(information).all():
         return solution, ()
-    told, axes = np.linalg.eigh(information)
-    if told[0] <= 1e-12 * told[-1]:
+    eigenvalues, axes = np.linalg.eigh(information)
+    if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return solution, ()
-    steps = (axes[:, :2] * BASIN_TUNING.beside / np.sqrt(told[:2])).T
+    steps = (axes[:, :2] * BASIN_TUNING.nearby_distance / np.sqrt(eigenvalues[:2])).T
     starts = map(Pose, *moved_all(solution.R, solution.t, solution.residuals.tangents,
                                   np.concatenate([steps, -steps])))
     some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.few_matches))
-    led = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_beside).poses()
+    refined = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_nearby).poses()
     bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(some.blur)
-    others = _unlike(led, solution, information, bound)[1:]
-    minima = [solution, *(minimise(problem, led[number].R, led[number].t, loss)
+    others = _distinct(refined, solution, information, bound)[1:]
+    minima = [solution, *(minimise(problem, refined[number].R, refined[number].t, loss)
                           for number in others)]
-    minima = [minima[number] for number in _unlike(
+    minima = [minima[number] for number in _distinct(
         [minimum.pose for minimum in minima], solution, information, BASIN_TUNING.same_minimum)]
     if len(minima) == 1:
         return solution, ()
@@ -255,66 +261,69 @@ def lowest_around(problem: JetProblem, places: Array, solution: Solution, loss: 
                                in enumerate(zip(poses, preferred)) if number != best)
 
 
-def _unlike(poses: Sequence[Pose], solution: Solution, information: Array, bound: float
-            ) -> list[int]:
+def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bound: float
+              ) -> list[int]:
     """
-    Find the numbers of poses that are farther from all before them than a bound has it.
+    Return the indices of the poses that are farther than a bound from all kept before them.
 
-    information: (5, 5) in the parameters of the solution, by which squared distances are taken.
+    information: (5, 5) in the parameters of the solution, for the squared distances.
     """
-    off = differences(solution.R, solution.t, np.array([pose.R for pose in poses]),
-                      np.array([pose.t for pose in poses]))
+    offsets = pose_differences(solution.R, solution.t, np.array([pose.R for pose in poses]),
+                               np.array([pose.t for pose in poses]))
     kept: list[int] = []
     for number in range(len(poses)):
-        if (_squared(off[kept] - off[number], information) > bound).all():
+        if (_squared_distances(offsets[kept] - offsets[number], information) > bound).all():
             kept.append(number)
     return kept
 
 
 def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose | None) -> int:
     """
-    Which of S poses costs least, or, of those undecided between, is next to the prior.
+    Return which of S poses costs least, or the nearest to the prior of those undecided.
 
-    losses: (S, N) of the matches there; places: (N, 2) their pixels.
+    losses: (S, N) of the matches at the poses; places: (N, 2) their pixels.
     """
     best = int(losses.sum(1).argmin())
     if prior is None:
         return best
     undecided = preferences(losses, places, best) < DECIDED
-    return min(np.flatnonzero(undecided).tolist(), key=lambda number: apart(prior, poses[number]))
+    return min(np.flatnonzero(undecided).tolist(),
+               key=lambda number: unsigned_distance(prior, poses[number]))
 
 
-def _turned_so(turn: Turn, sketch: Sketch) -> NDArray[np.bool_]:
+def _has_rotation(measured: Turn, sketch: Sketch) -> NDArray[np.bool_]:
     """
-    (S,) bool mask of the poses whose rotation is the measured one, within what both are good for.
+    Return the (S,) bool mask of poses whose rotation is consistent with the measured one.
 
-    The motion of something that fills the image is found under the measured rotation too, by a
-    direction that makes up for the difference; left to itself it turns away.
+    The motion of an object that fills the image is also found under the measured rotation, with a
+    translation that compensates for the difference; refined without it, its rotation drifts away.
     """
-    off = turn.off(sketch.R)
-    allowed = turn.covariance + BASIN_TUNING.turn_fits**2 * np.eye(3)
-    return np.asarray((off * np.linalg.solve(allowed, off.T).T).sum(1) < BASIN_TUNING.agreeing**2)
+    offsets = measured.off(sketch.R)
+    allowed = measured.covariance + BASIN_TUNING.rotation_noise**2 * np.eye(3)
+    squared = (offsets * np.linalg.solve(allowed, offsets.T).T).sum(1)
+    return np.asarray(squared < BASIN_TUNING.rotation_gate**2)
 
 
-def _held(turn: Turn | None, scale: float) -> Held | None:
+def _rotation_prior(measured: Turn | None, scale: float) -> RotationPrior | None:
     """
-    Draw rotations to the one that was measured, while a basin is chosen.
+    Return a prior that draws rotations to the measured one while a basin is chosen.
 
-    The matches of something large that moves by itself outweigh what is left of the scene, unless
-    a measured rotation counts for more than all of them. In the end the matches decide alone.
+    The matches of a large moving object outweigh the rest of the scene, unless a measured rotation
+    weighs more than all of them. In the final optimisation the matches decide alone.
     """
-    if turn is None:
+    if measured is None:
         return None
-    variance = turn.covariance + BASIN_TUNING.turn_slack**2 * np.eye(3)
-    return Held(turn.R, np.asarray(BASIN_TUNING.turn_weight * scale**2 * np.linalg.inv(variance)))
+    variance = measured.covariance + BASIN_TUNING.rotation_slack**2 * np.eye(3)
+    weight = BASIN_TUNING.rotation_weight * scale**2 * np.linalg.inv(variance)
+    return RotationPrior(measured.R, np.asarray(weight))
 
 
-def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
-               possible: NDArray[np.bool_] | None = None) -> list[Pose]:
-    """Choose the cheapest poses that lie in different basins, up to a number of them."""
+def _cheapest_basins(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
+                     possible: NDArray[np.bool_] | None = None) -> list[Pose]:
+    """Return the cheapest poses of distinct basins, up to a maximum number."""
     chosen: list[int] = []
     R = sketch.R.reshape(-1, 9)
-    # Squares of what `apart` gives, of all at once.
+    # Squares of `unsigned_distance`, for all pairs at once.
     near = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T) <= BASIN_TUNING.same_basin**2
     passed = np.zeros(len(sketch), bool) if possible is None else ~possible
     for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
@@ -323,22 +332,23 @@ def _promising(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
         chosen.append(number)
         if len(chosen) == most:
             break
-        # A valley has room for several that matches do not tell from one another.
+        # A valley holds several poses that matches do not distinguish.
         information = _information(
             epipolar_residuals(problem, sketch.R[number], sketch.t[number]), loss)
-        off = differences(sketch.R[number], sketch.t[number], sketch.R, sketch.t)
-        passed |= near[number] | (_squared(off, information) <= BASIN_TUNING.same_minimum)
+        offsets = pose_differences(sketch.R[number], sketch.t[number], sketch.R, sketch.t)
+        squared = _squared_distances(offsets, information)
+        passed |= near[number] | (squared <= BASIN_TUNING.same_minimum)
     return [sketch.pose(number) for number in chosen]
 
 
 def _information(residuals: Residuals, loss: Loss) -> Array:
-    """Information (5, 5) of matches about a pose, were their errors normal and independent."""
+    """Return the information (5, 5) about a pose, for normal and independent errors."""
     J, squared = residuals.jacobian, residuals.r**2
     _, weights = loss(squared)
-    noise = max(float((weights * squared).sum() / weights.sum()), LEAST_SCALE**2)
+    noise = max(float((weights * squared).sum() / weights.sum()), MIN_SCALE**2)
     return np.asarray((J * weights) @ J.T / noise)
 
 
-def _squared(off: Array, information: Array) -> Array:
-    """Squared lengths (S,) of differences (S, 5), by the information (5, 5) about a pose."""
-    return np.asarray((off @ information * off).sum(1))
+def _squared_distances(offsets: Array, information: Array) -> Array:
+    """Return the squared lengths (S,) of differences (S, 5), by the information (5, 5)."""
+    return np.asarray((offsets @ information * offsets).sum(1))

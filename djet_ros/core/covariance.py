@@ -6,94 +6,91 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from djet_ros import compiled
-from djet_ros.core.cells import by_cell, CELL, short
+from djet_ros.core.cells import CELL, group_by_cell, in_few_bytes
 from djet_ros.core.geometry import rotation_log, sphere_tangents
-from djet_ros.core.jet import (
-    epipolar_residuals,
-    JetProblem,
-    LEAST_CURVED,
-    Loss,
-    Residuals,
-)
+from djet_ros.core.jet import epipolar_residuals, JetProblem, LEAST_CURVED, Loss, Residuals
 from djet_ros.core.sketch import moved_all, refine_all
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-# Into so many cells the matches are cut too: none of these may hold all that is known either.
+# Number of large cells into which the matches are also divided: none of them may hold all
+# information either.
 LARGE_CELLS = 20
 
-# Matches err alike most where their patches overlap: pairs are told apart by whether they share a
-# cell of 8, 16, 32, 64, 128, 256 or 512 pixels, and not the one before.
-_SMALLEST, _SIDES = 8, 7
+# Errors are most correlated where patches overlap. Pairs of matches are classed by the smallest
+# cell that they share, of a side of 8, 16, 32, 64, 128, 256 or 512 pixels.
+_SMALLEST_SIDE, _SIDE_COUNT = 8, 7
 
-# Of these, the one of small cells.
-_SMALL = (CELL // _SMALLEST).bit_length() - 1
+# Index of the small cells among these sides.
+_SMALL_CELLS = (CELL // _SMALLEST_SIDE).bit_length() - 1
 
-# Chosen: what matches err alike falls by so much from one of these to the next, as the distance to
-# the power of -1.5. On scenes rendered with seeds 0-4 residuals fall faster from 32 on; but what
-# stays the same over the whole image is not seen in them, as the pose follows it.
-_FALL = 2**-1.5
+# chosen: decay of the error correlation from one side to the next, as the distance to the power of
+# -1.5. On scenes rendered with seeds 0-4 residuals decorrelate faster from 32 pixels on; but
+# errors common to the whole image do not show in them, as the pose absorbs these.
+_DECAY = 2**-1.5
 
-# From which of them on it is told in turn: from all, from those that no small cell holds, and then
-# from farther and farther.
-_TOLD_FROM = np.array([0, _SMALL, _SMALL + 1, _SMALL + 2])
+# Side index from which on the correlation is estimated in turn: from all pairs, from those that
+# share no small cell, and then from farther and farther.
+_FROM_SCALE = np.array([0, _SMALL_CELLS, _SMALL_CELLS + 1, _SMALL_CELLS + 2])
 
-# By what it falls from there on (4, 6); nothing is told of what is nearer.
-_FALLS = np.where(np.arange(_SIDES - 1) < _TOLD_FROM[:, None], 0.0,
-                  _FALL**(np.arange(_SIDES - 1.0) - _TOLD_FROM[:, None]))
+# Correlation (4, 6) relative to that side; nearer pairs are not used.
+_DECAYS = np.where(np.arange(_SIDE_COUNT - 1) < _FROM_SCALE[:, None], 0.0,
+                   _DECAY**(np.arange(_SIDE_COUNT - 1.0) - _FROM_SCALE[:, None]))
 
-# Squared Mahalanobis distance, over five degrees of freedom, that one pose of a thousand exceeds.
-SURPRISING = 20.5
+# 99.9 % quantile of chi^2 with five degrees of freedom.
+CHI2_999 = 20.5
 
-# Bound of chi^2 in five directions that holds 95 %.
-_BOUND = float(chdtri(5, 0.05))
+# 95 % quantile of the same.
+_CHI2_95 = float(chdtri(5, 0.05))
 
-# At this probability, the most that is promised, bounds are those of Fisher's F of (5, v), and of
-# chi^2 where v is large.
-_TOLD_AT = 0.999
-_BOUND_TOLD = float(chdtri(5, 1 - _TOLD_AT))
+# Confidence at which bounds are those of Fisher's F of (5, v) in place of chi^2; it is the highest
+# that is promised.
+_CONFIDENCE = 0.999
+_CHI2_CONFIDENCE = float(chdtri(5, 1 - _CONFIDENCE))
 
-# chosen: errors with longer tails than normal ones tell a variance as fewer of those would; 1.5
-# times fewer where the kurtosis is 4, not 3.
-_LONG_TAILS = 1.5
+# chosen: factor by which heavy tails reduce the degrees of freedom of a variance estimate; 1.5 for
+# a kurtosis of 4 in place of 3.
+_KURTOSIS_FACTOR = 1.5
 
-# chosen: no direction is taken to be told more than twenty times as badly as the curvature says.
-_LEAST_RISE = 0.05
+# chosen: lower bound of the rise of the loss over that of its parabola, so that no standard
+# deviation grows by a factor of more than 20.
+_MIN_RISE = 0.05
 
-# rad^2; a nanoradian, far below any noise: perfect data must not divide by nothing.
-_LEAST_VARIANCE = 1e-18
+# rad^2; a nanoradian, far below any noise, against division by zero on perfect data.
+_MIN_VARIANCE = 1e-18
 
-# What is said of a pose that is not determined.
+# Covariances of a pose that is not determined.
 UNKNOWN = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 
-# Of what is known in a direction of the pose, the matches of one cell may make up all but this.
-_LEAST_SUPPORT = 1e-6
+# Share of the information in any direction of the pose that has to remain without the matches of
+# one cell.
+_MIN_SUPPORT = 1e-6
 
-# Where the upper triangle of a (5, 5) has its entries, and which of them stands at each of all 25.
+# Indices of the upper triangle of a (5, 5), and for all 25 entries their position in it.
 _UPPER = np.triu_indices(5)
-_WHOLE = [i * (9 - i) // 2 + j for i, j in map(sorted, np.ndindex(5, 5))]
+_FULL = [i * (9 - i) // 2 + j for i, j in map(sorted, np.ndindex(5, 5))]
 
-# chosen: share of a cell, summed over the five directions, from which on it is looked at closely.
-_WEIGHTY = 0.9
+# chosen: share of a cell in the information, summed over the five directions, from which on its
+# eigenvalues are checked.
+_HEAVY = 0.9
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
                     flipped: bool) -> tuple[Array, Array]:
     """
-    Covariance of (rotation vector in rad from the left, direction of t) at the minimum.
+    Return the covariance of (rotation vector in rad from the left, direction of t) at the minimum.
 
-    places: (N, 2) pixels of the matches; t: (3,) the direction that was settled on, `flipped`
-    where it is the opposite of the optimiser's. Gives (5, 5) in the basis
-    ``sphere_tangents(t)``, and (6, 6) over (rotation vector, t), of rank 5 because t keeps its
-    length. All NaN where the matches do not determine the pose, only those of one cell do, or
-    they lie in too few cells.
+    places: (N, 2) pixels of the matches; t: (3,) the final direction, `flipped` if it is opposite
+    to the optimiser's. Returns the covariance (5, 5) in the basis ``sphere_tangents(t)``, and
+    (6, 6) over (rotation vector, t), of rank 5 because t has unit length. All NaN if the matches
+    do not determine the pose, if only those of one cell do, or if they lie in too few cells.
 
-    The noise is that of the residuals themselves, in whichever of the two images it arose. Small
-    cells tell how large it is, and of what shape, see `_jackknife`; how much these err alike is
-    told by their errors, see `_alike`. Where few decide about a direction, it is less sure than
-    they say: see `_hardly_told`.
+    The noise is estimated from the residuals, so it includes that of both images. Its size and
+    shape come from a jackknife over small cells (`_jackknife`), the correlation of errors between
+    cells from products of residuals (`_correlated`). A direction that few cells determine is
+    widened for the small sample (`_small_sample_widening`).
     """
     J = residuals.jacobian
     squared = residuals.r**2
@@ -101,88 +98,88 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     H = (J * weights) @ J.T
     if not np.isfinite(H).all():
         return UNKNOWN
-    told = np.linalg.eigvalsh(H)
-    if told[0] <= 1e-12 * told[-1]:
+    eigenvalues = np.linalg.eigvalsh(H)
+    if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return UNKNOWN
-    curved = _curved(H, (J * loss.curvature(squared)) @ J.T)
-    cells, pulls, products = _summed_up(H, places, J, weights, residuals.r)
+    curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
+    cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
-    if curved is None or not (cells.suffice() and large.suffice()):
+    if curved is None or not (cells.determine_pose() and large.determine_pose()):
         return UNKNOWN
-    moves, without = without_each(H, cells.sums)
-    size = cells.size(moves)
-    by_itself = _jackknife(cells, without, moves)
+    shifts, inverses_left = without_each(H, cells.sums)
+    size = cells.size(shifts)
+    independent = _jackknife(cells, inverses_left, shifts)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = by_itself + _alike(pulls, products, cells.inverse, by_itself, size, noise)
-    growth = float(np.trace(np.linalg.solve(by_itself, covariance))) / 5
-    covariance += growth * size * _hardly_told(cells, growth)
-    # What a pose moves by over what it would by H, the loss's weights.
+    covariance = independent + _correlated(pulls, products, cells.inverse, independent, size,
+                                           noise)
+    growth = float(np.trace(np.linalg.solve(independent, covariance))) / 5
+    covariance += growth * size * _small_sample_widening(cells, growth)
+    # Ratio of the step of a pose to that by H, in which the loss counts by its weights.
     flattened = np.linalg.solve(curved, H)
     covariance = flattened @ covariance @ flattened.T
     covariance = (covariance + covariance.T) / 2
-    # t and -t share their essential matrix: where one moves forwards, the other moves back.
+    # t and -t have the same essential matrix: their tangents move in opposite directions.
     turned = lift(-residuals.tangents if flipped else residuals.tangents)
     covariance_6 = turned @ covariance @ turned.T
     basis = lift(sphere_tangents(t))
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
-def as_far_as_claimed(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
-                      residuals: Residuals | None = None) -> tuple[Array, Array]:
+def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
+                       residuals: Residuals | None = None) -> tuple[Array, Array]:
     """
-    Widen a covariance (5, 5) where the loss does not rise as its curvature at the minimum says.
+    Widen a covariance (5, 5) where the loss rises less than its curvature at the minimum predicts.
 
-    Noise pulls a pose until the loss pulls back as much, so that it goes by the mean curvature on
-    its way. A loss that redescends bends where matches cease to agree, and those that decide about
-    a direction may be few. So the loss is looked at where each axis of the ellipsoid meets the
-    bound of 95 %, on both sides: where on one of them it has risen by a share of what a parabola
-    would have, the pose is off by the inverse of that share. (As profiles of the likelihood are
-    held against their parabolas: Bates and Watts, Nonlinear Regression Analysis, chapter 6.)
-    residuals: those at the pose, where they are known. Gives it with that over (rotation vector,
-    t), (6, 6).
+    Noise displaces a pose until the loss balances it, so the mean curvature along the way counts.
+    A redescending loss flattens where matches become outliers, and few may determine a direction.
+    So the loss is evaluated where each axis of the ellipsoid meets the 95 % bound, on both sides:
+    if it has risen by a share of what a parabola would have on either side, the standard deviation
+    is divided by that share. (Profile likelihoods, as in Bates and Watts, Nonlinear Regression
+    Analysis, chapter 6.) residuals: those at the pose, if known. Returns the covariances (5, 5),
+    and (6, 6) over (rotation vector, t).
     """
     residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
     J, squared = residuals.jacobian, residuals.r**2
-    curved = _curved((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
+    curved = _loss_curvature((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
     variances, axes = np.linalg.eigh(covariance)
     if curved is None or variances[0] <= 0:
-        return _lifted(covariance, pose.t)
-    ways = (axes * np.sqrt(_BOUND * variances)).T
+        return _with_covariance_6(covariance, pose.t)
+    ends = (axes * np.sqrt(_CHI2_95 * variances)).T
     around = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
-                                  np.concatenate([ways, -ways])))
+                                  np.concatenate([ends, -ends])))
     costs = refine_all(problem, [pose, *around], loss, 0).costs
     rises = (costs[1:] - costs[0]).reshape(2, 5).min(0)
-    share = np.clip(rises / (ways @ curved * ways).sum(1), _LEAST_RISE, 1.0)
-    return _lifted((axes * variances / share**2) @ axes.T, pose.t)
+    share = np.clip(rises / (ends @ curved * ends).sum(1), _MIN_RISE, 1.0)
+    return _with_covariance_6((axes * variances / share**2) @ axes.T, pose.t)
 
 
-def by_calibration(problem: JetProblem, K: Array, pose: Pose, residuals: Residuals, loss: Loss,
-                   sigma: float) -> Array:
+def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals: Residuals,
+                           loss: Loss, sigma: float) -> Array:
     """
-    Covariance (6, 6) over (rotation vector, t) that errors of the camera matrix bring about.
+    Return the covariance (6, 6) over (rotation vector, t) due to errors of the camera matrix.
 
-    residuals: those at the pose; sigma: standard deviation in pixels of the focal length, in which
-    fx and fy err together, and of either coordinate of the principal point. Where one of these is
-    off by dk, residuals change by dr, and weighted least squares moves the pose by
-    -(J W J^T)^-1 J W dr (the implicit function theorem on the minimum).
+    residuals: those at the pose; sigma: standard deviation in pixels of the focal length (common
+    to fx and fy), and of each coordinate of the principal point. If one of these is off by dk,
+    residuals change by dr, and weighted least squares shifts the pose by -(J W J^T)^-1 J W dr
+    (implicit function theorem at the minimum).
     """
     J = residuals.jacobian
-    weighed = J * loss(residuals.r**2)[1]
+    weighted = J * loss(residuals.r**2)[1]
     steps = np.zeros((3, 3, 3))
     steps[0, :2, :2], steps[1, 0, 2], steps[2, 1, 2] = sigma * np.eye(2), sigma, sigma
     changes = [epipolar_residuals(problem.seen_with(K, K + step), pose.R, pose.t).r - residuals.r
                for step in steps]
-    moves = np.linalg.solve(weighed @ J.T, weighed @ np.transpose(changes))
-    lifted = lift(residuals.tangents) @ moves
+    shifts = np.linalg.solve(weighted @ J.T, weighted @ np.transpose(changes))
+    lifted = lift(residuals.tangents) @ shifts
     return np.asarray(lifted @ lifted.T)
 
 
-def _curved(H: Array, curvature: Array) -> Array | None:
+def _loss_curvature(H: Array, curvature: Array) -> Array | None:
     """
-    Give how a loss curves (5, 5), by its second derivatives (5, 5) and its weights H (5, 5).
+    Return the curvature (5, 5) of a loss from its Hessian and its weighted H, (5, 5) each.
 
-    A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6), and
-    least along a direction that uncertain matches tell. None where it does not curve upwards.
+    A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6), most of
+    all in a direction that uncertain matches determine. None if the curvature is not positive.
     """
     root = np.linalg.cholesky(H)
     inverse = np.linalg.inv(root)
@@ -196,12 +193,12 @@ def _curved(H: Array, curvature: Array) -> Array | None:
 @dataclass(frozen=True)
 class _Cells:
     """
-    What the matches of C cells tell together.
+    Sums over the matches of C cells.
 
-    whole: (5, 5) H of all, and its inverse; places: (C, 2) pixels in them; sums: (27, C), one row
-    after the other the upper triangle of H (5, 5) of their loss, its gradient (5,), how that
-    changes where all residuals of a cell grow alike (5,), and their weighted residuals and
-    weights.
+    whole: (5, 5) H of all matches, and its inverse; places: (C, 2) pixels in the cells; sums:
+    (27, C), by rows the upper triangle of H (5, 5) of the loss, its gradient (5,), the derivative
+    of the gradient by a common shift of all residuals of the cell (5,), and the sums of the
+    weighted residuals and of the weights.
     """
 
     whole: Array
@@ -210,8 +207,8 @@ class _Cells:
     sums: Array
 
     def in_larger(self, side: float) -> _Cells:
-        """Give larger cells, each made of whole small ones; places are those of one of them."""
-        order, first = by_cell(self.places, side)
+        """Merge the small cells into larger ones; places are those of one of them."""
+        order, first = group_by_cell(self.places, side)
         return _Cells(self.whole, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
 
@@ -220,169 +217,170 @@ class _Cells:
 
     @cached_property
     def H(self) -> Array:
-        """Give (C, 5, 5)."""
-        return self.sums[_WHOLE].T.reshape(-1, 5, 5)
+        """Return the matrices H (C, 5, 5) of the cells."""
+        return self.sums[_FULL].T.reshape(-1, 5, 5)
 
     @property
     def gradients(self) -> Array:
-        """Give (5, C)."""
+        """Return the gradients (5, C) of the cells."""
         return self.sums[15:20]
 
-    def suffice(self) -> bool:
-        """Tell whether there are enough cells, and something is left without any one of them."""
-        if len(self) <= 5:  # so many are gone with the pose's own freedom
+    def determine_pose(self) -> bool:
+        """Return whether there are enough cells, and no single one is indispensable."""
+        if len(self) <= 5:  # the pose has 5 degrees of freedom
             return False
-        # The traces bound the shares, to within rounding, and hardly any cell comes near to all.
-        weighty = self.H[self.H.reshape(-1, 25) @ self.inverse.ravel() > _WEIGHTY]
-        if not len(weighty):
+        # The traces bound the eigenvalues, to within rounding, and are small for nearly all cells.
+        heavy = self.H[self.H.reshape(-1, 25) @ self.inverse.ravel() > _HEAVY]
+        if not len(heavy):
             return True
         whitening = np.linalg.inv(np.linalg.cholesky(self.whole))
-        shares = np.linalg.eigvalsh(whitening @ weighty @ whitening.T)
-        return bool((shares <= 1 - _LEAST_SUPPORT).all())
+        shares = np.linalg.eigvalsh(whitening @ heavy @ whitening.T)
+        return bool((shares <= 1 - _MIN_SUPPORT).all())
 
-    def size(self, moves: Array) -> float:
+    def size(self, shifts: Array) -> float:
         """
-        Size of the covariance that is told, over H^-1, on average over the five directions.
+        Return the ratio of the variances to H^-1, on average over the five directions.
 
-        moves: (5, C) of the pose without the matches of each cell. Where cells err by themselves,
-        it is the same for any size of them: by (H - H_c)^-1 in place of H^-1 it has no bias (Bell
-        and McCaffrey, Survey Methodology 2002).
+        shifts: (5, C) shifts of the pose without the matches of each cell. If errors are
+        independent between cells, it does not depend on the size of the cells: with (H - H_c)^-1
+        in place of H^-1 it is unbiased (Bell and McCaffrey, Survey Methodology 2002).
         """
-        return float((moves * self.gradients).sum()) / 5 + _LEAST_VARIANCE
+        return float((shifts * self.gradients).sum()) / 5 + _MIN_VARIANCE
 
 
-def difference(R: Array, t: Array, other: Pose) -> Array:
+def pose_difference(R: Array, t: Array, other: Pose) -> Array:
     """
-    How another motion differs (5,) from (R, t), in the parameters of a covariance of that.
+    Return the difference (5,) of another motion from (R, t), in the parameters of its covariance.
 
-    Matches tell t up to its sign, so it is the nearer of both signs that differs, by its chord.
+    Matches determine t up to its sign, so the nearer of both signs counts, by its chord.
     """
-    return np.asarray(differences(R, t, other.R[None], other.t[None])[0])
+    return np.asarray(pose_differences(R, t, other.R[None], other.t[None])[0])
 
 
-def differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
-    """Give how S motions, R (S, 3, 3) and t (S, 3), differ from one in that way, (S, 5)."""
+def pose_differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
+    """Return the differences (S, 5) of S motions, R (S, 3, 3) and t (S, 3), from one."""
     towards = np.where(other_t @ t >= 0, 1.0, -1.0)[:, None] * other_t - t
     return np.concatenate([rotation_log(other_R @ R.T), towards @ sphere_tangents(t)], axis=1)
 
 
-def squared_distance(covariance: Array, apart: Array) -> float:
-    """Squared Mahalanobis distance of a pose that is apart (5,); finite even of perfect data."""
+def squared_distance(covariance: Array, offset: Array) -> float:
+    """Squared Mahalanobis distance of a difference of poses (5,); finite even for perfect data."""
     variances, axes = np.linalg.eigh(covariance)
-    return float(((axes.T @ apart)**2 / np.maximum(variances, _LEAST_VARIANCE)).sum())
+    return float(((axes.T @ offset)**2 / np.maximum(variances, _MIN_VARIANCE)).sum())
 
 
-def spanning(covariance: Array, t: Array, apart: Array, probability: float
-             ) -> tuple[Array, Array]:
+def widened_to_span(covariance: Array, t: Array, offset: Array, probability: float
+                    ) -> tuple[Array, Array]:
     """
-    Widen a covariance (5, 5) by a pose apart (5,) that is the true one with a probability.
+    Widen a covariance (5, 5) by a rival at an offset (5,) that is true with a probability.
 
-    Gives it with that over (rotation vector, t), (6, 6): C + p a a^T, the expected square of the
-    error of the pose at hand.
+    Returns C + p a a^T, the expected squared error of the pose, (5, 5), and (6, 6) over (rotation
+    vector, t).
     """
-    return _lifted(covariance + probability * np.outer(apart, apart), t)
+    return _with_covariance_6(covariance + probability * np.outer(offset, offset), t)
 
 
 def widened(covariance: Array, t: Array, other: Array) -> tuple[Array, Array]:
     """
-    Widen a covariance (5, 5) by another one (6, 6), over (rotation vector, t), of what errs too.
+    Add to a covariance (5, 5) another one (6, 6) over (rotation vector, t), of independent errors.
 
-    That is what a calibration does; and a rival, which is spanned and may as well be the true
-    motion, is as far from the truth as its own covariance says. Gives it as ``spanning`` does; as
-    it was where the other is not determined.
+    Such as that of the calibration; or that of a rival, which may be the true motion, and is as
+    uncertain as its own covariance says. Returns the covariances as ``widened_to_span`` does;
+    unchanged if the other is not determined.
     """
     if np.isfinite(other).all():
         basis = lift(sphere_tangents(t))
         covariance = covariance + basis.T @ other @ basis
-    return _lifted(covariance, t)
+    return _with_covariance_6(covariance, t)
 
 
-def _lifted(covariance: Array, t: Array) -> tuple[Array, Array]:
-    """Give a covariance (5, 5), and the same over (rotation vector, t), (6, 6)."""
+def _with_covariance_6(covariance: Array, t: Array) -> tuple[Array, Array]:
+    """Return a covariance (5, 5) and the same over (rotation vector, t), (6, 6)."""
     basis = lift(sphere_tangents(t))
     return covariance, basis @ covariance @ basis.T
 
 
 def lift(tangents: Array) -> Array:
-    """Lift (6, 5) of steps (rotation, two tangents) to (rotation, direction)."""
+    """Return the matrix (6, 5) from (rotation, two tangents) to (rotation, direction)."""
     lifted = np.zeros((6, 5))
     lifted[:3, :3], lifted[3:, 3:] = np.eye(3), tangents
     return lifted
 
 
-def _jackknife(cells: _Cells, without: Array, moves: Array) -> Array:
+def _jackknife(cells: _Cells, inverses_left: Array, shifts: Array) -> Array:
     """
-    Covariance (5, 5) from how far the pose would move without the matches of a cell, cell by cell.
+    Covariance (5, 5) by a delete-a-group jackknife over cells, to first order.
 
-    without: (5, 5) sum of the inverses of what is left without each cell; moves: (5, C) of the
-    pose without its matches. A delete-a-group jackknife, to first order
-    (Bell and McCaffrey, Survey Methodology 2002). Where few cells decide about a direction, their
-    moves say little; so the mean is taken of the moves that are seen and of those that noise would
-    make, which are large there, at the size that has the seen ones on average.
+    inverses_left: (5, 5) sum of the inverses of H without each cell; shifts: (5, C) shifts of the
+    pose without each cell (Bell and McCaffrey, Survey Methodology 2002). If few cells determine a
+    direction, their shifts are a poor estimate; so the observed shifts are averaged with those
+    expected from noise, which are large there, at the scale that matches the observed ones on
+    average.
     """
-    seen = moves @ moves.T + _LEAST_VARIANCE * cells.inverse
-    by_noise = without - len(cells) * cells.inverse
+    seen = shifts @ shifts.T + _MIN_VARIANCE * cells.inverse
+    by_noise = inverses_left - len(cells) * cells.inverse
     by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
     return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
 
 
-def _alike(pulls: Array, products: Array, inverse: Array, by_itself: Array, size: float,
-           noise: float) -> Array:
+def _correlated(pulls: Array, products: Array, inverse: Array, independent: Array, size: float,
+                noise: float) -> Array:
     """
-    Covariance (5, 5) of what small cells err alike, over that of each by itself (5, 5).
+    Covariance (5, 5) due to correlated errors of cells, in addition to that of independent ones.
 
-    Errors of matches i and j at a distance d are taken to have E[r_i r_j] = a f(d), with f as in
-    _FALLS. Of residuals less is left, as the pose follows what all have in common:
+    Errors of matches i and j at a distance d are modelled by E[r_i r_j] = a f(d), with f as in
+    _DECAYS. The residuals are less correlated, as the pose absorbs what all have in common:
 
         E[r_i r_j] = a f(d) - J_i^T C J_j - a J_i^T H^-1 (sum_kl f w_k J_k J_l^T w_l) H^-1 J_j,
 
-    with C the covariance of each by itself. How large a is, is told best by patches that overlap;
-    then by pairs farther and farther apart, whether there is more between these than that lets
-    expect.
+    with C the covariance of independent errors. Overlapping patches determine a best; then pairs
+    farther and farther apart, by what exceeds the correlation already explained.
 
     pulls, products: of cells of each side, from the smallest on, see `sums_of_cells`; inverse:
-    (5, 5) that of H; noise: variance of a match, which bounds what is told.
+    (5, 5) that of H; independent: the covariance C; size: see `_Cells.size`; noise: variance of a
+    match, an upper bound of a.
     """
     pulls, products = np.diff(pulls, axis=0), np.diff(products, axis=0)
-    found = products[:, 0] + (pulls * by_itself).sum((1, 2))
-    left = inverse @ _in_all(_FALLS, pulls) @ inverse
-    expected = _FALLS * products[:, 1] - left.reshape(-1, 25) @ pulls.reshape(-1, 25).T
-    weighed = (_FALLS > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
-    known, amounts = (weighed * expected).sum(1), np.zeros(len(pulls))
+    found = products[:, 0] + (pulls * independent).sum((1, 2))
+    left = inverse @ _weighted_sum(_DECAYS, pulls) @ inverse
+    expected = _DECAYS * products[:, 1] - left.reshape(-1, 25) @ pulls.reshape(-1, 25).T
+    weighted = (_DECAYS > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
+    known, amounts = (weighted * expected).sum(1), np.zeros(len(pulls))
     for nearest in np.flatnonzero(known > 0):
-        amount = min(max(weighed[nearest] @ found / known[nearest], 0.0), noise)
-        amounts += amount * _FALLS[nearest]
+        amount = min(max(weighted[nearest] @ found / known[nearest], 0.0), noise)
+        amounts += amount * _DECAYS[nearest]
         found -= amount * expected[nearest]
-    return np.asarray(inverse @ _in_all(amounts[_SMALL:], pulls[_SMALL:]) @ inverse)
+    total = _weighted_sum(amounts[_SMALL_CELLS:], pulls[_SMALL_CELLS:])
+    return np.asarray(inverse @ total @ inverse)
 
 
-def _in_all(shares: Array, parts: Array) -> Array:
-    """Sum up shares (..., S) of parts (S, 5, 5), (..., 5, 5)."""
+def _weighted_sum(shares: Array, parts: Array) -> Array:
+    """Sum up parts (S, 5, 5) with weights (..., S), (..., 5, 5)."""
     return np.asarray(shares @ parts.reshape(-1, 25)).reshape(*shares.shape[:-1], 5, 5)
 
 
-def _hardly_told(cells: _Cells, growth: float) -> Array:
+def _small_sample_widening(cells: _Cells, growth: float) -> Array:
     """
-    Give by what (5, 5), over a size of one, few cells make a covariance less sure.
+    Return the widening (5, 5), over a size of one, of a covariance that few cells determine.
 
-    How large the noise is, v errors tell, and the squared error over what they say is Fisher's F
-    of (5, v), whose bounds are wider than those of chi^2. C cells that are alike tell v = 5 C
-    errors; their shares of the whole, squared and summed up, are 1 / C. growth: by what the
-    variances grow as cells err alike; chosen: that leaves its root fewer.
+    The variance is estimated from v errors, and the squared error over it follows Fisher's F of
+    (5, v), whose bounds are wider than those of chi^2. C equal cells give v = 5 C errors; their
+    squared shares of the whole sum up to 1 / C. growth: factor of the variances due to correlated
+    errors; chosen: it reduces v by its square root.
     """
     root = np.linalg.cholesky(cells.inverse)
     shares = root.T @ cells.H @ root
-    few, axes = np.linalg.eigh(_LONG_TAILS * np.sqrt(growth) * (shares @ shares).sum(0))
-    # One error is the least that tells a variance.
-    told = 5 / np.clip(few, 1e-9, 5.0)
-    wider = 5 * fdtri(5, told, _TOLD_AT) / _BOUND_TOLD
+    few, axes = np.linalg.eigh(_KURTOSIS_FACTOR * np.sqrt(growth) * (shares @ shares).sum(0))
+    # At least one degree of freedom.
+    freedom = 5 / np.clip(few, 1e-9, 5.0)
+    wider = 5 * fdtri(5, freedom, _CONFIDENCE) / _CHI2_CONFIDENCE
     half = root @ axes
     return np.asarray((half * (wider - 1)) @ half.T)
 
 
-def _summed_up(H: Array, places: Array, J: Array, weights: Array, r: Array
-               ) -> tuple[_Cells, Array, Array]:
-    """Give small cells, and pulls and products of cells of all sides: see `sums_of_cells`."""
+def _summed_by_cell(H: Array, places: Array, J: Array, weights: Array, r: Array
+                    ) -> tuple[_Cells, Array, Array]:
+    """Return small cells, and pulls and products of cells of all sides: see `sums_of_cells`."""
     order, codes = _along_curve(places)
     sums, first, pulls, products = sums_of_cells(J, weights, r, order, codes)
     middles = (places[order[first]] // CELL + 0.5) * CELL
@@ -392,58 +390,58 @@ def _summed_up(H: Array, places: Array, J: Array, weights: Array, r: Array
 def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
                   codes: NDArray[np.uint64]) -> tuple[Array, NDArray[np.int64], Array, Array]:
     """
-    Sum up what matches tell by cells in cells.
+    Sum up the terms of matches over nested cells.
 
-    J (5, N), weights and r (N,) of matches; order, codes: (N,) from `_along_curve`. Gives of small
-    cells their sums (27, C), see `_Cells`, and the first (C,) of their matches in order. And of
-    cells of each side, from the smallest on, sums of products: pulls (S, 5, 5) of how gradients
-    change where all residuals of a cell grow alike, and squares (S, 2) of weighted residuals and
-    of weights.
+    J (5, N), weights and r (N,) of matches; order, codes: (N,) from `_along_curve`. Returns for
+    small cells their sums (27, C), see `_Cells`, and the first (C,) of their matches in order; and
+    for cells of each side, from the smallest on, sums of products: pulls (S, 5, 5) of the
+    derivatives of the gradients by a common shift of a cell's residuals, and squares (S, 2) of
+    weighted residuals and of weights.
     """
     if compiled.library is not None:
-        return compiled.sums_of_cells(J, weights, r, order, codes, _SIDES, _SMALL)
-    terms = _terms(J.take(order, axis=1), weights[order], r[order])
-    # Cells of a side are the same where all bits above those of the places in them are.
+        return compiled.sums_of_cells(J, weights, r, order, codes, _SIDE_COUNT, _SMALL_CELLS)
+    terms = _match_terms(J.take(order, axis=1), weights[order], r[order])
+    # Two places are in the same cell of a side if their codes agree in all bits above it.
     differing = np.append(np.uint64(2**64 - 1), codes[1:] ^ codes[:-1])
-    nested = [np.flatnonzero(differing >= 4**side) for side in range(_SIDES)]
+    nested = [np.flatnonzero(differing >= 4**side) for side in range(_SIDE_COUNT)]
     by_side = [np.add.reduceat(terms[20:], first, axis=1) for first in nested]
-    return (np.add.reduceat(terms, nested[_SMALL], axis=1), nested[_SMALL],
+    return (np.add.reduceat(terms, nested[_SMALL_CELLS], axis=1), nested[_SMALL_CELLS],
             np.array([sums[:5] @ sums[:5].T for sums in by_side]),
             np.array([(sums[5:]**2).sum(1) for sums in by_side]))
 
 
 def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
     """
-    Tell how a pose would move without the matches of each of C cells, to first order.
+    Return the shifts of the pose without the matches of each of C cells, to first order.
 
-    whole: (5, 5) H of all; sums: (27, C), see `_Cells`; what is left of H without any of them is
-    positive definite. Gives moves (5, C), and the sum (5, 5) of the inverses of what is left.
+    whole: (5, 5) H of all; sums: (27, C), see `_Cells`; H without any cell has to be positive
+    definite. Returns the shifts (5, C), and the sum (5, 5) of the inverses of H without each cell.
     """
     if compiled.library is not None:
         return compiled.without_each(whole, sums)
-    left = np.asarray(np.linalg.inv(whole - sums[_WHOLE].T.reshape(-1, 5, 5)))
+    left = np.asarray(np.linalg.inv(whole - sums[_FULL].T.reshape(-1, 5, 5)))
     return np.einsum('cij,jc->ic', left, sums[15:20]), left.sum(0)
 
 
-def _terms(J: Array, weights: Array, r: Array) -> Array:
-    """Give what ``_Cells`` sums up (27, N) of matches, by their J (5, N), weights and r (N,)."""
-    weighed, (rows, columns) = J * weights, _UPPER
-    return np.concatenate([J[rows] * weighed[columns], weighed * r, weighed,
+def _match_terms(J: Array, weights: Array, r: Array) -> Array:
+    """Return the terms (27, N) that ``_Cells`` sums up, from J (5, N), weights and r (N,)."""
+    weighted, (rows, columns) = J * weights, _UPPER
+    return np.concatenate([J[rows] * weighted[columns], weighted * r, weighted,
                            [weights * r, weights]])
 
 
 def _along_curve(places: Array) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
     """
-    Order points (N, 2) by cells in cells in cells; gives that, and codes (N,) of these in it.
+    Order points (N, 2) by nested cells; returns the order, and the sorted codes (N,).
 
-    Along Morton's curve, which interleaves the bits of columns and rows, points of one cell of any
-    of the sides come one after the other.
+    Along the Morton curve, which interleaves the bits of columns and rows, points of one cell of
+    any side are contiguous.
     """
-    cells = np.floor(places / _SMALLEST).astype(np.int64)
-    # From the corner of one of the largest on, codes are short.
-    cells -= cells.min(0) >> _SIDES - 1 << _SIDES - 1
+    cells = np.floor(places / _SMALLEST_SIDE).astype(np.int64)
+    # Relative to the corner of a cell of the largest side, codes are short.
+    cells -= cells.min(0) >> _SIDE_COUNT - 1 << _SIDE_COUNT - 1
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         cells = (cells | cells << shift) & mask
-    code = short(cells[:, 0] | cells[:, 1] << 1)
+    code = in_few_bytes(cells[:, 0] | cells[:, 1] << 1)
     order = np.argsort(code, kind='stable')
     return order, code[order].astype(np.uint64)

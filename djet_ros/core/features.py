@@ -1,4 +1,4 @@
-"""ORB detection (paper, "Descriptor"), and matching by the descriptors of any features."""
+"""ORB detection (paper, "Descriptor"), and descriptor matching of any features."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from itertools import pairwise
 import cv2
 from djet_ros import compiled
 from djet_ros.core.masks import Mask
-from djet_ros.core.parallel import both, each
+from djet_ros.core.parallel import each, run_both
 from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
 
-# Features of the previous image that are compared at once; bounds the memory of a comparison.
+# Number of features of the previous image that are compared at once, which bounds the memory.
 _STRIP = 64
 
-# How many octaves of ORB's pyramid a feature may change: one more is a factor of 1.2 in size.
-_OCTAVES = 1
+# Maximum change of the octave of a feature: one is a factor of 1.2 in size.
+_MAX_OCTAVE_CHANGE = 1
 
-# Bits that a feature at the search radius has to agree in beyond one that has not moved.
+# Bits by which a feature at the search radius has to be more similar than one at the predicted
+# place.
 _DISTANCE_BITS = 32
 
 
 def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int = 20,
                mask: Mask | None = None) -> Features:
     """
-    Detect ORB features in a gray image (H, W) uint8; images too small for one give none.
+    Detect ORB features in a gray image (H, W) uint8; none in images too small for a descriptor.
 
-    The descriptors are the usual rotated ones: the initial matching needs their robustness, the
-    residual surfaces use unrotated ones (`djet_ros.core.hamming`). mask: (H, W) bool, where no
-    feature may be.
+    The descriptors are the usual rotated ones, for robust initial matching; the residual surfaces
+    use unrotated ones (`djet_ros.core.hamming`). mask: (H, W) bool, True where no feature may be.
     """
     orb = cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
     keypoints: Sequence[cv2.KeyPoint] = ()
@@ -50,9 +50,9 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
 
 def match_everywhere(previous: Features, current: Features) -> NDArray[np.int64]:
     """
-    Match all features with all by Hamming distance, with cross-check, as the paper does.
+    Match all features with all by Hamming distance, with cross-check, as in the paper.
 
-    Gives (M, 2) indices into the previous and the current features, in the order of the former.
+    Returns (M, 2) indices into the previous and the current features, in the order of the former.
     """
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)
@@ -64,20 +64,20 @@ def match_everywhere(previous: Features, current: Features) -> NDArray[np.int64]
 def match_nearby(previous: Features, current: Features,
                  search_radius: float) -> NDArray[np.int64]:
     """
-    Match by Hamming distance with cross-check, among features at most search_radius pixels apart.
+    Match features within search_radius pixels by Hamming distance, with cross-check.
 
-    Gives (M, 2) indices into the previous and the current features, the most similar ones first.
-    Only features of like size are compared, and the nearer of two that look alike is preferred.
-    Strips of the image are compared: several times faster than brute force over all pairs, and
-    with fewer chances to be wrong.
+    Returns (M, 2) indices into the previous and the current features, the most similar first. Only
+    features of similar octave are compared, and of two similar ones the nearer is preferred. The
+    comparison runs over strips of the image: several times faster than brute force over all pairs,
+    and with fewer false matches.
     """
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)
-    rows, columns = _by_octave_and_column(previous), _by_octave_and_column(current)
+    rows, columns = _octave_column_order(previous), _octave_column_order(current)
     there, here = previous.points[rows], current.points[columns]
-    strips = _neighbourhoods(previous.octaves[rows], there[:, 0], current.octaves[columns],
-                             here[:, 0], search_radius)
-    # Keeps the numbers small: single precision is enough.
+    strips = _search_strips(previous.octaves[rows], there[:, 0], current.octaves[columns],
+                            here[:, 0], search_radius)
+    # Small numbers: single precision suffices.
     centre, weight = there.mean(0), np.sqrt(_DISTANCE_BITS / 2) / search_radius
     claim, best_there, best_here = most_similar(
         strips, (previous.descriptors[rows], (there - centre) * weight),
@@ -94,20 +94,20 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
     """
     Find the most similar features in strips of two images.
 
-    there, here: descriptors (N, 32) and places (N, 2) of N and of M features; strips: (S, 4), of
-    those there the first and the one after the last, and of those here that they are compared
-    with. Similarity is 64 - Hamming distance / 2 - distance of places^2. Gives which of here each
-    of there is most similar to (N,), -1 where it is compared with none, how similar (N,), and how
-    similar each of here is at most (M,).
+    there, here: descriptors (N, 32) and places (N, 2) of N and of M features; strips: (S, 4), each
+    the range [first, after) of those there, and the range of those here to compare with.
+    Similarity is 64 - Hamming distance / 2 - distance of places^2. Returns the index of the most
+    similar here for each there (N,), -1 if it is compared with none, its similarity (N,), and the
+    highest similarity of each here (M,).
     """
     if compiled.library is not None:
         return compiled.most_similar(strips, there, here)
     claim = np.full(len(there[0]), -1)
     best_there = np.full(len(there[0]), -np.inf, np.float32)
     best_here = np.full(len(here[0]), -np.inf, np.float32)
-    left, right = _comparable(there, here)
+    left, right = _similarity_factors(there, here)
     bounds = [(slice(*strip[:2]), slice(*strip[2:])) for strip in strips.tolist()]
-    compared = each(lambda two: _compare(left[two[0]], right[two[1]]), bounds)
+    compared = each(lambda two: _best_matches(left[two[0]], right[two[1]]), bounds)
     for (strip, near), (nearest, highest, highest_here) in zip(bounds, compared):
         claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
         np.maximum(best_there[strip], highest, out=best_there[strip])
@@ -116,7 +116,7 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
 
 
 def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Keep the first of matches (M, 2) that share a feature, as twins do."""
+    """Keep the first of matches (M, 2) that share a feature, as identical descriptors do."""
     for side in (0, 1):
         first = np.full(matches[:, side].max(initial=-1) + 1, len(matches))
         np.minimum.at(first, matches[:, side], np.arange(len(matches)))
@@ -124,33 +124,34 @@ def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
     return matches
 
 
-def _compare(left: NDArray[np.float32], right: NDArray[np.float32],
-             ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """Which of the right each of the left is most similar to, how similar, and vice versa."""
+def _best_matches(left: NDArray[np.float32], right: NDArray[np.float32],
+                  ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the best of `right` for each of `left`, its similarity, and the reverse."""
     similarity = left @ right.T
     nearest = similarity.argmax(1)
     return nearest, similarity[np.arange(len(nearest)), nearest], similarity.max(0)
 
 
-def _by_octave_and_column(features: Features) -> NDArray[np.int64]:
+def _octave_column_order(features: Features) -> NDArray[np.int64]:
     return np.lexsort((features.points[:, 0], features.octaves))
 
 
-def _comparable(there: tuple[NDArray[np.uint8], Array], here: tuple[NDArray[np.uint8], Array]
-                ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Give factors (N, 260) and (M, 260) whose product is the similarity of features."""
+def _similarity_factors(there: tuple[NDArray[np.uint8], Array],
+                        here: tuple[NDArray[np.uint8], Array]
+                        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return factors (N, 260) and (M, 260) whose product is the similarity of features."""
     (one, a), (other, b) = there, here
     one_a, one_b = np.ones((len(a), 1)), np.ones((len(b), 1))
     square_a, square_b = ((p * p).sum(1, keepdims=True) for p in (a, b))
-    return both(lambda: factor(one, 2 * a, -square_a, -one_a),
-                lambda: factor(other, b, one_b, square_b))
+    return run_both(lambda: signed_bits(one, 2 * a, -square_a, -one_a),
+                    lambda: signed_bits(other, b, one_b, square_b))
 
 
-def factor(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32]:
+def signed_bits(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32]:
     """
-    Bits (N, 256) as +-1/2, so that their products count the differing ones; then other columns.
+    Return descriptor bits (N, 256) as +-1/2, with further columns appended.
 
-    The product of two is 64 - Hamming distance / 2.
+    The product of two of them is 64 - Hamming distance / 2.
     """
     columns = 256 + sum(place.shape[1] for place in places)
     whole = np.empty((len(descriptors), columns), np.float32)
@@ -160,13 +161,13 @@ def factor(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.float32
     return whole
 
 
-def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,
-                    octaves_here: NDArray[np.int32], x_here: Array,
-                    search_radius: float) -> NDArray[np.int64]:
+def _search_strips(octaves_there: NDArray[np.int32], x_there: Array,
+                   octaves_here: NDArray[np.int32], x_here: Array,
+                   search_radius: float) -> NDArray[np.int64]:
     """
-    Give strips (S, 4) of features of one octave, each with those in the other image to compare.
+    Return strips (S, 4) of features of one octave with the range of candidates in the other image.
 
-    As in `most_similar`. Features are ordered by octaves, and by columns x within these.
+    As in `most_similar`. Features are sorted by octave, and by column x within these.
     """
     found = [np.empty((0, 4), np.int64)]
     for octave in np.unique(octaves_there).tolist():
@@ -174,9 +175,9 @@ def _neighbourhoods(octaves_there: NDArray[np.int32], x_there: Array,
         first = np.arange(start, end, _STRIP)
         last = np.minimum(first + _STRIP, end)
         reach = x_there[first] - search_radius, x_there[last - 1] + search_radius
-        others = np.arange(octave - _OCTAVES, octave + _OCTAVES + 2)
+        others = np.arange(octave - _MAX_OCTAVE_CHANGE, octave + _MAX_OCTAVE_CHANGE + 2)
         bounds = octaves_here.searchsorted(others)
-        # Of a strip, one octave after the other.
+        # Ordered by strip, then by octave.
         strips = np.stack([np.stack([first, last, *(
             there + x_here[there:after].searchsorted(x) for x in reach)], axis=1)
             for there, after in pairwise(bounds)], axis=1).reshape(-1, 4)

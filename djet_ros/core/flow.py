@@ -1,8 +1,8 @@
 """
-Where places of one view are in the next by the flow of the image (Lucas and Kanade, IJCAI 1981).
+Tracking of features by pyramidal optical flow (Lucas and Kanade, IJCAI 1981).
 
-It needs no corner there, and is exact to a tenth of a pixel; it only goes astray where the image
-moves farther than its windows reach, or by its lighting.
+It needs no corner in the second image and is accurate to a tenth of a pixel; it fails if the
+displacement exceeds the reach of its windows, or if the lighting changes.
 """
 
 from __future__ import annotations
@@ -13,38 +13,36 @@ from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
 
-# Side of the window in pixels: the smaller the more exact, and OpenCV takes so many at once.
+# Side of the window in pixels: a smaller one is more accurate; OpenCV processes 8 pixels at once.
 _WINDOW = 8
 
-# Levels of the pyramid on the way there, each twice as coarse: where places are foreseen, and
-# where they are not.
-NEAR, FAR = 2, 3
+# Pyramid levels above full resolution: with predicted places, and without.
+NEAR_LEVELS, FAR_LEVELS = 2, 3
 
-# Steps at each level at most, and pixels of a step that is the last. Patches refine it: more of
-# them add nothing.
+# Maximum number of steps at each level, and the step in pixels at which it converges. Patch
+# alignment refines the result: more steps do not help.
 _STEPS, _LAST_STEP = 4, 0.1
 
-# The way back only has to tell whether it leads near the beginning, by as many pixels.
-_STEPS_BACK, _LAST_STEP_BACK, _THERE_AND_BACK = 3, 0.1, 1.0
+# The same for tracking back, which only has to return within _MAX_ROUND_TRIP pixels of the start.
+_STEPS_BACK, _LAST_STEP_BACK, _MAX_ROUND_TRIP = 3, 0.1, 1.0
 
-# Bits in which both places differ at most: those that have nothing to do with one another differ
-# by 128.
-_ALIKE = 80
+# Maximum descriptor distance in bits; unrelated places differ by 128.
+_MAX_BITS = 80
 
 
-def reach_of_levels(levels: int) -> float:
-    """Tell to how many pixels from where it starts the flow leads."""
+def flow_reach(levels: int) -> float:
+    """Return the largest displacement in pixels that the flow can follow."""
     return _WINDOW / 2 * float(2**levels)
 
 
-def follow(previous: View, current: View, start: Array, reach: float, levels: int = FAR
-           ) -> tuple[Array, Array]:
+def track_features(previous: View, current: View, start: Array, reach: float,
+                   levels: int = FAR_LEVELS) -> tuple[Array, Array]:
     """
-    Follow the features of the previous view from where they may be seen, pixels `start` (N, 2).
+    Track the features of the previous view from their expected pixels `start` (N, 2).
 
-    levels: of the pyramid, NEAR or FAR. Gives the pixels (N, 2) where they are, and the bits (N,)
-    in which descriptors differ there: infinitely many for those that are lost, which are farther
-    than `reach` from the start, do not lead back, or look otherwise.
+    levels: of the pyramid, NEAR_LEVELS or FAR_LEVELS. Returns the pixels (N, 2) in the current
+    view, and the descriptor distances (N,) in bits, infinite for features that are lost: farther
+    than `reach` from the start, not tracked back to where they came from, or too different.
     """
     points = previous.features.points
     bits = np.full(len(points), np.inf)
@@ -54,18 +52,18 @@ def follow(previous: View, current: View, start: Array, reach: float, levels: in
     began = x.take(near, axis=0)
     back, seen_back = _flow(current.gray, previous.gray, y.take(near, axis=0), began, 0,
                             _STEPS_BACK, _LAST_STEP_BACK)
-    good = near[seen_back & _within(_THERE_AND_BACK, back, began)]
+    good = near[seen_back & _within(_MAX_ROUND_TRIP, back, began)]
     places = y[:, 0].astype(np.float64)
     bits[good] = match_distances(previous.smoothed, points.take(good, axis=0), current.smoothed,
                                  places.take(good, axis=0))
-    # Not a number where a descriptor would leave the image.
-    bits[~(bits <= _ALIKE)] = np.inf
+    # NaN if the descriptor would leave the image.
+    bits[~(bits <= _MAX_BITS)] = np.inf
     return places, bits
 
 
 def _within(reach: float, places: NDArray[np.float32], others: NDArray[np.float32]
             ) -> NDArray[np.bool_]:
-    """(N,) bool mask of the places (N, 1, 2) that are nearer than a reach to others."""
+    """Return the (N,) bool mask of the places (N, 1, 2) that are nearer than a reach to others."""
     x, y = (places - others)[:, 0].T
     return np.asarray(np.sqrt(x * x + y * y) < reach)
 
@@ -73,12 +71,13 @@ def _within(reach: float, places: NDArray[np.float32], others: NDArray[np.float3
 def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32],
           start: NDArray[np.float32], levels: int, steps: int, last_step: float,
           ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Give where points (N, 1, 2) lead from where they may be, and (N,) whether they are seen."""
+    """Return the tracked points (N, 1, 2) from expected ones, and (N,) whether they were found."""
     if not len(points):
         return points, np.zeros(0, bool)
     found, seen, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, start.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, steps, last_step),
-        # In place of the eigenvalues, which it has, it would compare all patches once more.
+        # Without this flag OpenCV would compare all patches again; the eigenvalues are computed
+        # anyway.
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
     return np.asarray(found, np.float32), np.asarray(seen).ravel() > 0

@@ -1,9 +1,9 @@
 """
 Two-view geometry: rotations, the essential and fundamental matrix, epipolar lines, chirality.
 
-Convention everywhere in the core: x in the previous image A, y in the current image B, and
-``X_B = R X_A + t``, so that ``y^T F x = 0`` with F = K^-T [t]_x R K^-1 (paper, "Epipolar
-Constrained Tracking").
+Convention throughout the core: x in the previous image A, y in the current image B, and ``X_B = R
+X_A + t``, so that ``y^T F x = 0`` with F = K^-T [t]_x R K^-1 (paper, "Epipolar Constrained
+Tracking").
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-
-# The generators of rotations, (3, 3, 3): [e_i]_x.
+# Generators of SO(3), (3, 3, 3): [e_i]_x.
 GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
 
 
@@ -31,7 +30,7 @@ def rotation_exp(omega: Array) -> Array:
     """Rotation matrices (…, 3, 3) of rotation vectors, (3,) or (N, 3), in radians."""
     if omega.ndim == 1:  # Rodrigues' formula
         return np.asarray(cv2.Rodrigues(omega)[0])
-    # Of no turn at all, the quotients are 1 to the last bit.
+    # For a zero rotation the quotients are 1 to the last bit.
     half = np.maximum(np.sqrt((omega * omega).sum(1)) / 2, 1e-9)[:, None, None]
     turning, quotient = skew(omega), np.sin(half) / half
     # sin(a) / a and (1 - cos(a)) / a^2
@@ -42,7 +41,7 @@ def rotation_exp(omega: Array) -> Array:
 def rotation_log(R: Array) -> Array:
     """Rotation vectors (…, 3) in radians of rotation matrices, (3, 3) or (N, 3, 3)."""
     cosines = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
-    # Up to a quarter turn a rotation's odd part tells its axis, in a tenth of the time.
+    # Up to 90 degrees the antisymmetric part gives the axis, in a tenth of the time.
     if not (cosines > 0).all():
         return np.asarray(Rotation.from_matrix(R).as_rotvec())
     odd = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0],
@@ -60,7 +59,7 @@ def unit(v: Array) -> Array:
 
 def sphere_tangents(t: Array) -> Array:
     """
-    Give two orthonormal directions (…, 3, 2) perpendicular to unit vectors t, (3,) or (N, 3).
+    Return an orthonormal basis (…, 3, 2) of the tangent plane of unit vectors t, (3,) or (N, 3).
 
     Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017): no division by zero.
     """
@@ -74,9 +73,10 @@ def sphere_tangents(t: Array) -> Array:
 
 def sphere_log(t: Array, other: Array) -> Array:
     """
-    Step (2,) from a direction t (3,) to another, along its tangents, as long as the arc in rad.
+    Logarithm (2,) at t (3,) of another direction, in the basis of its tangents.
 
-    Opposite directions are half a turn apart; which way is taken then means nothing.
+    Its length is the arc in rad. For opposite directions that is pi, and the direction is
+    arbitrary.
     """
     tangents = sphere_tangents(t)
     across, along = tangents.T @ other, other @ t
@@ -87,7 +87,7 @@ def sphere_log(t: Array, other: Array) -> Array:
 
 
 def inverse_of(K: Array) -> Array:
-    """Inverse (3, 3) of a camera matrix (3, 3): each is asked for some fifty times a frame."""
+    """Return the inverse (3, 3) of a camera matrix, cached: it is used fifty times a frame."""
     return _inverse(np.asarray(K, float).tobytes())
 
 
@@ -99,9 +99,9 @@ def _inverse(matrix: bytes) -> Array:
 
 
 def rays(K: Array, points: Array) -> Array:
-    """Take pixels (N, 2) to their viewing rays K^-1 x (N, 3), with z = 1."""
+    """Return the viewing rays K^-1 x (N, 3) of pixels (N, 2), with z = 1."""
     K_inv = inverse_of(K)
-    # Components first: half of the time, and what is done with them mostly has them so.
+    # Component-major: half of the time, and the layout that most uses of them need.
     return np.asarray((K_inv[:, :2] @ points.T + K_inv[:, 2:]).T)
 
 
@@ -118,44 +118,44 @@ def fundamental(K: Array, R: Array, t: Array) -> Array:
 
 def epipolar_lines(F: Array, x: Array) -> Array:
     """Epipolar lines l = F x (N, 3) in image B, of pixels x (N, 2) of image A."""
-    # Components first, as in `rays`.
+    # Component-major, as in `rays`.
     return np.asarray((F[:, :2] @ x.T + F[:, 2:]).T)
 
 
 def line_distances(lines: Array, y: Array) -> Array:
     """Signed distances (N,) in pixels of points y (N, 2) to lines (N, 3)."""
     norm = np.hypot(lines[:, 0], lines[:, 1])
-    return np.asarray(values_on(lines, y) / np.maximum(norm, 1e-12))
+    return np.asarray(line_values(lines, y) / np.maximum(norm, 1e-12))
 
 
-def values_on(lines: Array, y: Array) -> Array:
-    """Values (N,) of lines (N, 3) at points y (N, 2): 0 where they pass through them."""
+def line_values(lines: Array, y: Array) -> Array:
+    """Values (N,) of lines (N, 3) at points y (N, 2): l^T y, 0 on the line."""
     return np.asarray(lines[:, 0] * y[:, 0] + lines[:, 1] * y[:, 1] + lines[:, 2])
 
 
 def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     """
-    Rotation R (3, 3) that alone brings rays x (N, 3) to rays y (N, 3), robustly.
+    Fit a rotation R (3, 3) that brings rays x (N, 3) to rays y (N, 3), robustly.
 
     Least squares over directions (Wahba's problem), reweighted by a Cauchy loss at the median
-    deviation, so that what moves or is near in part of the image does not turn it.
+    deviation, so that near points and moving objects in part of the image do not bias it.
     """
     if compiled.library is not None:
         return compiled.fit_rotation(rays_x, rays_y, rounds)
-    # Components first: a third of the time.
+    # Component-major: a third of the time.
     x, y = (one.T / np.sqrt(np.einsum('ij,ij->i', one, one)) for one in (rays_x, rays_y))
     R, weights, half = np.eye(3), np.ones(len(rays_x)), len(rays_x) // 2
     for _ in range(rounds):
         R = nearest_rotation((y * weights) @ x.T)
         off = y - R @ x
         squared = np.einsum('ij,ij->j', off, off)
-        # Half of them deviate by less than the median.
+        # The median of the squared deviations.
         weights = 1 / (1 + squared / max(float(np.partition(squared, half)[half]), 1e-18))
     return R
 
 
 def nearest_rotation(M: Array) -> Array:
-    """Give the rotation (3, 3) that is next to a matrix (3, 3), in the Frobenius norm."""
+    """Return the rotation (3, 3) nearest to a matrix (3, 3), in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)
     R = U @ Vt
     if np.linalg.det(R) < 0:
@@ -166,29 +166,29 @@ def nearest_rotation(M: Array) -> Array:
 
 def in_front(R: Array, t: Array, rays_x: Array, rays_y: Array) -> NDArray[np.bool_]:
     """
-    (N,) bool mask of the points with positive depth in both cameras (chirality).
+    Return the (N,) bool mask of points with positive depth in both cameras (chirality).
 
-    Only signs are taken, so that far points count like near ones: cv2.recoverPose ignores points
-    beyond 50 baselines and then decides forward motion on a handful.
+    Only signs count, so distant points count like near ones: cv2.recoverPose ignores points beyond
+    50 baselines and then decides forward motion on a handful.
     """
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     return np.asarray((depth_x > 0) & (depth_y > 0))
 
 
-def sides(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
-    """Sign (N,) of t that brings each point to the front of both cameras, 0 where neither does."""
-    # The other sign of t has all depths the other way round.
+def chirality_signs(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
+    """Sign (N,) of t that brings each point in front of both cameras, 0 if neither does."""
+    # The opposite t negates all depths.
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     ahead, behind = ((depth_x > 0) & (depth_y > 0), (depth_x < 0) & (depth_y < 0))
     return ahead.astype(float) - behind
 
 
-def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
+def depth_ratio(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
     """
-    (N,) how many times larger the surroundings of points are seen in B than in A.
+    Return the depths in A over the depths in B (N,): the magnification of a point's neighbourhood.
 
-    That is depth in A over depth in B, whatever the length and the sign of t: next to 1 for far
-    points, negative where a point is in front of one camera alone, NaN where it is anywhere.
+    It depends neither on the length nor on the sign of t: close to 1 for distant points, negative
+    for a point in front of one camera only, NaN if the depth is undetermined.
     """
     depth_x, depth_y = _scaled_depths(R, t, rays_x, rays_y)
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -197,67 +197,68 @@ def growth(R: Array, t: Array, rays_x: Array, rays_y: Array) -> Array:
 
 def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
     """
-    Inverse depths (N,) in A of matched rays (N, 3) with z = 1, one over the unit of t.
+    Triangulate inverse depths (N,) in A of matched rays (N, 3) with z = 1, in units of 1 / |t|.
 
-    By least squares of y x (R x + rho t) = 0, which is linear: noise about zero stays about zero.
-    Also gives their standard deviations (N,), a unit of noise in both x and y of rays in B.
+    By least squares of y x (R x + rho t) = 0, which is linear in rho: noise around zero stays
+    unbiased. Also returns their standard deviations (N,) for unit noise in both x and y of the
+    rays in B.
 
-    With s = y x R x, l = y x t and d = Z_B / Z_A, so that R x + rho t = d y, a ray that errs by
-    e = (e_x, e_y, 0) changes s + rho l by d (e x y), and what is least rho = -s.l / l^2 by
+    With s = y x R x, l = y x t and d = Z_B / Z_A, so that R x + rho t = d y, an error e =
+    (e_x, e_y, 0) of a ray changes s + rho l by d (e x y), and the minimum rho = -s.l / l^2 by
 
         -l.(d (e x y)) / l^2 = -d e.(y x l) / l^2.
     """
-    # Components first: a third of the time of np.cross.
+    # Component-wise: a third of the time of np.cross.
     (m1, m2, m3), (y1, y2, y3), (t1, t2, t3) = R @ rays_x.T, rays_y.T, t
     s1, s2, s3 = y2 * m3 - y3 * m2, y3 * m1 - y1 * m3, y1 * m2 - y2 * m1
     l1, l2, l3 = y2 * t3 - y3 * t2, y3 * t1 - y1 * t3, y1 * t2 - y2 * t1
     squared = np.maximum(l1 * l1 + l2 * l2 + l3 * l3, 1e-12)
     rho = -(s1 * l1 + s2 * l2 + s3 * l3) / squared
     p1, p2 = y2 * l3 - y3 * l2, y3 * l1 - y1 * l3
-    # At least as long as l, but for where both vanish, on the epipole.
+    # Not shorter than l, except at the epipole, where both vanish.
     pulled = np.sqrt(np.maximum(p1 * p1 + p2 * p2, squared))
     return rho, np.abs(m3 + rho * t3) * pulled / squared
 
 
-def patch_warp(K: Array, R: Array, y: Array, growth: Array) -> Array:
+def patch_warp(K: Array, R: Array, y: Array, depth_ratio: Array) -> Array:
     """
-    (N, 3, 2) local homographies: how patches that face camera A are seen in B.
+    Return the local homographies (N, 3, 2) of patches that are fronto-parallel in A, as seen in B.
 
-    R: (3, 3), or (N, 3, 3) from several cameras A; y: (N, 2) pixels in B; growth: (N,) see there.
-    Depth is taken to be the same all over a patch, so that with M = K R K^-1 and
-    y = (M x Z_A + K t) / Z_B, a step dx leads exactly to
+    R: (3, 3), or (N, 3, 3) from several cameras A; y: (N, 2) pixels in B; depth_ratio: (N,), see
+    there. Depth is constant over a patch, so that with M = K R K^-1 and y = (M x Z_A + K t) / Z_B,
+    a step dx leads exactly to
 
         dy = W dx / (1 + c^T dx),   W = Z_A / Z_B (M_12 - y m_3^T),   c = Z_A / Z_B m_3,
 
     with M_12 the first two rows of M and m_3 the third, of two entries each. The first two rows of
-    a warp are W, the derivative dy/dx, and the third is c, the share by which depth in B grows a
-    pixel.
+    a warp are W, the derivative dy/dx, and the third is c, the relative change of the depth in B
+    per pixel.
     """
     M = K @ R @ inverse_of(K)
     warp = np.empty((len(y), 3, 2))
     warp[:, :2] = M[..., :2, :2] - y[:, :, None] * M[..., 2:, :2]
     warp[:, 2] = M[..., 2, :2]
-    return np.asarray(growth[:, None, None] * warp)
+    return np.asarray(depth_ratio[:, None, None] * warp)
 
 
-def slant_warp(K: Array, t: Array, y: Array, growth: Array, slope: Array) -> Array:
+def slant_warp(K: Array, t: Array, y: Array, depth_ratio: Array, slope: Array) -> Array:
     """
-    (N, 3, 2) what `patch_warp` lacks where patches do not face the camera.
+    Return the terms (N, 3, 2) to add to `patch_warp` for slanted patches.
 
-    t: (3,) or (N, 3) translation to B; slope: (N, 2) how inverse depth in A, over the unit of t,
-    changes a pixel: all over a plane alike, so that their sum is the homography of it. Of
-    y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is Z_A / Z_B ((K t)_12 - y t_3), and
-    that of the denominator is t_3.
+    t: (3,) or (N, 3) translation to B; slope: (N, 2) derivative of the inverse depth in A, in
+    units of 1 / |t|, per pixel; it is constant on a plane, so that the sum is the plane's
+    homography. With y = (M x + rho K t) / (Z_B / Z_A), the derivative by rho is Z_A / Z_B
+    ((K t)_12 - y t_3), and that of the denominator is t_3.
     """
     shift = t @ K.T
     by_depth = np.empty((len(y), 3))
     by_depth[:, :2] = shift[..., :2] - y * shift[..., 2:]
     by_depth[:, 2] = shift[..., 2]
-    return np.asarray((growth[:, None] * by_depth)[:, :, None] * slope[:, None])
+    return np.asarray((depth_ratio[:, None] * by_depth)[:, :, None] * slope[:, None])
 
 
 def inverses(A: Array) -> Array:
-    """Invert matrices (N, 2, 2) that are not singular: ten times as fast as one by one."""
+    """Invert regular matrices (N, 2, 2) in closed form: ten times as fast as one by one."""
     a, b, c, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1]
     area, inverse = a * d - b * c, np.empty(A.shape)
     inverse[:, 0, 0], inverse[:, 1, 1] = d / area, a / area
@@ -266,7 +267,7 @@ def inverses(A: Array) -> Array:
 
 
 def stretches(warp: Array) -> tuple[Array, Array]:
-    """Give by how much warps (N, 2, 2) stretch at least and at most, (N,) each."""
+    """Return the smallest and the largest singular values (N,) of matrices (N, 2, 2)."""
     size = (warp**2).sum((1, 2))
     area = np.abs(warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])
     both, apart = np.sqrt(size + 2 * area), np.sqrt(np.maximum(size - 2 * area, 0))
@@ -274,8 +275,8 @@ def stretches(warp: Array) -> tuple[Array, Array]:
 
 
 def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:
-    """Depths (N,) in A and in B, both times the same positive number for a point."""
-    # Components first: a third of the time of np.cross.
+    """Return depths (N,) in A and in B, both up to one positive factor per point."""
+    # Component-wise: a third of the time of np.cross.
     (m1, m2, m3), (y1, y2, y3), (t1, t2, t3) = R @ rays_x.T, rays_y.T, t
     n1, n2, n3 = m2 * y3 - m3 * y2, m3 * y1 - m1 * y3, m1 * y2 - m2 * y1
     # (t x v) . n = v . (n x t)
@@ -289,5 +290,5 @@ def rotation_angle(Ra: Array, Rb: Array) -> float:
 
 
 def direction_angle(ta: Array, tb: Array) -> float:
-    """Angle in radians between two directions (there: the error of the translation)."""
+    """Angle in radians between two directions (there: the translation error)."""
     return float(np.arctan2(np.linalg.norm(np.cross(ta, tb)), np.dot(ta, tb)))

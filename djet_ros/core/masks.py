@@ -1,4 +1,4 @@
-"""Parts of an image that nothing is to be told from: the robot's own body, things that move."""
+"""Masks of image regions to ignore: the robot's own body, moving objects."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ Mask = NDArray[np.bool_]
 
 def blocked(left_out: Mask) -> Mask:
     """
-    (H, W) bool, where no descriptor may stand: next to a pixel (H, W) bool that is left out.
+    Return the mask (H, W) where no descriptor may be: `left_out` (H, W), dilated by its reach.
 
     A descriptor compares places up to REACH pixels away, the outermost most often: at the edge of
-    a mask half of its tests would be about what is masked, 6 pixels away still a third. So the
-    whole patch has to be free. What a surface samples beyond that, two pixels to each side, the
-    patch of its middle has all around it as well, and the matches' own weights deal with it.
+    a mask half of its tests would compare masked pixels, 6 pixels away still a third. So the whole
+    patch has to be free. A surface samples two more pixels to each side, but the patch at its
+    centre is unmasked, and the weights of matches handle the rest.
     """
     side = 2 * REACH + 1
     return np.asarray(cv2.dilate(left_out.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def at(mask: Mask | None, points: NDArray[np.float64] | NDArray[np.int64]) -> Mask:
-    """(N,) bool, the mask next to points (N, 2) in pixels; False beyond it, or without one."""
+    """Return the mask at points (N, 2) in pixels, (N,) bool; False outside or without one."""
     result = np.zeros(len(points), bool)
     if mask is None or not len(points):
         return result

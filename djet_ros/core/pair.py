@@ -1,4 +1,4 @@
-"""All that is given of a pair, before anything is estimated, and who looks on."""
+"""The input of the estimation of one pair: views, matches and prior knowledge."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 @dataclass(frozen=True)
 class Round:
     """
-    One round of Algorithm 1 on N matches, as an observer is shown it.
+    One round of Algorithm 1 on N matches, as passed to an observer.
 
     keypoints: (N, 2) pixels around which the surfaces were sampled; fits: the paraboloids there;
-    warp: (N, 3, 2) through which the reference patches were seen, None where they were not warped;
-    pose: the one found on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
+    warp: (N, 3, 2) patch warps under which the reference patches were sampled, None if unwarped;
+    pose: the pose estimated on them; optimum: (N, 2) the places y + v_opt on its epipolar lines.
     """
 
     keypoints: Array
@@ -32,14 +32,14 @@ class Round:
 @dataclass(frozen=True)
 class Limits:
     """
-    What a pair has to keep to that goes on as the one before it did.
+    Limits on a pair whose matches were predicted by the previous motion.
 
-    noise: at most so large may the robust standard deviation of its matches from their epipolar
-    lines be, in pixels; agreeing: more than this share of its matches have to agree.
+    max_noise: bound of the robust standard deviation of the matches' distances from their epipolar
+    lines, in pixels; min_agreeing: share of the matches that have to agree.
     """
 
-    noise: float = np.inf
-    agreeing: float = 0.0
+    max_noise: float = np.inf
+    min_agreeing: float = 0.0
 
 
 Observer = Callable[[Round], None]
@@ -48,26 +48,26 @@ Observer = Callable[[Round], None]
 @dataclass(frozen=True)
 class Pair:
     """
-    Two views, matches of them, and what is known of their motion.
+    Two views, their matches, and prior knowledge of their motion.
 
-    x, y: (N, 2) matched pixels of the previous and the current view, the surest first; before: the
-    motion before this one; known: what others than the images tell; ahead: a motion from which the
-    matches were followed, so that its basin will do as a start where none other comes near, its t
-    may be zeros; limits: beyond these it is given up; bits: (N,) in which descriptors at x and y
-    differ, where that is known already; covariances: (N, 2, 2) of y, up to a common factor, which
-    re-projection errors count by, all alike where they are not told; sought: of how many features,
-    see ``RelativePose``; outliers: how many matches more there were, which do not agree with a
-    starting pose; observe: is shown each round of Algorithm 1; timings: gets the seconds of each
-    stage.
+    x, y: (N, 2) matched pixels of the previous and the current view, the most reliable first;
+    prior: the previous motion; known: measurements from other sources than the images; predicted:
+    a motion from which the matches were predicted, around which basins are sought in place of
+    other starts (t may be zeros); limits: the estimation gives up beyond these; bits: (N,)
+    descriptor distances at x and y, if known already; covariances: (N, 2, 2) of y up to a common
+    factor, which weight re-projection errors, all alike if None; sought: number of features that
+    were searched, see ``RelativePose``; outliers: number of matches removed before as outliers of
+    a starting pose; observe: called with each round of Algorithm 1; timings: receives the seconds
+    of each stage.
     """
 
     previous: View
     current: View
     x: Array
     y: Array
-    before: Pose | None = None
+    prior: Pose | None = None
     known: Known = field(default_factory=Known)
-    ahead: Pose | None = None
+    predicted: Pose | None = None
     limits: Limits = field(default_factory=Limits)
     bits: Array | None = None
     covariances: Array | None = None
@@ -77,10 +77,10 @@ class Pair:
     timings: dict[str, float] = field(default_factory=dict)
 
     def without(self, some: NDArray[np.bool_]) -> Pair:
-        """Give the pair without some (N,) of its matches, as outliers; its start is open."""
-        def left(values: Array | None) -> Array | None:
+        """Return the pair without some (N,) of its matches, as outliers, and not predicted."""
+        def rest(values: Array | None) -> Array | None:
             return None if values is None else values[~some]
 
-        return replace(self, x=self.x[~some], y=self.y[~some], bits=left(self.bits),
-                       covariances=left(self.covariances), ahead=None,
+        return replace(self, x=self.x[~some], y=self.y[~some], bits=rest(self.bits),
+                       covariances=rest(self.covariances), predicted=None,
                        outliers=self.outliers + int(some.sum()))

@@ -1,9 +1,8 @@
 """
-Work side by side in two threads, if OpenCV may take as many (``cv2.setNumThreads``).
+Parallel execution in two threads, if OpenCV may use as many (``cv2.setNumThreads``).
 
-NumPy and OpenCV let go of the interpreter while they work on arrays of some size; what is left
-to the interpreter keeps more than two threads from being of use. Results are those of doing
-things in turn.
+NumPy and OpenCV release the interpreter lock while they work on larger arrays; the remaining
+Python code makes more than two threads useless. Results are the same as in sequence.
 """
 
 from __future__ import annotations
@@ -20,55 +19,56 @@ Second = TypeVar('Second')
 Task = TypeVar('Task')
 Result = TypeVar('Result')
 
-# Kept, as it takes longer to make a thread than to do much of what these do.
-_others = ThreadPoolExecutor(4, 'djet')
+# Kept alive, as starting a thread takes longer than most of these tasks.
+_pool = ThreadPoolExecutor(4, 'djet')
 
-# Whether this is something that was begun beside something else: no core is left for more.
-_beside = ContextVar('beside', default=False)
+# Whether the current task runs in the background already: no core is left for more.
+_in_background = ContextVar('in_background', default=False)
 
 
-def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
-    """Do two things at once, the first of them in the calling thread."""
-    if cv2.getNumThreads() < 2 or _beside.get():
+def run_both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Run two functions in parallel, the first of them in the calling thread."""
+    if cv2.getNumThreads() < 2 or _in_background.get():
         return first(), second()
-    later = _others.submit(second)
+    later = _pool.submit(second)
     try:
         done = first()
     finally:
-        # What nobody has begun is done here: so no two can wait for one another.
-        begun = not later.cancel()
-        if begun:
+        # A task that no thread has started runs here, so no two can wait for one another.
+        running = not later.cancel()
+        if running:
             wait([later])
-    return done, later.result() if begun else second()
+    return done, later.result() if running else second()
 
 
 def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
-    """Do the same with each of many small tasks, in two shares; results in their order."""
+    """Map a function over many small tasks in two threads; results in the order of the tasks."""
     if len(tasks) < 2:
         return [work(task) for task in tasks]
 
     def share(first: int) -> list[Result]:
         return [work(task) for task in tasks[first::2]]
 
-    shares = both(lambda: share(0), lambda: share(1))
+    shares = run_both(lambda: share(0), lambda: share(1))
     return [shares[i % 2][i // 2] for i in range(len(tasks))]
 
 
 def started_beside(work: Callable[[], Result]) -> Callable[[], Result]:
     """
-    Start something that is needed later; gives what waits for its result, to be called once.
+    Start a function in the background; returns a function to call once for its result.
 
-    Where there is one thread, or none had time to begin it, it is done when it is needed.
+    With a single thread, or if no thread was free to start it, it runs when its result is
+    requested.
     """
     if cv2.getNumThreads() < 2:
         return work
 
-    def beside() -> Result:
-        token = _beside.set(True)
+    def task() -> Result:
+        token = _in_background.set(True)
         try:
             return work()
         finally:
-            _beside.reset(token)
+            _in_background.reset(token)
 
-    later = _others.submit(beside)
+    later = _pool.submit(task)
     return lambda: work() if later.cancel() else later.result()

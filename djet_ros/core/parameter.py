@@ -1,8 +1,8 @@
 """
-How a parameter of a configuration dataclass describes itself.
+Descriptions of the parameters of a configuration dataclass.
 
-Everything that shows parameters to people (ROS declarations, YAML files, command-line flags)
-is derived from this description, so it is written once, beside the default.
+All presentations of parameters (ROS declarations, YAML files, command-line flags) are derived from
+these, which are given once, next to the default.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any
 @dataclass(frozen=True)
 class Description:
     """
-    What a parameter means and which values it takes; units belong into the text.
+    Meaning and admissible values of a parameter; the text includes the unit.
 
-    numbers: that a text holds several, and may be given as a list of them.
+    numbers: whether it is a text of several numbers, which may be given as a list.
     """
 
     text: str
@@ -36,7 +36,7 @@ def parameter(default: Any, text: str, *, minimum: float | None = None,
 
 
 def describe(config: Any) -> dict[str, Description]:
-    """Descriptions of the plain (not nested) parameters of a config class or instance, by name."""
+    """Return the descriptions of the plain (not nested) parameters of a config, by name."""
     return {f.name: f.metadata['description'] for f in fields(config)
             if 'description' in f.metadata}
 
@@ -45,14 +45,14 @@ def check(config: Any) -> None:
     """
     Raise ValueError naming the first parameter whose value is outside its description.
 
-    For use in ``__post_init__``: a config that exists is a config that is valid.
+    For use in ``__post_init__``: a config that exists is valid.
     """
     for name, description in describe(config).items():
         value = getattr(config, name)
         if description.choices and value not in description.choices:
             raise ValueError(f"{name} is '{value}'; choose from {', '.join(description.choices)}")
         low, high = description.minimum, description.maximum
-        # a NaN is neither below nor above, so ask for what it must be
+        # a NaN fails all comparisons, so the condition is what must hold
         if not ((low is None or value >= low) and (high is None or value <= high)):
             raise ValueError(f'{name} is {value}; it must lie between {low} and {high}')
         if description.odd and value % 2 == 0:

@@ -1,10 +1,10 @@
 """
-Many starting poses refined side by side: the problem of ``jet`` for all of them in one product.
+Refinement of many starting poses at once: the problem of ``jet`` for all of them in one product.
 
 An epipolar residual is linear in the essential matrix, e = y*^T E x = vec(x y*^T) . vec(E), and so
-are its derivatives in those of E. One product of the matches' (9, N) with the (S, 6, 9) of all
-starts gives what a Gauss-Newton step needs. The variances g^T A'^-1 g are held during a step,
-which costs it little on the way to a basin; ``jet.minimise`` goes on exactly.
+are its derivatives. One product of the matches' (9, N) with the (S, 6, 9) of all starts gives the
+terms of a Gauss-Newton step. The variances g^T A'^-1 g are constant during a step, which is
+accurate enough to reach a basin; ``jet.minimise`` then optimises exactly.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Sketch:
     """
     Poses R (S, 3, 3), t (S, 3) with their summed losses (S,).
 
-    r, sign (S, N): residuals, and the signs of curvature with which their losses count.
+    r, sign (S, N): residuals, and the signs with which their losses count.
     """
 
     R: Array
@@ -45,24 +45,24 @@ class Sketch:
         return len(self.R)
 
     def pose(self, number: int) -> Pose:
-        """Give one of the poses."""
+        """Return one of the poses."""
         return Pose(self.R[number], self.t[number])
 
     def poses(self) -> list[Pose]:
-        """Give all poses."""
+        """Return all poses."""
         return [self.pose(number) for number in range(len(self))]
 
     def scales(self) -> Array:
-        """Give the robust standard deviations (S,) of the residuals."""
+        """Return the robust standard deviations (S,) of the residuals."""
         return robust_scales(self.r)
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Evaluation:
     """
-    Matches as S poses leave them: costs (S,), and r, sign, weights (S, N) as they have them.
+    Residuals and losses at S poses: costs (S,), and r, sign, weights (S, N).
 
-    roots: (S, N) of the variances of the residuals.
+    roots: (S, N) standard deviations of the residuals.
     """
 
     costs: Array
@@ -71,63 +71,64 @@ class _Look:
     weights: Array
     roots: Array
 
-    def stay(self, before: _Look, which: NDArray[np.int64]) -> None:
-        """Take some of the poses to be as they were before."""
+    def restore(self, other: _Evaluation, which: NDArray[np.int64]) -> None:
+        """Take the values of some of the poses from another evaluation."""
         for name in ('costs', 'r', 'sign', 'weights', 'roots'):
-            getattr(self, name)[which] = getattr(before, name)[which]
+            getattr(self, name)[which] = getattr(other, name)[which]
 
 
 @dataclass(frozen=True)
-class Held:
-    """What a rotation costs that is not R (3, 3): w^T weight w, w from it by a vector (3,)."""
+class RotationPrior:
+    """Cost w^T weight w of a rotation, with w (3,) its rotation vector from R (3, 3)."""
 
     R: Array
     weight: Array
 
 
 def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: int,
-               held: Held | None = None) -> Sketch:
+               rotation_prior: RotationPrior | None = None) -> Sketch:
     """
-    Make some Levenberg-Marquardt steps from each of some poses, side by side.
+    Make Levenberg-Marquardt steps from each of some poses, all at once.
 
-    Each is judged by itself and never ends above the cost of its start; held: a rotation that
-    all are drawn to.
+    Each has its own damping and never ends above the cost of its start. rotation_prior: added to
+    all costs.
     """
     R, t = np.array([start.R for start in starts]), np.array([start.t for start in starts])
-    if compiled.library is not None and held is None:
+    if compiled.library is not None and rotation_prior is None:
         return Sketch(*compiled.refine_all(problem.matches, loss.numbers, steps,
                                            DAMPING_AT_FIRST, R, t))
     products = _products(problem)
-    here = _look(problem, products, R, t, loss, held)
+    here = _evaluate(problem, products, R, t, loss, rotation_prior)
     damping = np.full(len(R), DAMPING_AT_FIRST)
     for _ in range(steps):
-        tangents, H, gradient = _slopes(products, R, t, here, held)
+        tangents, H, gradient = _normal_equations(products, R, t, here, rotation_prior)
         R_new, t_new = moved_all(R, t, tangents, _damped_steps(H, gradient, damping))
-        there = _look(problem, products, R_new, t_new, loss, held)
+        there = _evaluate(problem, products, R_new, t_new, loss, rotation_prior)
         better = there.costs < here.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
         if not better.any():
             continue
-        # Few are worse, and stay where they are.
+        # Starts whose step was rejected return to where they were.
         if len(worse := np.flatnonzero(~better)):
             R_new[worse], t_new[worse] = R[worse], t[worse]
-            there.stay(here, worse)
+            there.restore(here, worse)
         R, t, here = R_new, t_new, there
     return Sketch(R, t, here.costs, here.r, here.sign)
 
 
 def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
-    """Sum up losses (S,) where points also have to lie in front of both cameras."""
+    """Return the summed losses (S,) with chirality, see ``losses_in_front``."""
     return np.asarray(losses_in_front(problem, sketch, loss).sum(1))
 
 
 def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
                     signs: Sequence[float] = (1.0, -1.0)) -> Array:
     """
-    Losses (S, N) where points also have to lie in front of both cameras.
+    Return the losses (S, N) of epipolar distances with chirality.
 
-    Epipolar lines are half-lines then: they begin where points at infinity are seen, and matches
-    before that pay for their way to it. Taken is the sign of t that costs less, of some.
+    Epipolar lines become half-lines, which begin at the image of the point at infinity; matches
+    before it also pay for their distance to it along the line. Of the given signs of t, the one
+    that costs less is taken.
     """
     if compiled.library is not None:
         return compiled.losses_in_front(problem.matches, loss.numbers, (sketch.R, sketch.t),
@@ -148,7 +149,7 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
 
 
 def losses_at(problem: JetProblem, poses: Sequence[Pose], loss: Loss) -> Array:
-    """Losses (S, N) as those in front, of poses as they are."""
+    """Return the losses (S, N) as ``losses_in_front`` does, at poses as they are."""
     return losses_in_front(problem, refine_all(problem, poses, loss, 0), loss)
 
 
@@ -157,9 +158,9 @@ def _products(problem: JetProblem) -> Array:
     return np.asarray((problem.rays_y[:, None] * problem.rays_x[None]).reshape(9, -1))
 
 
-def _look(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss,
-          held: Held | None) -> _Look:
-    """Take the residuals at all poses, and what they cost."""
+def _evaluate(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss,
+              rotation_prior: RotationPrior | None) -> _Evaluation:
+    """Evaluate residuals and costs at all poses."""
     E = skew(t) @ R
     e = E.reshape(-1, 9) @ products
     l1, l2 = (E[:, :2].transpose(1, 0, 2).reshape(-1, 3) @ problem.rays_x).reshape(2, len(R), -1)
@@ -170,18 +171,18 @@ def _look(problem: JetProblem, products: Array, R: Array, t: Array, loss: Loss,
     r = e / roots
     losses, weights = loss(r * r)
     costs = (sign * losses).sum(1)
-    if held is not None:
-        off = rotation_log(R @ held.R.T)
-        costs += (off @ held.weight * off).sum(1)
-    return _Look(costs, r, sign, weights, roots)
+    if rotation_prior is not None:
+        error = rotation_log(R @ rotation_prior.R.T)
+        costs += (error @ rotation_prior.weight * error).sum(1)
+    return _Evaluation(costs, r, sign, weights, roots)
 
 
-def _slopes(products: Array, R: Array, t: Array, here: _Look,
-            held: Held | None) -> tuple[Array, Array, Array]:
+def _normal_equations(products: Array, R: Array, t: Array, here: _Evaluation,
+                      rotation_prior: RotationPrior | None) -> tuple[Array, Array, Array]:
     """
-    Tangents (S, 3, 2) in which t moves, H (S, 5, 5) and gradients (S, 5) of the costs.
+    Tangents (S, 3, 2) of t, H (S, 5, 5) and gradients (S, 5) of the costs.
 
-    The variances of the residuals are held.
+    The variances of the residuals are held constant.
     """
     tangents = sphere_tangents(t)
     by_rotation = skew(t)[:, None] @ (GENERATORS @ R[:, None])
@@ -191,14 +192,14 @@ def _slopes(products: Array, R: Array, t: Array, here: _Look,
     weighted = J * here.weights[:, None]
     H = weighted @ J.transpose(0, 2, 1)
     gradient = (weighted @ (here.sign * here.r)[..., None])[..., 0]
-    if held is not None:
-        H[:, :3, :3] += held.weight
-        gradient[:, :3] += rotation_log(R @ held.R.T) @ held.weight
+    if rotation_prior is not None:
+        H[:, :3, :3] += rotation_prior.weight
+        gradient[:, :3] += rotation_log(R @ rotation_prior.R.T) @ rotation_prior.weight
     return tangents, H, gradient
 
 
 def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
-    """Damped Gauss-Newton steps (S, 5); none where a start has nothing to go by."""
+    """Damped Gauss-Newton steps (S, 5); zeros for a degenerate problem."""
     diagonal = H.diagonal(axis1=1, axis2=2)
     most = diagonal.max(1, keepdims=True)
     ridge = damping[:, None] * diagonal + 1e-12 * most
@@ -212,5 +213,5 @@ def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
 
 
 def moved_all(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
-    """Move one or S poses by steps (S, 5), as ``jet.moved`` does one by one."""
+    """Move one or S poses by steps (S, 5), as ``jet.moved`` does for a single one."""
     return rotation_exp(steps[:, :3]) @ R, unit(t + (tangents @ steps[:, 3:, None])[..., 0])

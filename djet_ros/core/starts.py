@@ -12,31 +12,30 @@ from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
-# Translation X_B = X_A + t of a camera that drives straight ahead.
+# Translation X_B = X_A + t of a camera that moves along its optical axis.
 FORWARD = np.array([0.0, 0.0, -1.0])
 
-# Matches that directions are sought by, pairs of them that are tried, and how many are found.
-_MATCHES_FOR_DIRECTIONS, _PAIRS, _DIRECTIONS = 600, 500, 3
+# Search for translation directions: matches used, random pairs of them, and number of directions.
+_MAX_MATCHES, _PAIRS, _DIRECTIONS = 600, 500, 3
 
-# Pixels that a match has to move beyond the turn to have a say, that it may be off the epipolar
-# line of a direction, and beyond which it does not belong to it.
-_MOVED, _OFF, _BEYOND = 0.5, 1.0, 2.0
+# Pixels: minimum parallax of a match, scale of its score by the distance from the epipolar line of
+# a direction, and distance from which on it is an outlier of it.
+_MIN_PARALLAX, _TOLERANCE, _OUTLIER = 0.5, 1.0, 2.0
 
-# As many matches, the most similar ones, tell a motion from the false ones; all of them are for
-# the optimisation.
+# Number of matches for RANSAC, the most similar ones; the optimisation uses all.
 _RANSAC_MATCHES = 300
 
 
 def five_point(K: Array, x: Array, y: Array, threshold: float,
                robust: bool) -> tuple[Pose, NDArray[np.bool_]] | None:
     """
-    Start from the 5-point algorithm inside RANSAC (paper, Algorithm 1's p_0), with its inliers.
+    Estimate a pose and its inliers by the 5-point algorithm with RANSAC.
 
-    x, y: (N, 2) pixels; threshold in pixels. `robust` takes MAGSAC++ instead of plain RANSAC.
-    None where no essential matrix was found.
+    The p_0 of Algorithm 1 in the paper. x, y: (N, 2) pixels; threshold in pixels; robust: MAGSAC++
+    in place of plain RANSAC. None if no essential matrix was found.
     """
     if K[0, 1]:
-        # OpenCV's RANSAC knows of no skew: it gets pixels of the same camera without any.
+        # OpenCV ignores skew, so the pixels are converted to a camera without it.
         upright = K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]
         x, y = (rays(K, places) @ upright[:2].T for places in (x, y))
         K = upright
@@ -56,88 +55,90 @@ def five_point(K: Array, x: Array, y: Array, threshold: float,
 def starting_poses(K: Array, x: Array, y: Array, threshold: float,
                    prior: Pose | None) -> list[Pose]:
     """
-    Collect all starting poses of the preset ``best``.
+    Collect the starting poses of the preset ``best``.
 
-    x, y: (N, 2) pixels, the surest matches first; threshold in pixels; prior: the previous
-    motion, if there is one.
+    x, y: (N, 2) pixels, the most reliable matches first; threshold in pixels; prior: the previous
+    motion, if any.
     """
     x, y = x[:_RANSAC_MATCHES], y[:_RANSAC_MATCHES]
     found = five_point(K, x, y, threshold, robust=True)
-    return [*several(found[0] if found else None, prior), *planar(K, x, y, threshold)]
+    return [*likely_starts(found[0] if found else None, prior), *planar_starts(K, x, y, threshold)]
 
 
 @dataclass(frozen=True)
 class Known:
     """
-    What others than the images tell of a motion.
+    Measurements of a motion from other sources than the images.
 
-    turn: its rotation, and how sure that is; guess: a pose that it may be near, as another
-    odometry has it.
+    turn: its rotation with covariance, as from a gyro; guess: an approximate pose, as from another
+    odometry.
     """
 
     turn: Turn | None = None
     guess: Pose | None = None
 
     def rotations(self) -> list[Array]:
-        """Give what is known of the rotation, (3, 3) each, the surest first."""
+        """Return the measured rotations, (3, 3) each, the most certain first."""
         return [one.R for one in (self.turn, self.guess) if one is not None]
 
 
-def known_starts(K: Array, x: Array, y: Array, known: Known) -> list[Pose]:
+def external_starts(K: Array, x: Array, y: Array, known: Known) -> list[Pose]:
     """
-    Collect the guess, and the directions that matches have under the turn.
+    Collect starts from external measurements: the guess, and the rotation with directions.
 
-    x, y: (N, 2) pixels, the surest matches first.
+    The directions are those of matches under the measured rotation, of the guess, and forward. x,
+    y: (N, 2) pixels, the most reliable matches first.
     """
     starts = [] if known.guess is None else [known.guess]
     if known.turn is not None:
-        some = thinned(len(x), _MATCHES_FOR_DIRECTIONS)
-        starts += [Pose(known.turn.R, t) for t in directions(K, x[some], y[some], known.turn.R)]
+        some = thinned(len(x), _MAX_MATCHES)
+        starts += [Pose(known.turn.R, t)
+                   for t in translation_directions(K, x[some], y[some], known.turn.R)]
         if known.guess is not None:
             starts.append(Pose(known.turn.R, known.guess.t))
         starts.append(Pose(known.turn.R, FORWARD))
     return starts
 
 
-def directions(K: Array, x: Array, y: Array, R: Array) -> list[Array]:
+def translation_directions(K: Array, x: Array, y: Array, R: Array) -> list[Array]:
     """
-    Find directions of translation (3,) under a rotation R (3, 3), the one of most matches first.
+    Estimate translation directions (3,) for a known rotation R (3, 3), the best supported first.
 
-    Each match leaves a plane that t lies in; two of them leave t. The best of random pairs comes
-    first, and after it the best that those matches leave which are not its own: something may
-    move by itself. x, y: (N, 2) pixels.
+    Each match constrains t to a plane; two of them determine it. The best hypothesis from random
+    pairs is taken, its inliers are removed, and so on, as there may be moving objects. x, y:
+    (N, 2) pixels.
     """
     focal = float(K[0, 0])
     normals = np.cross(rays(K, x) @ R.T, rays(K, y)) * focal
-    # A match that hardly moves beyond the turn leaves no plane.
-    normals = normals[np.linalg.norm(normals, axis=1) > _MOVED]
+    # A match with hardly any parallax does not constrain t.
+    normals = normals[np.linalg.norm(normals, axis=1) > _MIN_PARALLAX]
     found: list[Array] = []
     while len(found) < _DIRECTIONS and len(normals) > 2:
         one, other = np.random.default_rng(0).integers(0, len(normals), (2, _PAIRS))
         tried = unit(np.cross(normals[one], normals[other]))
         off = np.abs(tried @ normals.T)
-        # A match paired with itself leaves nothing, which everything would agree with.
-        agreement = np.maximum(1 - (off / _OFF)**2, 0).sum(1) * tried.any(1)
+        # A match paired with itself gives a zero vector, which fits everything.
+        agreement = np.maximum(1 - (off / _TOLERANCE)**2, 0).sum(1) * tried.any(1)
         best = int(agreement.argmax())
         if not agreement[best]:
             break
         found.append(tried[best])
-        normals = normals[off[best] > _BEYOND]
+        normals = normals[off[best] > _OUTLIER]
     return found
 
 
 def thinned(count: int, most: int) -> slice:
-    """Choose at most so many of a count of matches, evenly from their order."""
+    """Return a slice that takes at most so many of a count of matches, evenly spaced."""
     return slice(None, None, max(1, -(-count // most)))
 
 
-def all_round(R: Array, count: int) -> list[Pose]:
-    """Give poses of one rotation with directions evenly over half a sphere, on a spiral."""
-    return [Pose(R, t) for t in _half_sphere(count)]
+def hemisphere_starts(R: Array, count: int) -> list[Pose]:
+    """Return poses of one rotation with directions evenly over a hemisphere, on a spiral."""
+    return [Pose(R, t) for t in _hemisphere(count)]
 
 
 @lru_cache(maxsize=8)
-def _half_sphere(count: int) -> Array:
+def _hemisphere(count: int) -> Array:
     z = (np.arange(count) + 0.5) / count
     turn = np.pi * (1 + np.sqrt(5)) * (np.arange(count) + 0.5)
     ring = np.sqrt(1 - z**2)
@@ -148,37 +149,37 @@ def _half_sphere(count: int) -> Array:
 
 def around(pose: Pose, count: int) -> list[Pose]:
     """
-    Give a pose, and others of its rotation: straight ahead, and in directions all round.
+    Return a pose and its rotation with the forward and hemisphere directions, as starts.
 
-    Without itself, where its t is zeros, as its direction is not known.
+    Without the pose itself if its t is zeros, as then its direction is unknown.
     """
     itself = [pose] if pose.t.any() else []
-    return [*itself, Pose(pose.R, FORWARD), *all_round(pose.R, count)]
+    return [*itself, Pose(pose.R, FORWARD), *hemisphere_starts(pose.R, count)]
 
 
-def planar(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
+def planar_starts(K: Array, x: Array, y: Array, threshold: float) -> list[Pose]:
     """
-    Start from the motions of a plane that many matches may lie on (at most four).
+    Estimate up to four motions from a homography, as many matches may be of one plane.
 
-    A plane is seen alike under two motions (its twin); RANSAC may take the wrong one of them.
-    x, y: (N, 2) pixels; threshold in pixels.
+    Two motions explain the same plane, and RANSAC may take the wrong one. x, y: (N, 2) pixels;
+    threshold in pixels.
     """
     H, _ = cv2.findHomography(x, y, cv2.USAC_MAGSAC, 2 * threshold)
     if H is None or not np.isfinite(H).all():
         return []
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.ascontiguousarray(K))
-    # OpenCV's rotations are off by as much as 1e-8.
+    # OpenCV's rotation matrices have errors up to 1e-8.
     return [Pose(nearest_rotation(np.asarray(R, float)), unit(np.ravel(np.asarray(t, float))))
             for R, t in zip(rotations, translations)
             if np.isfinite(R).all() and np.linalg.norm(t) > 1e-6]
 
 
-def several(robust: Pose | None, prior: Pose | None) -> list[Pose]:
+def likely_starts(robust: Pose | None, prior: Pose | None) -> list[Pose]:
     """
-    Collect starting poses that between them reach the right basin.
+    Collect starts that cover the likely basins.
 
-    RANSAC alone can land in a wrong one (sideways for forward translation); the previous motion
-    and driving straight ahead are the likely alternatives.
+    RANSAC alone can end in a wrong one (sideways in place of forward translation); the previous
+    motion and pure forward motion are the likely alternatives.
     """
     known = [pose for pose in (robust, prior) if pose is not None]
     straight = [Pose(R, FORWARD) for R in [*(pose.R for pose in known), np.eye(3)]]

@@ -1,4 +1,4 @@
-"""The values that travel through the core: features, views, poses, and what vouches for them."""
+"""Data types of the core: features, views, poses, and the estimate of a pair."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @unique
 class Status(StrEnum):
-    """What became of a frame or of a pair of frames."""
+    """Outcome of a frame or of a pair of frames."""
 
     OK = 'OK'
     FIRST_FRAME = 'FIRST_FRAME'
@@ -30,11 +30,11 @@ class Status(StrEnum):
     SIZE_CHANGED = 'SIZE_CHANGED'
 
 
-# Statuses under which the motion of a pair was estimated.
+# Statuses with an estimated motion.
 TRACKED = (Status.OK, Status.NO_PARALLAX)
 
-# Statuses of pairs whose images are good, and tell two motions: from the newest image on it may be
-# told again, while over two steps what the bodies have in common is gone.
+# Statuses of pairs with good images but two possible motions. A later pair that starts at the
+# newer image may decide; a pair over both steps would have even fewer matches in common.
 UNDECIDED = (Status.AMBIGUOUS, Status.TWO_MOTIONS)
 
 # Statuses of a frame at which the odometry started or restarted, without a pair.
@@ -46,10 +46,10 @@ class Features:
     """
     Features of one image.
 
-    points: (N, 2) pixels on level 0, pixel centres at integers; octaves: (N,) sizes;
-    angles: (N,) degrees; responses: (N,); describe: gives the descriptors, which are made when
-    they are first asked for, as pairs that go on like the one before do without; others: gives
-    more features, in the same way, which only views that are far apart are worth.
+    points: (N, 2) pixels at full resolution, pixel centres at integers; octaves: (N,) pyramid
+    levels; angles: (N,) degrees; responses: (N,); describe: computes the descriptors, on first
+    access only, as predicted pairs never need them; others: detects additional features on demand,
+    which only help if views are far apart.
     """
 
     points: Array
@@ -61,8 +61,9 @@ class Features:
 
     @classmethod
     def together(cls, parts: Sequence[Features]) -> Features:
-        """Put features of one image together, but for their others."""
-        # Not the parts: one that keeps what it is part of would stay in memory.
+        """Concatenate features of one image, without their additional ones."""
+        # Captures the callables only: a reference to the parts would keep all of their arrays
+        # alive.
         describe = [part.describe for part in parts]
         return cls(np.concatenate([part.points for part in parts]),
                    np.concatenate([part.octaves for part in parts]),
@@ -73,7 +74,7 @@ class Features:
     @classmethod
     def described(cls, points: Array, octaves: NDArray[np.int32], angles: NDArray[np.float32],
                   responses: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:
-        """Give features whose descriptors are known already."""
+        """Create features with descriptors that are computed already."""
         return cls(points, octaves, angles, responses, lambda: descriptors)
 
     def __len__(self) -> int:
@@ -86,36 +87,36 @@ class Features:
 
     @cached_property
     def with_others(self) -> Features:
-        """Give these features, and the others if there are any."""
+        """Return these features and the additional ones, if there are any."""
         return self if self.others is None else Features.together([self, self.others()])
 
 
 class Picture(Protocol):
-    """What a camera shows: gray (H, W), and K (3, 3) its camera matrix."""
+    """An image with a camera: gray (H, W), and K (3, 3) the camera matrix."""
 
     @property
     def gray(self) -> NDArray[np.uint8]:
-        """Give the gray levels."""
+        """Return the gray levels."""
 
     @property
     def K(self) -> Array:
-        """Give the camera matrix."""
+        """Return the camera matrix."""
 
 
 def of_one_camera(one: Picture, other: Picture) -> bool:
-    """Whether two pictures have one size and one camera matrix, as those of a pair have to."""
+    """Return whether two images have the same size and camera matrix, as a pair requires."""
     return one.gray.shape == other.gray.shape and np.array_equal(one.K, other.K)
 
 
 @dataclass(frozen=True)
 class View:
     """
-    One image as the estimator wants it.
+    One image, prepared for the estimator.
 
-    gray: (H, W) uint8, free of distortion; K: (3, 3) its camera matrix; features: its
-    features; smoothed: (H, W) uint8, gray as ORB's binary tests see it; tested: (H, W), as the
-    tests of the descriptor surfaces do; mask: (H, W) bool, True where neither a feature nor a
-    surface may stand, or None.
+    gray: (H, W) uint8, undistorted; K: (3, 3) camera matrix; features: its features; smoothed:
+    (H, W) uint8, gray as ORB's binary tests sample it; tested: (H, W), gray as the tests of the
+    descriptor surfaces sample it; mask: (H, W) bool, True where neither a feature nor a surface
+    may be, or None.
     """
 
     gray: NDArray[np.uint8]
@@ -137,32 +138,30 @@ class Pose:
 @dataclass(frozen=True)
 class RelativePose:
     """
-    The motion between two frames, ``x_current = R x_previous + t``, and what vouches for it.
+    The estimated motion between two frames, ``x_current = R x_previous + t``, and its evidence.
 
-    R: (3, 3) rotation; t: (3,) unit direction, or zeros where the translation can't be estimated
-    (status NO_PARALLAX and all failures). Three statuses hold a best guess, whose covariance
-    spans what else it may be: AMBIGUOUS, where a motion far off explains the matches as well;
-    TWO_MOTIONS, where two bodies move and nothing tells which of them is the world; and
-    TOO_FEW_INLIERS, where no more matches agree than false ones might. covariance_5: (5, 5) over
+    R: (3, 3) rotation; t: (3,) unit direction, or zeros if the translation is not determined
+    (status NO_PARALLAX and all failures). Three statuses come with a best guess whose covariance
+    spans the alternatives: AMBIGUOUS if a very different motion explains the matches as well;
+    TWO_MOTIONS if two bodies move and nothing decides which of them is the static world;
+    TOO_FEW_INLIERS if false matches could produce as many inliers. covariance_5: (5, 5) over
     (rotation vector in rad, two coordinates of t in the basis ``sphere_tangents(t)``);
-    covariance_6: (6, 6) over (rotation vector, t), of rank 5 because the length of t is fixed.
-    Where t is zeros only the rotation's (3, 3) of either tells anything: the rest is of the
-    direction that was fitted first, which is not told.
+    covariance_6: (6, 6) over (rotation vector, t), of rank 5 because t has unit length. If t is
+    zeros, only the rotation blocks (3, 3) are meaningful: the rest belongs to the direction that
+    was fitted first, which is not determined.
 
-    x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2)
-    the place of y after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,)
-    bool, those that took part in the pose, whether they agree with it or not; placed: (N, 2)
-    where gray levels have y, seen through the pose and the depths, or y itself;
-    placed_covariances: (N, 2, 2) of these in square pixels, up to a common factor (see
-    `core.patches`), all alike where gray levels were not asked;
-    residuals: (N,) signed distances in pixels of y to its epipolar line, for which the t that was
-    fitted first stands in where t is zeros;
-    hamming: (N,) descriptor distances at the final place in bits (NaN off the image);
-    losses: (N,) each match's loss on its surface, the last known one where it was culled;
-    culled: how many matches had no surface in the end; indefinite: how many surfaces had no
-    minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other motions
-    that were considered, the signs of their t open; sought: how many features of the previous
-    image were looked for, 0 where matches were given.
+    x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2) y
+    after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,) bool, matches
+    that took part in the optimisation, inliers or not; placed: (N, 2) y as refined by photometric
+    patch alignment under the pose and the depths, or y itself; placed_covariances: (N, 2, 2) of
+    these in square pixels, up to a common factor (see `core.patches`), all alike without patch
+    alignment; residuals: (N,) signed distances in pixels of y from its epipolar line, by the t
+    that was fitted first if t is zeros; hamming: (N,) descriptor distances at y_opt in bits (NaN
+    off the image); losses: (N,) loss of each match on its surface, the last one if it was culled;
+    culled: number of matches without a usable surface in the end; indefinite: number of surfaces
+    without a minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other
+    motions that were considered, up to the sign of t; sought: number of features of the previous
+    image that were searched, 0 if matches were given.
     """
 
     status: Status

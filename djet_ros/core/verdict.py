@@ -1,95 +1,102 @@
-"""What is to be believed of a pair: direction of t, covariance, status."""
+"""The verdict on a pair: sign of t, covariance, status."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from djet_ros.core.covariance import (
-    as_far_as_claimed,
-    by_calibration,
-    difference,
+    calibration_covariance,
+    CHI2_999,
     pose_covariance,
-    spanning,
+    pose_difference,
     squared_distance,
-    SURPRISING,
     widened,
+    widened_by_profile,
+    widened_to_span,
 )
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
+    chirality_signs,
     epipolar_lines,
     fit_rotation,
     fundamental,
     line_distances,
     rays,
     rotation_log,
-    sides,
 )
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.jet import epipolar_residuals
 from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import median, quantile
-from djet_ros.core.rivals import change, DECIDED, false_alarms, goes_on, preferences
+from djet_ros.core.rivals import (
+    continues_motion,
+    DECIDED,
+    false_alarms,
+    pose_distance,
+    preferences,
+)
 from djet_ros.core.tracking import Track, TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
 from scipy.special import ndtr
 
-# Bits that differ between the descriptors of matches beyond which they are no better than chance:
-# 128 differ between places that have nothing to do with one another, and 20 to 40 between matches.
-_CHANCE_BITS = 112
+# Median descriptor distance of the inliers, in bits, above which they are no better than random:
+# unrelated places differ by 128 bits, matches by 20 to 40.
+_RANDOM_BITS = 112
 
-# Parallax has to exceed the noise of the matches by this factor to be believed.
-_OUT_OF_NOISE = 3.0
+# Factor by which parallax has to exceed the noise of the matches.
+_PARALLAX_OVER_NOISE = 3.0
 
-# chosen: what a standard deviation of a preference counts, as neighbouring cells err together too.
-_TRUSTED = 0.5
+# chosen: factor on the z-score of a preference, as neighbouring cells have correlated errors too.
+_PREFERENCE_FACTOR = 0.5
 
-# rad; no ellipsoid spans two motions that are further from one another, as the sphere of
-# directions is bent: up to here chord and arc agree to a twentieth.
-_FAR = 0.5
+# rad; limit of the distance of two motions that one covariance can span: the sphere of directions
+# is curved, and up to here chord and arc agree to a twentieth.
+_MAX_SPANNED = 0.5
 
 
 def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     """
-    Settle which way t points, how sure the pose is, and whether it is to be believed.
+    Determine the sign of t, the covariance, and the status of a pair.
 
-    track: where Algorithm 1 ended, on the matches of the pair.
+    track: the result of Algorithm 1 on the matches of the pair.
     """
     x, K, R = pair.x, pair.current.K, track.pose.R
     inliers = track.inliers()
-    # Chirality: E = [t]_x R leaves the sign of t open, positive depths decide it.
+    # Chirality: E = [t]_x R does not determine the sign of t; positive depths do.
     seen, minima = (places.compress(inliers, axis=0) for places in (x, track.minima))
     rays_x, rays_y = rays(K, seen), rays(K, minima)
-    sign, other_way = _sign(track.pose, rays_x, rays_y, seen, pair.before)
+    sign, sign_open = _sign(track.pose, rays_x, rays_y, seen, pair.prior)
     t = sign * track.pose.t
 
     voting = x.compress(track.voting, axis=0)
     covariances = pose_covariance(track.residuals, track.loss, voting, t, sign < 0)
     if np.isfinite(covariances[0]).all():
-        covariances = as_far_as_claimed(covariances[0], track.problem, Pose(R, t), track.loss,
-                                        track.residuals if sign > 0 else None)
+        covariances = widened_by_profile(covariances[0], track.problem, Pose(R, t), track.loss,
+                                         track.residuals if sign > 0 else None)
     hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
                               None if pair.bits is None else (pair.y, pair.bits))
     status = Status.OK
     if (inliers.sum() < config.min_matches or not np.isfinite(covariances[0]).all()
-            or _by_chance(hamming[inliers])):
+            or _random_descriptors(hamming[inliers])):
         status, t = Status.DEGENERATE, np.zeros(3)
     elif _false_alarm(pair, track, int(inliers.sum()), config):
         status = Status.TOO_FEW_INLIERS
     else:
-        # Where a rotation alone explains the matches, any direction of t would do.
-        R_alone, noise = fit_rotation(rays_x, rays_y), _OUT_OF_NOISE * track.scale
+        # If a rotation alone explains the matches, t is not determined.
+        R_alone, noise = fit_rotation(rays_x, rays_y), _PARALLAX_OVER_NOISE * track.scale
         parallax = _parallax(K, R_alone, rays_x, minima)
         if parallax < max(config.min_parallax, noise):
             if parallax >= noise:
-                # What is out of noise is a way, which the turn by itself makes up for.
-                covariances = _bent(covariances[0], Pose(R, t), R_alone)
+                # The parallax above the noise is real, and the pure rotation is biased to
+                # compensate for it.
+                covariances = _widened_by_rotation(covariances[0], Pose(R, t), R_alone)
             status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
         else:
-            status, covariances = _judged(Pose(R, t), covariances, track, voting, pair.before,
-                                          other_way)
+            status, covariances = _compare_with_rivals(Pose(R, t), covariances, track, voting,
+                                                       pair.prior, sign_open)
     if config.calibration_sigma and np.isfinite(covariances[0]).all():
-        covariances = widened(covariances[0], sign * track.pose.t, by_calibration(
+        covariances = widened(covariances[0], sign * track.pose.t, calibration_covariance(
             track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma))
     lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
     return RelativePose(
@@ -101,112 +108,119 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
         sought=pair.sought,
         rivals=(*(rival.pose for rival in track.rivals),
-                *([Pose(R, -t)] if other_way and t.any() else [])))
+                *([Pose(R, -t)] if sign_open and t.any() else [])))
 
 
 def as_turn(relative: RelativePose, K: Array) -> RelativePose:
-    """Give a pair whose parallax is none: a rotation alone, and how far its way had bent that."""
+    """
+    Return a pair without parallax as a pure rotation (status NO_PARALLAX).
+
+    The covariance is widened by the change of the rotation.
+    """
     agree = relative.inliers
     R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
-    covariances = _bent(relative.covariance_5, Pose(relative.R, relative.t), R)
+    covariances = _widened_by_rotation(relative.covariance_5, Pose(relative.R, relative.t), R)
     return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
                    covariance_5=covariances[0], covariance_6=covariances[1])
 
 
-def _bent(covariance: Array, pose: Pose, R: Array) -> tuple[Array, Array]:
-    """Widen a pose's covariance (5, 5) by how far it is turned from a rotation alone (3, 3)."""
-    return spanning(covariance, pose.t, np.append(rotation_log(R @ pose.R.T), [0.0, 0.0]), 1.0)
+def _widened_by_rotation(covariance: Array, pose: Pose, R: Array) -> tuple[Array, Array]:
+    """Widen the covariance (5, 5) of a pose by its difference from a pure rotation R (3, 3)."""
+    offset = np.append(rotation_log(R @ pose.R.T), [0.0, 0.0])
+    return widened_to_span(covariance, pose.t, offset, 1.0)
 
 
 def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,
-          before: Pose | None) -> tuple[float, bool]:
+          prior: Pose | None) -> tuple[float, bool]:
     """
-    Tell the sign of t, and whether the other one may be right as well.
+    Return the sign of t, and whether the opposite sign remains possible.
 
-    rays_x, rays_y: (N, 3) of the matches that agree, places: (N, 2) their pixels in the previous
-    image. False ones along epipolar lines, as edges on the way have them, are behind the cameras
-    as often as before them: where points before and behind do not decide, by the test of
-    ``preferences``, the motion before does.
+    rays_x, rays_y: (N, 3) of the inliers; places: (N, 2) their pixels in the previous image. False
+    matches along epipolar lines, as on edges in the direction of motion, are as often behind the
+    cameras as in front. If the depth signs do not decide by the test of ``preferences``, the
+    previous motion does.
     """
-    votes = sides(pose.R, pose.t, rays_x, rays_y)
+    votes = chirality_signs(pose.R, pose.t, rays_x, rays_y)
     sign = 1.0 if votes.sum() >= 0 else -1.0
     if preferences(np.stack([-votes, votes]) * sign, places, 0)[1] >= DECIDED:
         return sign, False
-    ways = {way: Pose(pose.R, way * pose.t) for way in (sign, -sign)}
-    if before is not None:
-        sign = min(ways, key=lambda way: change(before, ways[way]))
-    return sign, before is None or not goes_on(before, ways[sign], ways[-sign])
+    poses = {one: Pose(pose.R, one * pose.t) for one in (sign, -sign)}
+    if prior is not None:
+        sign = min(poses, key=lambda one: pose_distance(prior, poses[one]))
+    return sign, prior is None or not continues_motion(prior, poses[sign], poses[-sign])
 
 
 def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfig) -> bool:
     """
-    Tell whether false matches would bring about a motion that as many agree with.
+    Return whether false matches alone would produce a motion with as many inliers.
 
-    One that may be anywhere in a disc of the search radius r lies within w of a line through
-    its middle with a probability of at most 4 w / (pi r). Those that a starting pose had left out
-    were tried as well.
+    A match uniform in a disc of the search radius r lies within w of a line through its centre
+    with a probability of at most 4 w / (pi r). Matches that were removed with a starting pose
+    count as tested too.
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
     chance = 4 * TRACK_TUNING.inlier * track.scale / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting) + pair.outliers, chance) > 0
 
 
-def _judged(pose: Pose, covariances: tuple[Array, Array], track: Track, places: Array,
-            before: Pose | None, other_way: bool) -> tuple[Status, tuple[Array, Array]]:
+def _compare_with_rivals(pose: Pose, covariances: tuple[Array, Array], track: Track,
+                         places: Array, prior: Pose | None, sign_open: bool
+                         ) -> tuple[Status, tuple[Array, Array]]:
     """
-    Tell whether rivals leave a pose unsure, and widen its covariances to span them.
+    Compare a pose with its rivals: return its status, and its covariances widened to span them.
 
-    places: (M, 2) pixels of the matches that voted, in the previous image; other_way: whether t
-    may have the other sign as well, which is a rival too. Those that the covariance allows of are
-    spanned by it already. Any other is the true motion with the probability that the preference
-    comes from noise. Where that is less than the one of a hundred at which matches decide, it is
-    left out, unless two bodies move: of a motion 60 degrees off, a probability of six in a
-    thousand makes a standard deviation of five degrees out of a fifth of one.
+    places: (M, 2) pixels of the voting matches in the previous image; sign_open: whether -t
+    remains possible, which is a rival too. Rivals within the covariance are covered already. Any
+    other is the true motion with the probability that the preference is due to noise. Below one in
+    a hundred (the level of ``DECIDED``) it is ignored, unless two bodies move: with a motion 60
+    degrees away, a probability of six in a thousand turns a standard deviation of a fifth of a
+    degree into one of five degrees.
     """
-    status = Status.TWO_MOTIONS if track.guess else Status.OK
+    status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
     unsure: list[Array] = []
-    for rival in (*track.rivals, *track.beside):
-        off = difference(pose.R, pose.t, rival.pose)
-        if squared_distance(covariances[0], off) < SURPRISING:
+    for rival in (*track.rivals, *track.nearby):
+        off = pose_difference(pose.R, pose.t, rival.pose)
+        if squared_distance(covariances[0], off) < CHI2_999:
             continue
-        undecided = rival.preference < DECIDED and not _goes_on(before, pose, rival.pose)
-        if undecided and np.linalg.norm(off) > _FAR and not track.guess:
+        undecided = rival.preference < DECIDED and not _prior_decides(prior, pose, rival.pose)
+        if undecided and np.linalg.norm(off) > _MAX_SPANNED and not track.body_ambiguous:
             status = Status.AMBIGUOUS
-        probability = float(ndtr(-_TRUSTED * rival.preference))
-        if track.guess or probability > ndtr(-DECIDED):
-            covariances = spanning(covariances[0], pose.t, off, probability)
+        probability = float(ndtr(-_PREFERENCE_FACTOR * rival.preference))
+        if track.body_ambiguous or probability > ndtr(-DECIDED):
+            covariances = widened_to_span(covariances[0], pose.t, off, probability)
         if undecided:
             unsure.append(_covariance_of(rival.pose, track, places))
-    # Not before all are held against it: what is not known of one is no reason to allow of others.
+    # Only after all rivals were compared: the uncertainty of one rival must not make another one
+    # look covered.
     for own in unsure:
         covariances = widened(covariances[0], pose.t, own)
-    if other_way:
-        status = status if track.guess else Status.AMBIGUOUS
-        # It lies 2 away by its chord, to no side more than to another.
+    if sign_open:
+        status = status if track.body_ambiguous else Status.AMBIGUOUS
+        # -t is at chord 2, in no particular tangent direction.
         for off in np.sqrt(2) * np.eye(5)[3:]:
-            covariances = spanning(covariances[0], pose.t, off, 0.5)
+            covariances = widened_to_span(covariances[0], pose.t, off, 0.5)
     return status, covariances
 
 
 def _covariance_of(pose: Pose, track: Track, places: Array) -> Array:
-    """Covariance (6, 6) of a rival, by the matches as they lie for the pose that was taken."""
+    """Covariance (6, 6) of a rival, from the residuals at the rival on the same surfaces."""
     residuals = epipolar_residuals(track.problem, pose.R, pose.t)
     return pose_covariance(residuals, track.loss, places, pose.t, flipped=False)[1]
 
 
-def _goes_on(before: Pose | None, pose: Pose, rival: Pose) -> bool:
-    """Tell whether the motion before decides for a pose, whichever sign a rival's t may have."""
-    return before is not None and all(
-        goes_on(before, pose, Pose(rival.R, sign * rival.t)) for sign in (1, -1))
+def _prior_decides(prior: Pose | None, pose: Pose, rival: Pose) -> bool:
+    """Return whether the previous motion decides for a pose, for either sign of the rival's t."""
+    return prior is not None and all(
+        continues_motion(prior, pose, Pose(rival.R, sign * rival.t)) for sign in (1, -1))
 
 
-def _by_chance(hamming: Array) -> bool:
-    """Tell of descriptor distances (N,), NaN where there is none, whether chance explains them."""
+def _random_descriptors(hamming: Array) -> bool:
+    """Return whether descriptor distances (N,) in bits, NaN if unknown, look random."""
     known = hamming[np.isfinite(hamming)]
-    return bool(known.size and median(known) > _CHANCE_BITS)
+    return bool(known.size and median(known) > _RANDOM_BITS)
 
 
 def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
-    """Upper quartile of the distances in pixels of y from where rotation alone would bring x."""
+    """Upper quartile of the distances in pixels of y from the places of x under rotation alone."""
     rotated = rays_x @ (K @ R).T
     return quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
