@@ -1,4 +1,4 @@
-"""Which of the poses that starts lead to are basins of their own."""
+"""Distinct basins among the poses that starts lead to."""
 
 from itertools import combinations
 
@@ -16,8 +16,8 @@ NOISE = 0.5
 
 
 @pytest.mark.parametrize('seed', range(16))
-def test_the_basins_of_a_pair_are_told_apart_by_its_matches(seed):
-    """Where all is far, and turning makes up for going sideways, many minima lie in one valley."""
+def test_basins_of_a_pair_differ_significantly_for_its_matches(seed):
+    """Distant points leave a valley of minima, as rotation compensates for sideways motion."""
     rng = np.random.default_rng(seed)
     views = two_views(rng, 100, SIDEWAYS, near=30.0)
     y = views.y + rng.normal(0, NOISE, views.y.shape)
@@ -29,5 +29,5 @@ def test_the_basins_of_a_pair_are_told_apart_by_its_matches(seed):
         told = epipolar_residuals(problem, one.R, one.t)
         near = told.jacobian[:, np.abs(told.r) < 3 * NOISE]
         off = pose_difference(one.R, one.t, other)
-        # As exact as matches that are right would be at most.
+        # The noise of the best matches.
         assert off @ (near @ near.T) @ off / NOISE**2 > CHI2_999 / 2

@@ -1,4 +1,4 @@
-"""Corners are spread, real and between pixels, whatever the image."""
+"""Corners are evenly distributed, real and sub-pixel, on any image."""
 
 import cv2
 from djet_ros.core.corners import (
@@ -20,7 +20,7 @@ def image():
 
 
 def squares(contrast):
-    """Give an image of 6 x 4 squares and their 96 corners."""
+    """Return an image of 6 x 4 squares and their 96 corners."""
     image = np.full((300, 400), 100, np.uint8)
     corners = []
     for left in range(40, 340, 50):
@@ -30,7 +30,7 @@ def squares(contrast):
     return image, np.array(corners)
 
 
-def test_corners_of_squares_are_found_and_nothing_but_corners():
+def test_exactly_the_corners_of_squares_are_detected():
     image, corners = squares(100)
     features = detect_corners(image, 2000, 1.0)
     ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
@@ -59,7 +59,7 @@ def test_noise_alone_has_no_corners(sigma):
     assert len(detect_corners(noisy(np.full((480, 640), 128.0), sigma), 2000, 1.0)) < 10
 
 
-def test_corners_are_found_in_noise_and_no_others():
+def test_corners_are_detected_in_noise_without_false_ones():
     image, corners = squares(100)
     features = detect_corners(noisy(image, 8), 2000, 1.0)
     ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
@@ -68,16 +68,16 @@ def test_corners_are_found_in_noise_and_no_others():
 
 
 @pytest.mark.parametrize('sigma', [2, 5, 15])
-def test_noise_is_told_where_an_image_is_flat(image, sigma):
+def test_noise_is_estimated_from_flat_blocks(image, sigma):
     image = np.tile(image, (2, 2))
     image[:, :300] = 90
     assert noise_of(noisy(image, sigma)) == pytest.approx(sigma, rel=0.2)
     assert noise_of(image) == 0
 
 
-def test_slopes_are_told_in_gray_levels_per_pixel():
+def test_slopes_are_in_gray_levels_per_pixel():
     rows, columns = np.mgrid[:60, :60]
-    # Along x it climbs by 3 for each pixel, along y by 4, in quarters of the image in turn.
+    # The gradient is 3 along x and 4 along y, in alternating quarters of the image.
     saw = np.where((rows // 2 + columns // 2) % 2 == 0, 3 * columns, 4 * rows) % 200
     assert corner_slopes(saw.astype(np.uint8)).max() > 1
     ramp = (3 * columns).astype(np.uint8)
@@ -93,29 +93,29 @@ def test_points_have_room_for_a_descriptor(image):
     assert (features.responses >= 1.0).all()
 
 
-def test_corners_of_the_middle_size_wait_until_they_are_asked_for(image):
+def test_middle_octave_is_detected_on_demand(image):
     features = detect_corners(image, 100, 1.0)
     assert set(features.octaves) == {0, 2}
-    every = features.with_others
+    every = features.with_additional
     assert np.bincount(every.octaves).tolist() == [70, 25, 18]
     assert every.descriptors.shape == (113, 32)
     assert np.array_equal(every.descriptors[:88], features.descriptors)
 
 
-def test_where_corners_are_few_all_sizes_are_told_at_once():
+def test_all_octaves_are_detected_at_once_if_corners_are_few():
     features = detect_corners(squares(100)[0], 2000, 1.0)
     assert set(features.octaves) == {0, 1, 2}
-    assert features.with_others is features
+    assert features.with_additional is features
 
 
-def test_large_corners_are_told_alone_where_they_are_many(image):
+def test_only_large_corners_are_detected_if_they_are_many(image):
     features = detect_large_corners(image, 50, 1.0)
     assert set(features.octaves) == {2}
     assert 0.6 * 50 <= len(features) <= 50
     assert np.array_equal(features.points, detect_large_corners(image, 50, 1.0).points)
 
 
-def test_where_large_corners_are_few_there_are_small_ones_too():
+def test_small_corners_are_added_if_large_ones_are_few():
     image, corners = squares(100)
     features = detect_large_corners(image, 400, 1.0)
     assert set(features.octaves) == {0, 2}
@@ -124,7 +124,7 @@ def test_where_large_corners_are_few_there_are_small_ones_too():
     assert len(features) <= 400
 
 
-def test_points_follow_an_image_by_parts_of_a_pixel(image):
+def test_points_move_with_the_image_to_sub_pixel_accuracy(image):
     by = np.array([0.3, -0.4])
     moved = cv2.warpAffine(image, np.column_stack([np.eye(2), by]), image.shape[::-1],
                            flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -138,11 +138,11 @@ def test_points_follow_an_image_by_parts_of_a_pixel(image):
         follows = length.min(1) < 2
         return np.median(np.abs(apart[np.arange(len(here)), nearest][follows]))
 
-    # Slopes are sampled at each second pixel.
+    # Slopes are sampled at every second pixel.
     assert error(here, there) < 0.7 * error(*(2 * np.rint((p - 0.5) / 2) for p in (here, there)))
 
 
-def test_a_weak_corner_is_taken_only_where_there_is_nothing_better():
+def test_a_weak_corner_is_used_only_without_a_stronger_one():
     image, _ = squares(100)
     image[:, 215:] = np.minimum(image[:, 215:], 112)
     every, some = detect_corners(image, 2000, 0.5), detect_corners(image, 60, 0.5)
@@ -152,7 +152,7 @@ def test_a_weak_corner_is_taken_only_where_there_is_nothing_better():
     assert weak.any()
 
 
-def test_each_cell_gives_its_best_before_any_gives_its_second():
+def test_each_cell_gives_its_strongest_before_any_second():
     points = np.array([(5, 5), (8, 8), (12, 12), (85, 5), (88, 30)])
     strengths = np.array([5, 9, 7, 1, 2], np.float32)
     alike = np.zeros(5, bool)
@@ -161,7 +161,7 @@ def test_each_cell_gives_its_best_before_any_gives_its_second():
     assert spread_out(points, strengths, 9, alike).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_those_that_come_first_come_before_the_best_of_the_others():
+def test_priority_points_precede_the_strongest_others():
     points = np.array([(5, 5), (8, 8), (12, 12), (85, 5), (88, 30)])
     strengths = np.array([5, 9, 7, 1, 2], np.float32)
     first = np.array([True, False, True, False, False])
@@ -182,8 +182,8 @@ def test_the_same_image_gives_the_same_bytes(image):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
-def test_slopes_do_not_depend_on_where_in_memory_they_are_worked_out():
-    """Some functions of OpenCV tell another last bit for arrays that begin elsewhere."""
+def test_slopes_do_not_depend_on_memory_alignment():
+    """Some functions of OpenCV round differently for arrays of another alignment."""
     rng = np.random.default_rng(19)
     for _ in range(20):
         noise, seen, held = rng.integers(0, 256, (50, 70), dtype=np.uint8), set(), []
@@ -194,8 +194,8 @@ def test_slopes_do_not_depend_on_where_in_memory_they_are_worked_out():
 
 
 @pytest.mark.parametrize('rows', [20, 52, 96])
-def test_slopes_are_the_same_whatever_stands_far_above_them(image, rows):
+def test_slopes_do_not_depend_on_distant_rows(image, rows):
     whole, below = corner_slopes(image), corner_slopes(image[2 * rows:])
-    # At a border, slopes are taken from what is mirrored there.
+    # At a border, gradients use mirrored pixels.
     assert np.array_equal(whole[rows + 2:], below[2:])
     assert below[2:].any()

@@ -1,4 +1,4 @@
-"""The covariance of a pose is true on scenes other than the one it was calibrated on."""
+"""Consistency of the covariance on scenes other than the one it was calibrated on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
 
 
 def normalised_squared_error(name: str, first: int) -> float:
-    """e^T C^-1 e over the five degrees of freedom of a pair; 5 on average if C is true."""
+    """e^T C^-1 e over the five degrees of freedom of a pair; 5 on average if C is correct."""
     pair = render_pair(name, first, seed=3)
     estimator = TwoViewEstimator(preset('best'))
     pose = estimator.estimate(*(estimator.view(gray, pair.K)
@@ -35,7 +35,7 @@ def normalised_squared_error(name: str, first: int) -> float:
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 
-def test_exact_matches_are_surer_than_any_camera_and_leave_a_covariance_nevertheless():
+def test_exact_matches_have_a_tiny_but_finite_covariance():
     rng = np.random.default_rng(9)
     t = unit(np.array([0.1, 0.2, -1.0]))
     exact = Residuals(np.zeros(100), np.ones(100), 700 * rng.normal(size=(5, 100)),
@@ -46,13 +46,13 @@ def test_exact_matches_are_surer_than_any_camera_and_leave_a_covariance_neverthe
 
 
 def calibrated(K: np.ndarray, f: float = 0.0, cx: float = 0.0, cy: float = 0.0) -> np.ndarray:
-    """Camera matrix that is off by so many pixels."""
+    """Camera matrix with an error of so many pixels."""
     return K + np.array([[f, 0, cx], [0, f, cy], [0, 0, 0]])
 
 
 @pytest.mark.parametrize('camera', [K, SKEWED])
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
-def test_a_wrong_calibration_moves_a_pose_as_its_covariance_says(camera, t):
+def test_a_calibration_error_moves_a_pose_as_its_covariance_predicts(camera, t):
     views, off = two_views(np.random.default_rng(5), t=t, K=camera), 0.5
     loss, count = Loss('geman_mcclure', 3.0), len(views.x)
     sharp = np.random.default_rng(6).uniform(0.5, 2, (count, 1, 2)) * np.eye(2)
@@ -75,9 +75,9 @@ def test_a_wrong_calibration_moves_a_pose_as_its_covariance_says(camera, t):
     np.testing.assert_array_less(np.abs(told - moves @ moves.T), 0.05 * np.outer(size, size))
 
 
-def test_poses_of_a_camera_whose_calibration_is_off_are_as_sure_as_they_say():
-    # Half a pixel, as conventions of where a pixel has its middle differ, is ten times the error
-    # of a pair whose calibration is right.
+def test_covariance_is_consistent_with_calibration_errors():
+    # Half a pixel, as between conventions of the pixel centre, is ten times the error of a pair
+    # with the correct calibration.
     rng, found = np.random.default_rng(0), {0.0: [], 0.5: []}
     estimators = {sigma: TwoViewEstimator(preset('best', calibration_sigma=sigma))
                   for sigma in found}
@@ -92,7 +92,7 @@ def test_poses_of_a_camera_whose_calibration_is_off_are_as_sure_as_they_say():
                 error = np.append(rotation_log(pair.R @ pose.R.T),
                                   sphere_log(pose.t, unit(pair.t)))
                 found[sigma].append(error @ np.linalg.solve(pose.covariance_5, error))
-            # Only what is claimed is another.
+            # Only the covariance differs.
             assert poses[0.0].status is poses[0.5].status is Status.OK
             assert poses[0.0].R.tobytes() == poses[0.5].R.tobytes()
             assert poses[0.0].t.tobytes() == poses[0.5].t.tobytes()
@@ -104,8 +104,8 @@ def test_poses_of_a_camera_whose_calibration_is_off_are_as_sure_as_they_say():
 
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says():
-    # Pairs far from one another, so that their errors are independent. True within a factor of
-    # 2 in variance, 1.4 in standard deviation: errors of real surfaces are no Gaussians.
+    # Distant pairs, with independent errors. Within a factor of 2 in variance, 1.4 in standard
+    # deviation: errors of real surfaces are not Gaussian.
     found = [normalised_squared_error(name, first)
              for name in ('road', 'loop', 'sharp_turn', 'underwater')
              for first in range(5, 100, 19)]
@@ -113,7 +113,7 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert bounds['least'] < np.mean(found) < bounds['most']
 
 
-def test_settling_on_the_opposite_direction_turns_what_goes_with_it():
+def test_flipping_t_flips_its_cross_covariance():
     rng = np.random.default_rng(0)
     t = unit(np.array([0.2, -0.1, -1.0]))
     residuals = Residuals(rng.normal(size=400), np.ones(400), rng.normal(size=(5, 400)),
@@ -127,7 +127,7 @@ def test_settling_on_the_opposite_direction_turns_what_goes_with_it():
     assert np.linalg.matrix_rank(same, 1e-12) == 5
 
 
-def test_repeating_every_match_next_to_itself_makes_no_pose_surer():
+def test_duplicated_matches_do_not_reduce_the_covariance():
     rng = np.random.default_rng(1)
     t = np.array([0.0, 0, 1])
     J, r, places = rng.normal(size=(5, 300)), rng.normal(size=300), rng.uniform(0, 1000, (300, 2))
@@ -139,7 +139,7 @@ def test_repeating_every_match_next_to_itself_makes_no_pose_surer():
     assert np.allclose(once, twice)
 
 
-def test_a_direction_about_which_one_match_decides_is_no_surer_than_that_match():
+def test_a_direction_determined_by_one_match_is_as_uncertain_as_it():
     rng = np.random.default_rng(2)
     t, places, off = np.array([0.0, 0, 1]), rng.uniform(0, 1000, (300, 2)), []
     for _ in range(300):
@@ -150,13 +150,13 @@ def test_a_direction_about_which_one_match_decides_is_no_surer_than_that_match()
         residuals = Residuals(noise - error @ J, np.ones(300), J, sphere_tangents(t))
         covariance = pose_covariance(residuals, Loss(), places, t, False)[0]
         off.append(error / np.sqrt(np.diag(covariance)))
-    # Its residual is a hundredth of its noise; errors are nevertheless no larger than claimed,
+    # Its residual is a hundredth of its noise; errors are nevertheless no larger than predicted,
     # and those of the other parameters hardly smaller.
     typical = np.median(np.abs(off), axis=0) / 0.6745
     assert np.all((typical[:4] > 0.8) & (typical[:4] < 1.05)) and typical[4] < 1
 
 
-def test_a_pose_that_hangs_on_one_match_is_not_known():
+def test_a_pose_that_depends_on_one_match_is_undetermined():
     rng = np.random.default_rng(3)
     t = np.array([0.0, 0, 1])
     J, r, places = rng.normal(size=(5, 300)), rng.normal(size=300), rng.uniform(0, 1000, (300, 2))
@@ -166,7 +166,7 @@ def test_a_pose_that_hangs_on_one_match_is_not_known():
     assert np.isnan(pose_covariance(residuals, Loss(), places, t, False)[0]).all()
 
 
-def test_minima_stay_where_they_are_when_their_keypoints_are_displaced_a_little():
+def test_minima_do_not_follow_small_displacements_of_their_keypoints():
     pair = render_pair('road', 5, seed=1, size=(620, 188))
     estimator = TwoViewEstimator()
     views = [estimator.view(gray, pair.K) for gray in (pair.previous, pair.current)]
@@ -185,14 +185,14 @@ def test_minima_stay_where_they_are_when_their_keypoints_are_displaced_a_little(
         right = np.all([one.usable & (np.abs(one.minima() - y).max(1) < 0.5) for one in fits], 0)
         moved = (fits[1].minima() - fits[0].minima())[right]
         drawn.append((moved * off[right]).sum() / (off[right]**2).sum())
-    # As fitted, paraboloids draw them along by a quarter of the way.
+    # As fitted, paraboloids follow by a quarter of the displacement.
     assert abs(np.mean(drawn)) < 0.1
 
 
 @pytest.mark.parametrize('reach', [0, 40, 80])
-def test_errors_that_reach_over_many_patches_are_counted_as_the_few_that_they_are(reach):
-    # Half of the noise is a field that hardly changes within so many pixels: were each patch to
-    # err by itself, a tenth of the poses would lie within the ellipsoid that ought to hold 95 %.
+def test_errors_correlated_over_many_patches_inflate_the_covariance(reach):
+    # Half of the noise is a field that hardly changes over so many pixels: if patches were taken
+    # as independent, a tenth of the poses would lie within the 95 % ellipsoid.
     rng, t, squares = np.random.default_rng(0), np.array([0.0, 0, 1]), []
     for _ in range(60):
         places = rng.uniform(0, 1, (1500, 2)) * [1200, 400]
@@ -209,31 +209,31 @@ def test_errors_that_reach_over_many_patches_are_counted_as_the_few_that_they_ar
         covariance = pose_covariance(residuals, Loss(), places, t, False)[0]
         squares.append(error @ np.linalg.solve(covariance, error))
     assert np.mean(np.array(squares) < chi2.ppf(0.95, 5)) > 0.9
-    # Nor are they taken to be far larger than they are.
+    # And the covariance is not far too large.
     assert np.median(squares) / chi2.median(5) > 0.4
 
 
 @pytest.mark.parametrize(('share', 'least', 'most'), [(0.01, 1.0, 1.02), (1.0, 1.0, 1.1),
                                                       (100.0, 2.0, 400.0)])
-def test_what_is_claimed_beyond_where_matches_cease_to_agree_is_less_sure(share, least, most):
+def test_profile_widens_where_matches_become_outliers(share, least, most):
     rng = np.random.default_rng(4)
     views = two_views(rng, 400)
     surface = ReprojectionSurface(views.x, views.y)
     problem = jet_problem(views.K, views.x, surface.around(views.y))
     loss, pose = Loss('geman_mcclure', 0.3), Pose(views.R, views.t)
     J = epipolar_residuals(problem, views.R, views.t).jacobian
-    # Of noise of a tenth of where the loss bends: what is claimed is within that, or far beyond.
+    # The noise is a tenth of the scale of the loss: the bound is within it, or far beyond.
     claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
     told, _ = widened_by_profile(claimed, problem, pose, loss)
     wider = np.linalg.eigvals(np.linalg.solve(claimed, told)).real
     assert wider.min() > least - 1e-9 and wider.max() < most
-    # A sum of squares rises as its curvature says, as long as the pose is bent by a little only.
+    # A sum of squares rises as its curvature predicts, for small differences of the pose.
     squares, _ = widened_by_profile(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
 
 
 @pytest.mark.parametrize('way', [2, -2])
-def test_a_pose_beside_its_minimum_is_unsure_towards_it_to_whichever_side_that_lies(way):
+def test_a_pose_off_its_minimum_is_widened_towards_either_side(way):
     views = two_views(np.random.default_rng(5), count=300)
     surface = ReprojectionSurface(views.x, views.y)
     problem = jet_problem(views.K, views.x, surface.around(views.y))
@@ -246,8 +246,8 @@ def test_a_pose_beside_its_minimum_is_unsure_towards_it_to_whichever_side_that_l
         assert axis @ told @ axis > 50 * variance
 
 
-def test_few_errors_tell_a_covariance_whose_bounds_hold_nevertheless():
-    # As many cells as matches, and few of them: errors over what they say are no Gaussian.
+def test_bounds_hold_for_a_covariance_from_a_small_sample():
+    # As many cells as matches, and few of them: normalised errors are not Gaussian.
     rng, t, squares = np.random.default_rng(5), np.array([0.0, 0, 1]), []
     for _ in range(1000):
         J, noise = rng.normal(size=(5, 16)), rng.normal(size=16)

@@ -1,4 +1,4 @@
-"""The two-view estimator: how near it comes to what is true, to what is possible, and no crash."""
+"""The two-view estimator: accuracy against truth and bounds, failure handling, robustness."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ MOTIONS = {'sideways': SIDEWAYS, 'forward': FORWARD, 'backward': BACKWARD}
 NOISE = 0.5  # pixels, in each coordinate of y
 TRIALS = 200
 
-# The factor by which the covariance exceeds what 300 independent matches would give. It is never
-# taken to be smaller than small cells tell, and they tell of some 150 errors (Hotelling's T^2);
-# and all that is seen in one of twenty large cells may be shifted by 0.12 of a match's noise.
+# Factor of the covariance over that of 300 independent matches: it is never below what small cells
+# allow, which amount to some 150 errors (Hotelling's T^2), and what is seen in one of twenty large
+# cells may be shifted by 0.12 of the noise of a match.
 CAUTION = 1.1 * (1 + 20 / 150) + 0.12**2 * 300 / 20
 
 
@@ -74,10 +74,10 @@ def errors_of(result, R, t):
 
 def cramer_rao(seen):
     """
-    Find the least covariance (5, 5) that an unbiased estimator of the pose can have.
+    Return the Cramer-Rao bound (5, 5) of the covariance of an unbiased estimator of the pose.
 
     Inverse of the Fisher information about the pose and every point's depth, with the depths
-    eliminated; from projected points alone, by numeric derivatives, with no epipolar line in it.
+    eliminated; from projected points alone, by numeric derivatives, without epipolar lines.
     Coordinates: rotation vector from the left, tangents of t.
     """
     step, tangents = 1e-6, sphere_tangents(seen.t)
@@ -98,7 +98,7 @@ def cramer_rao(seen):
 
 @cache
 def trials(motion, loss):
-    """Re-estimate one geometry under fresh noise, over and over, by re-projection error."""
+    """Estimate one geometry repeatedly under fresh noise, by re-projection error."""
     seen = two_views(np.random.default_rng(41), count=300, t=MOTIONS[motion])
     view = uniform_view()
     estimator = TwoViewEstimator(preset('best', method='rpe', loss=loss))
@@ -110,7 +110,7 @@ def trials(motion, loss):
 
 
 @pytest.mark.parametrize('motion', MOTIONS)
-def test_reprojection_error_comes_as_near_to_the_true_pose_as_the_cramer_rao_bound_lets_it(motion):
+def test_reprojection_error_reaches_the_cramer_rao_bound(motion):
     seen, results = trials(motion, 'none')
     tangents = sphere_tangents(seen.t)
     errors = np.array([np.concatenate([
@@ -128,8 +128,8 @@ def test_reprojection_error_comes_as_near_to_the_true_pose_as_the_cramer_rao_bou
 @pytest.mark.parametrize(('motion', 'loss'), [
     *((motion, 'none') for motion in MOTIONS), ('sideways', 'geman_mcclure'),
     ('forward', 'cauchy'), ('backward', 'geman_mcclure')])
-def test_the_covariance_tells_how_the_pose_scatters(motion, loss):
-    """In all five directions alike, also where the sign of t was found only at the end."""
+def test_the_covariance_is_that_of_the_scatter_of_the_pose(motion, loss):
+    """In all five directions, also if the sign of t is flipped at the end."""
     seen, results = trials(motion, loss)
     whitened, squares = [], []
     for r in results:
@@ -147,8 +147,8 @@ def test_the_covariance_tells_how_the_pose_scatters(motion, loss):
     assert least > 0.45 and most < 1.8
 
 
-def test_matches_in_a_handful_of_places_do_not_pretend_to_know_how_sure_the_pose_is():
-    """Neighbours err together: five groups of them are no more than five witnesses."""
+def test_matches_in_a_handful_of_cells_have_no_covariance():
+    """Errors are correlated in a cell: five cells do not determine a covariance."""
     rng = np.random.default_rng(56)
     seen = two_views(rng, count=4000)
     middle = (seen.x % 32 > 1).all(1) & (seen.x % 32 < 31).all(1)
@@ -174,7 +174,7 @@ def test_without_noise_the_pose_is_exact(motion, method, preset_name):
     assert result.inliers.all()
 
 
-def test_a_third_of_wrong_matches_is_told_from_the_others():
+def test_a_third_of_outliers_is_identified():
     rng = np.random.default_rng(44)
     seen = two_views(rng, count=300)
     y = seen.y + rng.normal(0, 0.2, seen.y.shape)
@@ -201,7 +201,7 @@ def test_the_five_point_method_is_opencvs_with_the_sign_of_depth_for_chirality()
     assert np.allclose(result.R, R, atol=1e-12) and np.allclose(result.t, t.ravel(), atol=1e-12)
 
 
-def test_the_starting_poses_are_the_known_ones_and_driving_straight_ahead_at_each_of_their_turns():
+def test_starts_are_the_known_poses_and_forward_motion_with_their_rotations():
     turn = Rotation.from_rotvec(TURN).as_matrix()
     robust, prior = Pose(turn, np.array([1.0, 0, 0])), Pose(turn.T, np.array([0, 1.0, 0]))
     ahead = np.array([0, 0, -1.0])
@@ -215,7 +215,7 @@ def test_the_starting_poses_are_the_known_ones_and_driving_straight_ahead_at_eac
 
 @pytest.mark.parametrize('count', [0, 7, 19])
 @pytest.mark.parametrize('method', METHODS)
-def test_too_few_matches_have_a_status_of_their_own(method, count):
+def test_too_few_matches_are_a_status(method, count):
     seen = two_views(np.random.default_rng(47), count=count)
     result = TwoViewEstimator(EstimatorConfig(method=method, min_matches=20)).estimate_matched(
         uniform_view(), uniform_view(), seen.x, seen.y)
@@ -223,7 +223,7 @@ def test_too_few_matches_have_a_status_of_their_own(method, count):
     assert np.array_equal(result.R, np.eye(3)) and not result.t.any()
 
 
-def test_turning_on_the_spot_is_told_from_going():
+def test_pure_rotation_is_distinguished_from_translation():
     seen = two_views(np.random.default_rng(48), near=1e5, far=1e6)  # as good as without t
     y = seen.y + np.random.default_rng(49).normal(0, 0.1, seen.y.shape)
     estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
@@ -234,20 +234,20 @@ def test_turning_on_the_spot_is_told_from_going():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_turn_that_makes_up_for_a_way_too_short_to_be_told_says_how_far_it_may_be_bent(seed):
+def test_a_rotation_that_absorbs_little_parallax_has_a_wider_covariance(seed):
     seen = two_views(np.random.default_rng(seed), count=500, near=500, far=1500)
     y = seen.y + np.random.default_rng(seed + 50).normal(0, 0.03, seen.y.shape)
     result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
         uniform_view(), uniform_view(), seen.x, y)
     assert result.status == Status.NO_PARALLAX
     off = rotation_log(seen.R @ result.R.T)
-    # All go to one side alike by half a pixel and more, which a turn by itself does too.
+    # All points move to one side by half a pixel and more, which a rotation explains as well.
     assert np.linalg.norm(off) > 0.5 / 700
     assert off @ np.linalg.solve(result.covariance_6[:3, :3], off) < 16.3
 
 
 class WatchedSurface(DescriptorSurface):
-    """A descriptor surface that remembers at which keypoints it was asked for."""
+    """A descriptor surface that records the keypoints at which it is sampled."""
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
@@ -260,9 +260,9 @@ class WatchedSurface(DescriptorSurface):
 
 class Wall:
     """
-    A wall seen two pixels further to the left, tracked from where it was, round by round.
+    A wall seen two pixels further to the left, tracked from its previous place, round by round.
 
-    tracks: what Algorithm 1 gives after 1, 2, ... rounds; keypoints: (N, 2) where each looked.
+    tracks: results of Algorithm 1 after 1, 2, ... rounds; keypoints: (N, 2) where each sampled.
     """
 
     def __init__(self, step: str) -> None:
@@ -276,7 +276,7 @@ class Wall:
         sideways = Pose(np.eye(3), np.array([-1.0, 0, 0]))
         self.tracks, self.keypoints = [], []
         for rounds in range(1, 6):
-            # A sum of squares has no other minimum to end in than the round before.
+            # A sum of squares has no other minimum than that of the previous round.
             config = replace(whole, step=step, step_share=0.2, max_iterations=rounds, loss='none',
                              epsilon=1e-12, cull_outside=False, join_matches=False)
             surface = WatchedSurface(*views, x, config)
@@ -287,7 +287,7 @@ class Wall:
 
 
 @pytest.mark.parametrize('step', ['share', 'pixel'])
-def test_keypoints_step_towards_their_optimum_by_a_share_of_the_way_or_a_pixel_at_most(step):
+def test_keypoints_move_by_a_share_of_the_distance_or_one_pixel(step):
     wall, lengths = Wall(step), []
     for n, (before, after) in enumerate(pairwise(wall.keypoints)):
         way = wall.tracks[n].y_opt - before
@@ -300,7 +300,7 @@ def test_keypoints_step_towards_their_optimum_by_a_share_of_the_way_or_a_pixel_a
 
 
 def test_culled_matches_keep_the_loss_they_had_last():
-    """Keypoints at the left border walk on towards their optimum until they have no surface."""
+    """Keypoints at the left border move towards their optimum until they have no surface."""
     wall = Wall('pixel')
     lost = wall.tracks[0].voting & ~wall.tracks[-1].voting
     assert 3 <= lost.sum() < len(lost) / 4
@@ -309,7 +309,7 @@ def test_culled_matches_keep_the_loss_they_had_last():
         assert not (after.voting & ~before.voting).any()  # a culled match stays out
         out = ~after.voting
         assert np.array_equal(before.losses[out], after.losses[out])
-        # The others' follow the pose, if only by a millionth: the wall is found in two rounds.
+        # The others follow the pose, if only by a millionth: the wall converges in two rounds.
         assert not np.array_equal(before.losses[~out], after.losses[~out])
     assert np.isfinite(wall.tracks[-1].losses[lost]).all()
 
@@ -356,12 +356,12 @@ def test_descriptors_do_better_than_points_with_the_same_matches_on_rendered_fra
 
 @pytest.mark.parametrize('scene', ['rotation', 'standstill'])
 @pytest.mark.parametrize(('method', 'first'), [('djet', 3), ('pjet', 3), ('rpe', 0)])
-def test_a_rendered_camera_that_stays_on_the_spot_has_no_parallax(scene, method, first):
+def test_a_rendered_static_camera_has_no_parallax(scene, method, first):
     """
-    Images tell it, on any frames; points not on all.
+    Images show it on any frames, points not on all.
 
-    From frame 3 on, half of ORB's corners stay on their row of whole pixels, so that going
-    sideways explains them exactly, and re-projection error takes it for the truth.
+    From frame 3 on, half of ORB's corners stay on their row of integer pixels, so that a sideways
+    motion fits them exactly, and re-projection error prefers it.
     """
     K, frames, motions = drive(scene, 3, first)
     estimator = TwoViewEstimator(preset('best', method=method))
@@ -406,7 +406,7 @@ def test_the_final_step_ends_on_the_epipolar_line(pair, method):
 
 
 @pytest.mark.parametrize('threads', [1, 2])
-def test_stage_times_add_up_to_the_time_it_took(pair, threads):
+def test_stage_times_add_up_to_the_total(pair, threads):
     previous, current, _ = pair
     before = cv2.getNumThreads()
     cv2.setNumThreads(threads)
@@ -422,7 +422,7 @@ def test_stage_times_add_up_to_the_time_it_took(pair, threads):
 
 
 @pytest.mark.parametrize(('limit', 'value'), [('max_noise', 0.7), ('min_agreeing', 1.0)])
-def test_a_pair_is_given_up_beyond_its_limits_before_it_is_judged(limit, value):
+def test_estimation_stops_beyond_the_limits_before_the_verdict(limit, value):
     scene = make_scene('road', size=(620, 188))
     estimator = TwoViewEstimator()
     a, b = (estimator.view(scene.render(pose, i), scene.K)
@@ -441,7 +441,7 @@ def test_a_pair_is_given_up_beyond_its_limits_before_it_is_judged(limit, value):
     assert 'result' not in given_up.timings
 
 
-def test_the_time_of_a_second_attempt_is_added_to_that_of_the_first(pair):
+def test_stage_times_of_a_second_attempt_are_added(pair):
     previous, current, _ = pair
     matches = TwoViewEstimator().match(previous, current)
     first = {'matching': 1.0, 'starts': 5.0, 'jet': 7.0, 'result': 2.0}
@@ -452,7 +452,7 @@ def test_the_time_of_a_second_attempt_is_added_to_that_of_the_first(pair):
         assert first[stage] < stages[stage] < first[stage] + 1.0
 
 
-def test_the_result_tells_the_hamming_distances_at_the_final_places(pair):
+def test_the_result_has_the_hamming_distances_at_y_opt(pair):
     previous, current, _ = pair
     result = TwoViewEstimator().estimate(previous, current)
     known = np.flatnonzero(np.isfinite(result.hamming))
@@ -476,7 +476,7 @@ def test_stepping_keypoints_towards_their_optimum_lowers_their_descriptor_distan
     assert distances[2] < 0.95 * distances[0]
 
 
-def test_the_paper_trusts_epipolar_lines_however_near_to_the_epipole(pair):
+def test_the_paper_preset_trusts_epipolar_lines_near_the_epipole(pair):
     previous, current, _ = pair
     printed = preset('paper', max_iterations=1)
     assert printed.epipole_blur == 0
@@ -486,7 +486,7 @@ def test_the_paper_trusts_epipolar_lines_however_near_to_the_epipole(pair):
     assert len(x) and not np.array_equal(as_printed, blurred)
 
 
-def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_foreseen():
+def test_features_are_searched_widely_after_a_step_twice_as_long():
     scene = make_scene('road', size=(620, 188))
     estimator = TwoViewEstimator()
     a, b, c = (estimator.view(scene.render(pose, i), scene.K)
@@ -495,7 +495,7 @@ def test_after_a_step_twice_as_long_features_are_not_only_sought_where_they_are_
     assert len(foreseen.x) > 0.9 * len(estimator.estimate(a, c).x)
 
 
-def test_after_a_jerk_features_are_found_by_the_turn_that_the_largest_tell():
+def test_features_are_found_after_a_jerk_by_the_rotation_of_the_largest():
     scene = make_scene('road', size=(620, 376))
     estimator = TwoViewEstimator()
     poses = scene.trajectory(3)
@@ -503,7 +503,7 @@ def test_after_a_jerk_features_are_found_by_the_turn_that_the_largest_tell():
     a, b, c = (estimator.view(scene.render(pose, i), scene.K) for i, pose in enumerate(poses))
     alone = estimator.estimate(b, c)
     result = estimator.estimate(b, c, estimator.estimate(a, b))
-    # Nothing foresees them.
+    # Without a prediction.
     assert 'starts' in result.timings
     assert len(result.x) / result.sought > 0.8 * len(alone.x) / alone.sought
     true = np.linalg.inv(poses[2]) @ poses[1]
@@ -511,7 +511,7 @@ def test_after_a_jerk_features_are_found_by_the_turn_that_the_largest_tell():
     assert np.degrees(direction_angle(result.t, true[:3, 3])) < 0.3
 
 
-def test_one_mere_turn_after_another_needs_no_starts_and_has_no_rivals():
+def test_consecutive_pure_rotations_need_no_starts_and_have_no_rivals():
     scene = make_scene('rotation', size=(620, 376))
     estimator = TwoViewEstimator()
     poses = scene.trajectory(3)
@@ -523,7 +523,7 @@ def test_one_mere_turn_after_another_needs_no_starts_and_has_no_rivals():
     assert np.degrees(rotation_angle(result.R, true[:3, :3])) < 0.01
 
 
-def test_a_prior_helps_or_does_no_harm(pair):
+def test_a_prior_never_degrades_the_pose(pair):
     previous, current, (R, t) = pair
     estimator = TwoViewEstimator()
     alone = estimator.estimate(previous, current)
@@ -537,7 +537,7 @@ def test_a_prior_helps_or_does_no_harm(pair):
 
 
 @pytest.mark.parametrize('method', METHODS)
-def test_a_black_frame_is_a_status_and_no_crash(pair, method):
+def test_a_black_frame_gives_a_status(pair, method):
     previous, current, _ = pair
     estimator = TwoViewEstimator(EstimatorConfig(method=method))
     black = estimator.view(np.zeros_like(current.gray), current.K)
@@ -563,7 +563,7 @@ def test_steps_of_nine_metres_through_leaves_are_found_among_mostly_false_matche
 # Real frames.
 
 def pair_from_the_truth(kitti: Path, first: int) -> tuple[RelativePose, Pose]:
-    """Estimate a pair of frames indoors with its true motion as a guess, and give that too."""
+    """Estimate a pair of indoor frames with its true motion as a guess, and return both."""
     indoor = kitti.parent / 'tartanair/sequences/indoor'
     if not indoor.is_dir():
         pytest.skip(f'{indoor} is not there')
@@ -571,21 +571,21 @@ def pair_from_the_truth(kitti: Path, first: int) -> tuple[RelativePose, Pose]:
     estimator = TwoViewEstimator()
     views = [estimator.view(sequence.image(i), sequence.K) for i in range(2)]
     true_motion = np.linalg.inv(sequence.poses[1]) @ sequence.poses[0]
-    # That the right one is among them is left to no RANSAC.
+    # So that the right basin does not depend on RANSAC.
     near = Pose(true_motion[:3, :3], unit(true_motion[:3, 3]))
     return estimator.estimate(*views, known=Known(guess=near)), near
 
 
 @pytest.mark.parametrize('first', [1, 2])
-def test_basins_are_told_apart_by_what_each_comes_to_with_patches_of_its_own(kitti: Path, first):
-    """On panels without texture a wrong one fits matches as well, seen as itself has them."""
+def test_basins_are_compared_after_each_is_refined_with_its_own_warps(kitti: Path, first):
+    """On textureless panels a wrong pose fits as well under its own warps."""
     result, near = pair_from_the_truth(kitti, first)
     assert np.degrees(rotation_angle(result.R, near.R)) < 0.1
     assert np.degrees(direction_angle(result.t, near.t)) < 2
 
 
-def test_of_two_poses_that_cost_the_same_the_right_one_is_kept_and_none_is_sure(kitti: Path):
-    """Which of them is taken hangs on the corners that a version of OpenCV finds."""
+def test_two_poses_of_equal_cost_are_ambiguous(kitti: Path):
+    """Which of them is taken depends on the corners that OpenCV's version finds."""
     result, near = pair_from_the_truth(kitti, 152)
     held = [Pose(result.R, result.t), *result.rivals]
     assert min(np.degrees(rotation_angle(pose.R, near.R)) for pose in held) < 0.1
@@ -604,16 +604,16 @@ def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_na
               for method in ('djet', 'rpe', 'five_point')}
     points, descriptors = errors['rpe'].mean(0), errors['djet'].mean(0)
     assert descriptors[0] < points[0]
-    # On sub-pixel corners both are within what the truth's directions are good for, here.
+    # With sub-pixel corners both are within the accuracy of the true directions here.
     assert descriptors[1] < points[1] or max(descriptors[1], points[1]) < 0.35
     assert (points < errors['five_point'].mean(0)).all()
     assert errors['djet'][:, 0].max() < 0.1
 
 
-# Anything else.
+# Input other than images of a scene.
 
 def degenerate(kind, rng, count):
-    """Make matches (x, y) of sorts that no camera would give, and of some that one would."""
+    """Return degenerate matches (x, y) of several kinds, and realistic ones."""
     x, y = rng.uniform((0, 0), (160, 120), (2, count, 2))
     one, right = np.tile(x[:1], (count, 1)), np.array([5.0, 0.0])
     level = np.column_stack([x[:, 0], np.full(count, 60.0)])
@@ -645,11 +645,10 @@ def small_views():
        images=st.tuples(*2 * [st.integers(0, 2)]),
        indefinite=st.sampled_from(['project', 'drop', 'keep']))
 @settings(max_examples=200, deadline=None)
-# Places of most matches, by surfaces and by gray levels, lie exactly on one another.
+# Surfaces and photometric alignment place most matches identically.
 @example(kind='half still', count=10, seed=1, method='pjet', preset_name='best', images=(0, 0),
          indefinite='project')
-def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, preset_name, images,
-                                                   indefinite):
+def test_no_finite_matches_raise(kind, count, seed, method, preset_name, images, indefinite):
     x, y = degenerate(kind, np.random.default_rng(seed), count)
     views = [small_views()[i] for i in images]
     config = preset(preset_name, method=method, min_matches=8, indefinite=indefinite)
@@ -665,8 +664,8 @@ def test_no_finite_matches_make_the_estimator_fail(kind, count, seed, method, pr
 
 @pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 @pytest.mark.parametrize('method', ['djet', 'rpe'])
-def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
-    """Some hundred matches of noise always fit some essential matrix."""
+def test_random_matches_determine_no_motion(method, preset_name):
+    """Some hundred random matches always fit some essential matrix."""
     estimator = TwoViewEstimator(preset(preset_name, method=method))
     rng = np.random.default_rng(57)
     camera = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
@@ -677,8 +676,8 @@ def test_matches_that_agree_by_chance_alone_tell_no_motion(method, preset_name):
 
 
 @pytest.mark.parametrize('method', ['rpe', 'five_point'])
-def test_what_a_start_leaves_out_counts_among_the_matches_that_may_agree_by_chance(method):
-    """Those that RANSAC leaves agree with one another, however many it was offered."""
+def test_outliers_of_a_start_count_as_tested_matches(method):
+    """The inliers of RANSAC agree with each other, however many matches were tested."""
     estimator = TwoViewEstimator(preset('best', method=method, starts='five_point'))
     camera = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
@@ -694,8 +693,8 @@ def test_what_a_start_leaves_out_counts_among_the_matches_that_may_agree_by_chan
 
 @pytest.mark.parametrize('goes', [pose(x=0.25), pose(x=0.2, z=0.1, yaw=-0.01),
                                   pose(x=0.1, z=0.3)])
-def test_the_twin_motion_of_a_plane_is_not_taken_for_the_cameras(goes):
-    """Three planes, one of them behind most of the matches: it looks alike under two motions."""
+def test_the_twin_motion_of_a_plane_is_not_chosen(goes):
+    """Three planes, one of them behind most of the matches, which two motions explain."""
     cards, estimator = Cards(), TwoViewEstimator()
     true = np.linalg.inv(goes)
     for seed in range(6):
@@ -705,7 +704,7 @@ def test_the_twin_motion_of_a_plane_is_not_taken_for_the_cameras(goes):
         assert errors_of(result, true[:3, :3], true[:3, 3])[1] < 10
 
 
-def test_views_of_two_cameras_are_no_pair():
+def test_views_of_two_cameras_are_rejected():
     view = uniform_view()
     for other in (replace(view, K=np.diag([1, 1.5, 1]) @ view.K),
                   replace(view, gray=view.gray[:-1])):
@@ -717,18 +716,18 @@ def test_views_of_two_cameras_are_no_pair():
 
 @pytest.mark.parametrize('image', [np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60)),
                                    np.zeros((40, 60), np.uint16)])
-def test_what_is_no_gray_image_of_8_bits_is_refused(image):
+def test_an_image_other_than_8_bit_gray_is_rejected(image):
     with pytest.raises(ValueError, match='expected an image'):
         TwoViewEstimator().view(image, K)
 
 
-def test_what_is_no_camera_matrix_is_refused():
-    with pytest.raises(ValueError, match='its K'):
+def test_a_wrong_camera_matrix_is_rejected():
+    with pytest.raises(ValueError, match='and K'):
         TwoViewEstimator().view(np.zeros((40, 60), np.uint8), np.eye(3, 4))
 
 
 @pytest.mark.parametrize('method', METHODS)
-def test_matches_may_be_whole_numbers_but_not_none(method):
+def test_matches_may_be_integers_but_must_be_finite(method):
     views, estimator = small_views()[:2], TwoViewEstimator(preset('best', method=method))
     x = np.rint(np.random.default_rng(60).uniform((20, 20), (140, 100), (60, 2)))
     whole, exact = (estimator.estimate_matched(*views, places, places + np.array([3, 0], kind))
@@ -740,7 +739,7 @@ def test_matches_may_be_whole_numbers_but_not_none(method):
         estimator.estimate_matched(*views, x, x)
 
 
-def test_a_plane_starts_from_its_motion_among_others():
+def test_planar_starts_include_the_motion_of_a_plane():
     rng = np.random.default_rng(58)
     x = rng.uniform((0, 0), SIZE, (200, 2))
     R, t = Rotation.from_rotvec(TURN).as_matrix(), np.array([0.3, 0.1, -0.2])
@@ -753,7 +752,7 @@ def test_a_plane_starts_from_its_motion_among_others():
 
 
 def twin_motions(t: Sequence[float]) -> tuple[np.ndarray, np.ndarray, list[Pose]]:
-    """Give matches on one plane seen on a way t, and the two motions that lie on their lines."""
+    """Return matches on one plane seen under a translation t, and both motions that fit."""
     rng = np.random.default_rng(59)
     x = rng.uniform((0, 0), SIZE, (200, 2))
     R = Rotation.from_rotvec(TURN).as_matrix()
@@ -767,13 +766,13 @@ def twin_motions(t: Sequence[float]) -> tuple[np.ndarray, np.ndarray, list[Pose]
 
 
 def shares_in_front(motion: Pose, x: np.ndarray, y: np.ndarray) -> list[float]:
-    """Tell how many points lie in front of both cameras, for each of the signs of t."""
+    """Return the numbers of points in front of both cameras, for each sign of t."""
     return [in_front(motion.R, sign * motion.t, rays(K, x), rays(K, y)).mean()
             for sign in (1, -1)]
 
 
 @pytest.mark.parametrize('which', [0, 1])
-def test_of_two_motions_that_explain_a_plane_alike_the_one_like_the_motion_before_is_taken(which):
+def test_the_prior_decides_between_two_motions_of_a_plane(which):
     x, y, motions = twin_motions((0.2, 0.1, -0.3))
     assert all(max(shares_in_front(motion, x, y)) == 1 for motion in motions)
     before = RelativePose(Status.OK, motions[which].R, motions[which].t)
@@ -783,7 +782,7 @@ def test_of_two_motions_that_explain_a_plane_alike_the_one_like_the_motion_befor
     assert abs(result.t @ before.t) > np.cos(0.1)
 
 
-def test_a_motion_that_has_points_behind_the_camera_is_not_taken_for_being_like_the_one_before():
+def test_the_prior_does_not_outweigh_chirality():
     x, y, (own, twin) = twin_motions((0.3, 0.1, -0.2))
     assert max(shares_in_front(own, x, y)) == 1 and max(shares_in_front(twin, x, y)) < 0.9
     result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
@@ -792,7 +791,7 @@ def test_a_motion_that_has_points_behind_the_camera_is_not_taken_for_being_like_
     assert result.t @ own.t > np.cos(0.1)
 
 
-def test_a_motion_that_explains_less_is_not_taken_for_being_like_the_one_before():
+def test_the_prior_does_not_outweigh_a_better_fit():
     seen = two_views(np.random.default_rng(60))
     before = RelativePose(Status.OK, Rotation.from_rotvec([0, 0.05, 0]).as_matrix() @ seen.R,
                           unit(np.cross(seen.t, [0, 1, 0])))
@@ -801,11 +800,11 @@ def test_a_motion_that_explains_less_is_not_taken_for_being_like_the_one_before(
     assert max(errors_of(result, seen.R, seen.t)) < 0.1
 
 
-def test_points_without_any_plane_have_no_planar_start():
+def test_points_without_a_plane_have_no_planar_start():
     assert planar_starts(K, np.zeros((30, 2)), np.ones((30, 2)), 1.0) == []
 
 
-def test_a_camera_matrix_cut_out_of_a_larger_one_is_as_good_as_any():
+def test_a_camera_matrix_may_be_a_view_of_a_larger_array():
     seen = two_views(np.random.default_rng(59))
     P = np.hstack([K, np.ones((3, 1))])
     for robust in (False, True):
@@ -815,8 +814,8 @@ def test_a_camera_matrix_cut_out_of_a_larger_one_is_as_good_as_any():
 
 @pytest.mark.parametrize('robust', [False, True])
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD])
-def test_pixels_that_are_aslant_start_as_exactly_as_any(robust, t):
-    """Plain RANSAC of OpenCV takes the axes of all sensors to be at right angles."""
+def test_skew_does_not_affect_the_start(robust, t):
+    """Plain RANSAC of OpenCV ignores skew."""
     for seed in range(5):
         seen = two_views(np.random.default_rng(seed), t=t, K=SKEWED)
         start, inliers = five_point(SKEWED, seen.x, seen.y, 1.0, robust)

@@ -16,7 +16,7 @@ SIZE = (320, 240)
 
 @pytest.fixture(scope='module')
 def pair():
-    """Features of two pictures of the same wall, the second a little turned and brighter."""
+    """Features of two images of the same wall, the second rotated a little and brighter."""
     image = textured(np.random.default_rng(21), SIZE)
     turned = cv2.warpAffine(image, cv2.getRotationMatrix2D((160, 120), 4, 1.02), SIZE,
                             borderMode=cv2.BORDER_REFLECT)
@@ -56,7 +56,7 @@ def test_matching_everywhere_gives_mutual_nearest_neighbours(pair):
 
 
 def scores(previous, current, radius):
-    """Give bits (N, M) by which descriptors differ, and more with the way; inf across octaves."""
+    """Return descriptor distances (N, M), higher with the displacement, inf across octaves."""
     ways = np.linalg.norm(previous.points[:, None] - current.points, axis=2)
     apart = distances(previous, current) + 32 * (ways / radius)**2
     octaves = np.abs(previous.octaves[:, None].astype(int) - current.octaves)
@@ -86,7 +86,7 @@ def test_no_mutual_best_match_is_missing(pair, radius):
     assert expected <= {(i, j) for i, j in match_nearby(*pair, radius).tolist()}
 
 
-def test_of_two_that_look_alike_the_nearer_is_taken(pair):
+def test_the_nearer_of_two_similar_features_is_matched(pair):
     wall = pair[0]
     twice = Features.described(*(np.concatenate([getattr(wall, name)] * 2) for name in (
         'points', 'octaves', 'angles', 'responses', 'descriptors')))
@@ -95,7 +95,7 @@ def test_of_two_that_look_alike_the_nearer_is_taken(pair):
     assert (columns < len(wall)).mean() > 0.95
 
 
-def test_twins_do_not_both_match_the_same_feature(pair):
+def test_identical_descriptors_do_not_match_the_same_feature(pair):
     one = some(pair[0], slice(0, 1))
     twins = some(pair[0], [0, 0, 0])
     assert len(match_nearby(twins, one, 60.0)) == len(match_nearby(one, twins, 60.0)) == 1

@@ -1,4 +1,4 @@
-"""Two-view geometry, against exact points and against formulas of other making."""
+"""Two-view geometry, against exact points and independent formulas."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_tangents_of_the_sphere_are_orthonormal_everywhere(t):
     assert np.allclose(basis.T @ basis, np.eye(3), atol=1e-14)
 
 
-def test_of_many_vectors_each_gets_what_it_gets_alone():
+def test_vectorised_functions_agree_with_single_calls():
     v = np.random.default_rng(2).normal(size=(7, 3))
     assert np.allclose(rotation_exp(v), [rotation_exp(one) for one in v], atol=1e-14)
     assert (sphere_tangents(unit(v)) == [sphere_tangents(unit(one)) for one in v]).all()
@@ -70,7 +70,7 @@ def test_a_matrix_times_its_inverse_is_one(A):
     assert np.allclose(inverses(A) @ A, np.eye(2), atol=1e-9)
 
 
-def test_unit_vectors_have_length_one_and_nothing_becomes_of_zero():
+def test_unit_vectors_have_length_one_and_zero_stays_zero():
     v = unit(np.array([[3.0, 0, 4.0], [0, 0, 0], [1e-100, 0, 0]]))
     assert np.allclose(np.linalg.norm(v, axis=1), [1, 0, 1])
     assert np.allclose(v[0], [0.6, 0, 0.8])
@@ -116,7 +116,7 @@ def test_the_distance_to_a_line_is_that_to_the_nearest_of_its_points_and_changes
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
 @pytest.mark.parametrize(('near', 'far'), [(4.0, 40.0), (1e3, 1e5)])
 def test_only_the_true_one_of_four_motions_has_all_points_in_front(t, near, far):
-    """A thousand baselines away, too: cv2.recoverPose would leave such points out."""
+    """Also a thousand baselines away, where cv2.recoverPose ignores points."""
     seen = two_views(np.random.default_rng(3), t=t, near=near, far=far)
     rays_x, rays_y = rays(K, seen.x), rays(K, seen.y)
     half_turn = Rotation.from_rotvec(np.pi * seen.t).as_matrix()
@@ -127,7 +127,7 @@ def test_only_the_true_one_of_four_motions_has_all_points_in_front(t, near, far)
         assert not in_front(R, t, rays_x, rays_y).any()
 
 
-def test_chirality_is_told_for_each_point_by_itself():
+def test_chirality_is_decided_per_point():
     seen = two_views(np.random.default_rng(4), t=SIDEWAYS)
     rays_y = rays(K, seen.y)
     behind = np.arange(len(rays_y)) % 3 == 0
@@ -147,7 +147,7 @@ def test_depth_ratio_is_depth_before_over_depth_after(t):
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
-def test_a_patch_that_faces_one_camera_is_warped_as_its_points_move(t):
+def test_a_fronto_parallel_patch_is_warped_as_its_points_move(t):
     seen = two_views(np.random.default_rng(7), t=t, near=3, far=30)
     grown = depth_ratio(seen.R, seen.t, rays(K, seen.x), rays(K, seen.y))
     warp = patch_warp(K, seen.R, seen.y, grown)
@@ -157,7 +157,7 @@ def test_a_patch_that_faces_one_camera_is_warped_as_its_points_move(t):
         assert np.allclose(there - seen.y, moved[:, :2] / (1 + moved[:, 2:]), atol=1e-8)
 
 
-def test_patches_of_several_cameras_are_warped_as_those_of_each():
+def test_patch_warps_of_several_cameras_agree_with_single_ones():
     rng = np.random.default_rng(8)
     R, t = rotation_exp(rng.normal(0, 0.1, (5, 3))), rng.normal(size=(5, 3))
     y, grown, slope = rng.uniform(0, 300, (5, 2)), rng.uniform(0.5, 2, 5), rng.normal(size=(5, 2))
@@ -168,14 +168,14 @@ def test_patches_of_several_cameras_are_warped_as_those_of_each():
         assert np.allclose(together[some], alone, rtol=1e-12)
 
 
-def test_stretches_are_the_singular_values():
+def test_singular_values_are_those_of_numpy():
     warps = np.random.default_rng(8).normal(size=(50, 2, 2))
     warps[0] = 2 * np.eye(2)
     expected = np.linalg.svd(warps, compute_uv=False)
     assert np.allclose(stretches(warps), expected.T[::-1])
 
 
-def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():
+def test_a_rotation_fit_is_exact_and_robust_to_outliers():
     rng = np.random.default_rng(5)
     seen = two_views(rng, count=200)
     rays_x = rays(K, seen.x)
@@ -186,7 +186,7 @@ def test_a_rotation_is_fitted_to_rays_exactly_and_not_turned_by_what_moves():
     assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-4
 
 
-def test_a_rotation_fitted_to_rays_of_one_plane_is_no_mirror():
+def test_a_rotation_fitted_to_coplanar_rays_is_no_reflection():
     rays_x = np.array([[-0.5, 0, 1], [-0.2, 0, 1], [0.3, 0, 1], [0.4, 0, 1]])
     for turn in ((0.1, 0.2, 0.3), (-0.3, 0, 0.5), (0, 0, np.pi), (np.pi, 0, 0)):
         R = Rotation.from_rotvec(turn).as_matrix()
@@ -194,7 +194,7 @@ def test_a_rotation_fitted_to_rays_of_one_plane_is_no_mirror():
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-6, 0.3, np.pi - 1e-6])
-def test_angles_between_poses_are_exact_even_where_an_arc_cosine_is_blind(angle):
+def test_angles_are_exact_where_an_arc_cosine_loses_precision(angle):
     axis = unit(np.array([1.0, -2.0, 0.5]))
     before = Rotation.from_rotvec([0.4, 0.1, -0.9]).as_matrix()
     after = before @ Rotation.from_rotvec(angle * axis).as_matrix()
@@ -205,7 +205,7 @@ def test_angles_between_poses_are_exact_even_where_an_arc_cosine_is_blind(angle)
     assert direction_angle(3 * a, b) == pytest.approx(angle, rel=1e-6, abs=1e-15)
 
 
-def test_opposite_directions_are_half_a_turn_apart():
+def test_opposite_directions_are_pi_apart():
     assert direction_angle(np.array([0, 0, 1.0]), np.array([0, 0, -2.0])) == pytest.approx(np.pi)
 
 
@@ -213,7 +213,7 @@ def test_opposite_directions_are_half_a_turn_apart():
                          ids=['forwards', 'backwards', 'sideways', 'aslant'])
 @pytest.mark.parametrize('turn', [[0.0, 0, 0], [0.05, -0.1, 0.08]], ids=['straight', 'turning'])
 @pytest.mark.parametrize('rho', [0.1, 0.3, 0.5, 0.8])
-def test_inverse_depths_scatter_as_they_say_however_near_they_come(t, turn, rho):
+def test_inverse_depths_scatter_as_their_standard_deviations_predict(t, turn, rho):
     rng, noise, count = np.random.default_rng(11), 1e-5, 20_000
     R, t = rotation_exp(np.array(turn)), unit(np.array(t))
     for x in ([0.4, 0.2, 1], [-0.1, 0.5, 1], [0.8, -0.6, 1]):
@@ -225,7 +225,7 @@ def test_inverse_depths_scatter_as_they_say_however_near_they_come(t, turn, rho)
         assert sigma * noise == pytest.approx(found.std(), rel=0.03)
 
 
-def test_of_points_on_the_epipole_nobody_knows_the_depth():
+def test_depths_at_the_epipole_are_undetermined():
     x = np.array([[0.0, 0, 1]])
     _, sigma = inverse_depths(np.eye(3), np.array([0.0, 0, -1]), x, x)
     assert sigma[0] > 1e5

@@ -1,4 +1,4 @@
-"""Places of two views that are the same: followed by the flow, or found again by descriptors."""
+"""Feature matching between two views: by optical flow and by descriptors."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def turned_views(max_features: int) -> tuple[View, View, Array]:
 
 
 def misses(H: Array, x: Array, y: Array) -> Array:
-    """Pixels (N,) by which y are off where x are seen."""
+    """Distances (N,) in pixels of y from the true places of x."""
     return np.asarray(np.linalg.norm(cv2.perspectiveTransform(x[None], H)[0] - y, axis=1))
 
 
-def test_corners_are_followed_to_a_tenth_of_a_pixel_whether_others_find_them_or_not():
+def test_corners_are_tracked_to_a_tenth_of_a_pixel():
     previous, current, H = turned_views(600)
     there = cv2.perspectiveTransform(previous.features.points[None], H)[0]
     seen = ((there > 20) & (there < np.array(SIZE) - 20)).all(1)
@@ -46,28 +46,28 @@ def test_corners_are_followed_to_a_tenth_of_a_pixel_whether_others_find_them_or_
         assert np.quantile(misses(H, x, y), 0.95) < 0.3
 
 
-def test_what_looks_most_alike_comes_first():
+def test_the_most_similar_matches_come_first():
     previous, current, _ = turned_views(600)
     bits = match_distances(previous.smoothed, (matches := match_widely(
         previous, current, None, Known(), 0.15)).x, current.smoothed, matches.y)
     assert (np.diff(bits) >= 0).all()
 
 
-def test_where_the_lighting_changes_corners_are_found_again_by_their_descriptors():
+def test_corners_are_matched_by_descriptors_if_the_lighting_changes():
     previous, current, H = turned_views(600)
     darker = TwoViewEstimator(EstimatorConfig(max_features=600)).view(
         cv2.convertScaleAbs(current.gray, alpha=0.5), K)
     x, y = match_widely(previous, darker, None, Known(), 0.15)
     assert len(x) > 0.25 * len(previous.features)
-    # They are as exact as corners are.
+    # As accurate as the corners.
     assert np.median(misses(H, x, y)) < 0.7
     lost, _ = match_widely(previous, replace(darker, features=some(darker.features, slice(0, 0))),
                            None, Known(), 0.15)
     assert len(lost) < 0.5 * len(x)
 
 
-def test_of_two_places_the_one_that_looks_alike_is_taken():
-    # A wall of tiles that all look alike but for one in each row: the flow takes the next one.
+def test_the_more_similar_of_two_places_is_kept():
+    # A wall of identical tiles but for one in each row: the flow tracks to the next one.
     rng = np.random.default_rng(93)
     tile = textured(rng, (20, 20))
     wall = np.tile(tile, (15, 20))
@@ -81,7 +81,7 @@ def test_of_two_places_the_one_that_looks_alike_is_taken():
 
 
 @pytest.mark.parametrize('what', ['black', 'noise'])
-def test_nothing_is_followed_into_another_picture(what: str):
+def test_nothing_is_tracked_into_an_unrelated_image(what: str):
     previous, current, _ = turned_views(200)
     rng = np.random.default_rng(92)
     other = (np.zeros_like(current.gray) if what == 'black'
@@ -92,7 +92,7 @@ def test_nothing_is_followed_into_another_picture(what: str):
     assert len(x) < 0.05 * len(previous.features)
 
 
-def test_no_feature_at_all_is_no_match():
+def test_no_features_give_no_matches():
     previous, current, _ = turned_views(200)
     none = replace(previous, features=some(
         previous.features, np.zeros(len(previous.features), bool)))
@@ -101,14 +101,14 @@ def test_no_feature_at_all_is_no_match():
 
 
 @pytest.mark.parametrize('more', [1, 3])
-def test_as_many_matches_are_enough_as_there_are_features_for_them(more: int) -> None:
-    """The motion before was told by as many features, or by three times as many."""
+def test_the_required_number_of_matches_scales_with_the_features(more: int) -> None:
+    """With as many features in the previous pair, or three times as many."""
     previous, current, _ = turned_views(600)
     count = len(previous.features)
     places = np.tile(previous.features.points, (more, 1))
     before = RelativePose(Status.OK, R=rotation_exp(TURN), x=places, y=places, y_opt=places,
                           inliers=np.ones(more * count, bool), sought=more * count)
     assert match_predicted(previous, current, before, Known(), 0.15) is not None
-    # Had a third as many features told as many, three times as many would be expected.
+    # With a third as many features in the previous pair, three times as many are expected.
     assert match_predicted(previous, current, replace(before, sought=count // 3), Known(),
                            0.15) is None

@@ -1,4 +1,4 @@
-"""Memory is asked for once, and not anew with each pair."""
+"""Memory is reused from pair to pair."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from djet_ros.lab.scenes import make_scene
 import numpy as np
 import pytest
 
-# Page faults of twenty pairs, after as many that have asked for all that is needed. In one thread:
-# on a busy machine another may begin at any time, which asks for memory of its own.
+# Page faults of twenty pairs, after as many that have allocated all memory. Single-threaded: on a
+# busy machine another thread may start at any time, and allocate memory of its own.
 ESTIMATES = """
 from resource import getrusage, RUSAGE_SELF
 import sys
@@ -31,8 +31,8 @@ print(getrusage(RUSAGE_SELF).ru_minflt - before)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='of the GNU C library alone')
-def test_pairs_do_not_ask_for_their_memory_anew(tmp_path):
-    # Not rendered where pages are counted: to render takes, and frees, larger blocks.
+def test_pairs_reuse_their_memory(tmp_path):
+    # Rendered elsewhere: rendering allocates and frees larger blocks.
     scene = make_scene('road')
     images = [scene.render(pose, i) for i, pose in enumerate(scene.trajectory(2))]
     paths = [str(tmp_path / f'{i}.npy') for i in range(3)]
@@ -40,5 +40,5 @@ def test_pairs_do_not_ask_for_their_memory_anew(tmp_path):
         np.save(path, array)
     faults = int(subprocess.run([sys.executable, '-c', ESTIMATES, *paths], check=True,
                                 capture_output=True, text=True).stdout)
-    # As many pages as one image of floating point numbers has; a pair writes to a dozen of them.
+    # The pages of one image of floats; a pair writes a dozen of them.
     assert faults < 456

@@ -1,4 +1,4 @@
-"""What is done side by side is done as in turn."""
+"""Parallel execution gives the same results as sequential execution."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 @pytest.mark.parametrize('count', [0, 1, 2, 7])
-def test_results_come_in_the_order_of_the_tasks(threads: int, count: int) -> None:
+def test_results_are_in_the_order_of_the_tasks(threads: int, count: int) -> None:
     assert each(lambda task: task**2, range(count)) == [task**2 for task in range(count)]
 
 
-def test_two_things_are_under_way_at_once_where_opencv_may_take_two_threads(threads: int) -> None:
+def test_two_functions_run_in_parallel_if_opencv_may_use_two_threads(threads: int) -> None:
     meeting = Barrier(2)
 
     def meet() -> int:
@@ -39,12 +39,12 @@ def test_two_things_are_under_way_at_once_where_opencv_may_take_two_threads(thre
 
 
 @pytest.mark.parametrize('bad', [0, 1])
-def test_an_error_in_either_of_two_things_comes_out(threads: int, bad: int) -> None:
+def test_an_error_in_either_function_is_raised(threads: int, bad: int) -> None:
     with pytest.raises(ZeroDivisionError):
         run_both(lambda: 1 // bad, lambda: 1 // (1 - bad))
 
 
-def test_many_things_within_one_another_wait_for_none_that_was_not_begun(threads: int) -> None:
+def test_nested_tasks_do_not_deadlock(threads: int) -> None:
     def count(depth: int) -> int:
         return 1 if depth == 0 else sum(run_both(lambda: count(depth - 1),
                                                  lambda: count(depth - 1)))
@@ -52,24 +52,24 @@ def test_many_things_within_one_another_wait_for_none_that_was_not_begun(threads
     assert count(6) == 2**6
 
 
-def test_what_is_begun_is_under_way_before_it_is_needed(threads: int) -> None:
+def test_a_background_task_runs_before_its_result_is_requested(threads: int) -> None:
     done = Event()
     wait_for_it = started_beside(lambda: done.set() or get_ident())
     assert done.wait(20 if threads == 2 else 0.05) is (threads == 2)
     assert (wait_for_it() == get_ident()) is (threads == 1)
 
 
-def test_an_error_in_what_was_begun_comes_out_where_it_is_needed(threads: int) -> None:
+def test_an_error_in_a_background_task_is_raised_on_request(threads: int) -> None:
     later = started_beside(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         later()
 
 
-def test_what_was_begun_leaves_the_other_core_to_what_is_done_meanwhile(threads: int) -> None:
+def test_a_background_task_uses_one_thread_only(threads: int) -> None:
     here, there = started_beside(lambda: run_both(get_ident, get_ident))()
     assert here == there
 
 
-def test_more_may_be_begun_than_there_are_threads(threads: int) -> None:
+def test_more_background_tasks_than_threads_complete(threads: int) -> None:
     later = [started_beside(lambda number=number: number**2) for number in range(40)]
     assert [one() for one in later] == [number**2 for number in range(40)]

@@ -1,4 +1,4 @@
-"""A turn of the camera is found before its features are matched one by one."""
+"""Prediction of features by the camera's rotation and by constant motion."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def turned_pair(degrees):
 
 
 @pytest.mark.parametrize('degrees', [(0, 0, 0), (0, 4, 0), (2, -12, 1), (0, 0, 6), (-8, 3, 0)])
-def test_big_turns_are_told_without_any_motion_before(degrees):
+def test_large_rotations_are_estimated_without_a_prior(degrees):
     R, H, previous, current = turned_pair(degrees)
     found = likely_rotation(previous, current, K, [], 30.0)
     assert np.rad2deg(rotation_angle(R, found)) < 2
@@ -32,20 +32,20 @@ def test_big_turns_are_told_without_any_motion_before(degrees):
     assert np.median(np.linalg.norm(there - truth, axis=1)) < 15
 
 
-def test_a_wrong_motion_before_does_no_harm():
+def test_a_wrong_prior_does_no_harm():
     R, _, previous, current = turned_pair((0, 5, 0))
     wrong = rotation_exp(np.deg2rad([0.0, -20.0, 0.0]))
     assert np.rad2deg(rotation_angle(R, likely_rotation(previous, current, K, [wrong], 30.0))) < 2
 
 
-def test_where_there_is_nothing_to_match_nothing_turns():
+def test_without_matches_the_rotation_is_identity():
     _, _, previous, _ = turned_pair((0, 0, 0))
     none = detect_corners(np.zeros((300, 400), np.uint8), 100, 1.0)
     assert (likely_rotation(previous, none, K, [], 30.0) == np.eye(3)).all()
     assert predict_at_infinity(none, previous, K, [], 30.0).shape == (0, 2)
 
 
-def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
+def test_points_rotated_behind_the_camera_are_far_outside_the_image():
     _, _, previous, _ = turned_pair((0, 0, 0))
     none = some(previous, slice(0, 0))
     R = rotation_exp(np.array([0.0, 3.0, 0.0]))
@@ -54,7 +54,7 @@ def test_points_that_are_turned_behind_the_camera_are_far_out_of_the_image():
 
 
 def driven_through(depths):
-    """Give features of the second of three views, the motion of each step, and the third."""
+    """Return features of the second of three views, the motion of each step, and the third."""
     rng = np.random.default_rng(5)
     n = len(depths)
     places = np.stack([rng.uniform(-0.4, 0.4, n), rng.uniform(-0.3, 0.3, n), np.ones(n)]).T
@@ -65,32 +65,32 @@ def driven_through(depths):
         image = places @ K.T
         seen.append(image[:, :2] / image[:, 2:])
         places = places @ R.T + t
-    before = RelativePose(Status.OK, R, t, x=seen[0], y=seen[1], y_opt=seen[1],
-                          inliers=np.ones(n, bool))
+    prior = RelativePose(Status.OK, R, t, x=seen[0], y=seen[1], y_opt=seen[1],
+                         inliers=np.ones(n, bool))
     none = detect_corners(np.zeros((300, 400), np.uint8), 100, 1.0)
-    return replace(none, points=seen[1]), before, seen[2]
+    return replace(none, points=seen[1]), prior, seen[2]
 
 
-def test_a_camera_that_goes_on_as_before_sees_what_is_foreseen():
-    features, before, truth = driven_through(np.random.default_rng(6).uniform(5, 50, 200))
-    foreseen = predict_constant_motion(features, K, before.R, before)
+def test_prediction_is_exact_for_constant_motion():
+    features, prior, truth = driven_through(np.random.default_rng(6).uniform(5, 50, 200))
+    foreseen = predict_constant_motion(features, K, prior.R, prior)
     assert np.abs(foreseen - truth).max() < 1e-6
-    # By the turn alone they are seen elsewhere.
-    turned = predict_at_infinity(features, features, K, [before.R], 30.0, sure=True)
+    # The rotation alone predicts other places.
+    turned = predict_at_infinity(features, features, K, [prior.R], 30.0, measured=True)
     assert np.median(np.linalg.norm(turned - truth, axis=1)) > 3
 
 
-def test_what_was_not_seen_before_moves_as_what_is_beside_it():
-    features, before, truth = driven_through(np.full(200, 20.0))
+def test_new_features_are_predicted_by_their_nearest_inlier():
+    features, prior, truth = driven_through(np.full(200, 20.0))
     known = np.arange(200) % 4 > 0
-    foreseen = predict_constant_motion(features, K, before.R, replace(before, inliers=known))
+    foreseen = predict_constant_motion(features, K, prior.R, replace(prior, inliers=known))
     assert np.abs(foreseen - truth)[known].max() < 1e-6
     assert 1e-6 < np.linalg.norm(foreseen - truth, axis=1)[~known].max() < 2
 
 
-def test_after_a_mere_turn_the_next_one_is_foreseen():
-    features, before, _ = driven_through(np.full(50, 1e9))
-    still = replace(before, t=np.zeros(3))
-    turned = predict_at_infinity(features, features, K, [before.R], 30.0, sure=True)
-    assert np.allclose(predict_constant_motion(features, K, before.R, still), turned)
-    assert np.abs(predict_constant_motion(features, K, before.R, before) - turned).max() < 1e-3
+def test_prediction_after_a_pure_rotation():
+    features, prior, _ = driven_through(np.full(50, 1e9))
+    still = replace(prior, t=np.zeros(3))
+    turned = predict_at_infinity(features, features, K, [prior.R], 30.0, measured=True)
+    assert np.allclose(predict_constant_motion(features, K, prior.R, still), turned)
+    assert np.abs(predict_constant_motion(features, K, prior.R, prior) - turned).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Pairs that leave a choice: two basins, two bodies, matches by chance; and pairs that do not."""
+"""Ambiguous pairs: two basins, two bodies, random matches; and unambiguous ones."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from two_view import (
 )
 
 NOISE = 0.2
-# How a body may move, as the camera sees it: across, or against it along the camera's own way.
+# Motion of a body relative to the camera: across, or against it along its own direction.
 BODIES = {'across': (0.3, 0.05, 0.4), 'against': (0.0, -0.016, 0.8)}
 FLAT, DEEP = (3, 4), (4, 40)
 
@@ -57,7 +57,7 @@ FLAT, DEEP = (3, 4), (4, 40)
 def scene_with_body(still: int, moving: int, motion: str, box: tuple[float, float],
                     depths: tuple[float, float] = (5, 8)
                     ) -> tuple[TwoViews, np.ndarray, np.ndarray, Pose]:
-    """Give matches of the world and of a body between two columns, and how that moves."""
+    """Return matches of the static world and of a body between two columns, and its motion."""
     rng = np.random.default_rng(3)
     seen = two_views(rng, count=still, t=FORWARD, turn=(0.0, 0.004, 0.0))
     pixels = rng.uniform((box[0], 60), (box[1], SIZE[1]), (moving, 2))
@@ -69,25 +69,25 @@ def scene_with_body(still: int, moving: int, motion: str, box: tuple[float, floa
     return seen, x, y + rng.normal(0, NOISE, y.shape), Pose(R, unit(t))
 
 
-def estimate(x: np.ndarray, y: np.ndarray, before: Pose | None = None) -> RelativePose:
-    prior = None if before is None else RelativePose(Status.OK, before.R, before.t)
+def estimate(x: np.ndarray, y: np.ndarray, motion: Pose | None = None) -> RelativePose:
+    prior = None if motion is None else RelativePose(Status.OK, motion.R, motion.t)
     return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
         uniform_view(), uniform_view(), x, y, prior)
 
 
-@pytest.mark.parametrize(('behind', 'before', 'status'), [
+@pytest.mark.parametrize(('behind', 'prior', 'status'), [
     (20, None, Status.OK), (95, None, Status.AMBIGUOUS), (95, 'likewise', Status.OK),
     (105, 'likewise', Status.OK)])
-def test_where_as_many_points_are_behind_as_before_the_camera_its_way_is_told_by_none_of_them(
-        behind: int, before: str | None, status: Status) -> None:
-    """Edges along the way have false matches on epipolar lines, on the wrong half as often."""
+def test_balanced_chirality_leaves_the_sign_of_t_to_the_prior(
+        behind: int, prior: str | None, status: Status) -> None:
+    """Edges along the motion have false matches on either half of epipolar lines."""
     rng = np.random.default_rng(4)
     seen = two_views(rng, t=FORWARD, count=100)
     on_lines = two_views(rng, t=np.negative(FORWARD), count=behind)
     anywhere = rng.uniform((0, 0), SIZE, (2, 2 * behind, 2))
     x, y = (np.concatenate(parts) for parts in zip(
         (seen.x, seen.y), (on_lines.x, on_lines.y), anywhere))
-    result = estimate(x, y, Pose(seen.R, seen.t) if before else None)
+    result = estimate(x, y, Pose(seen.R, seen.t) if prior else None)
     assert result.status is status
     if status is Status.OK:
         assert direction_angle(result.t, seen.t) < 1e-3
@@ -97,18 +97,18 @@ def test_where_as_many_points_are_behind_as_before_the_camera_its_way_is_told_by
 
 
 def direction_claimed(result: RelativePose) -> float:
-    """Give the standard deviation of the direction in degrees, where that is largest."""
+    """Return the largest standard deviation of the direction, in degrees."""
     return float(np.degrees(np.sqrt(np.linalg.eigvalsh(result.covariance_5[3:, 3:])[-1])))
 
 
 @pytest.mark.parametrize('motion', BODIES)
-def test_of_two_bodies_equally_deep_none_is_taken_for_the_world_for_sure(motion: str) -> None:
+def test_two_bodies_of_equal_depth_range_are_two_motions(motion: str) -> None:
     _, x, y, _ = scene_with_body(200, 300, motion, (300, 1000), DEEP)
     assert estimate(x, y).status is Status.TWO_MOTIONS
 
 
 @pytest.mark.parametrize('motion', BODIES)
-def test_the_world_is_what_reaches_far_though_most_matches_follow_a_flat_body(
+def test_the_static_world_spans_depths_even_if_a_flat_body_has_most_matches(
         motion: str) -> None:
     seen, x, y, _ = scene_with_body(200, 300, motion, (300, 1000), FLAT)
     result = estimate(x, y)
@@ -117,7 +117,7 @@ def test_the_world_is_what_reaches_far_though_most_matches_follow_a_flat_body(
     assert direction_angle(result.t, seen.t) < 0.02
 
 
-def test_a_body_that_shows_no_depth_for_want_of_parallax_may_be_the_world(
+def test_a_body_without_parallax_may_be_the_static_world(
         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BODIES, 'beside', (0.0, 0.0, 1e-9))
     _, x, y, _ = scene_with_body(200, 300, 'beside', (300, 1000), FLAT)
@@ -125,7 +125,7 @@ def test_a_body_that_shows_no_depth_for_want_of_parallax_may_be_the_world(
 
 
 @pytest.mark.parametrize('motion', BODIES)
-def test_the_world_is_what_goes_on_as_before_though_most_matches_follow_another_body(
+def test_the_prior_identifies_the_static_world_against_the_majority(
         motion: str) -> None:
     seen, x, y, body = scene_with_body(200, 300, motion, (300, 1000))
     result = estimate(x, y, Pose(rotation_exp(np.array([0, 0.002, 0])) @ seen.R, seen.t))
@@ -133,11 +133,11 @@ def test_the_world_is_what_goes_on_as_before_though_most_matches_follow_another_
     assert rotation_angle(result.R, seen.R) < 2e-3
     assert direction_angle(result.t, seen.t) < 0.02
     assert result.inliers[:200].mean() > 0.8 and result.inliers[200:].mean() < 0.3
-    # … and with the body's motion before it, it would be the body.
+    # … and with the motion of the body as the prior, the body is chosen.
     assert direction_angle(estimate(x, y, body).t, body.t) < 0.1
 
 
-def test_a_small_body_leaves_no_doubt_about_the_world() -> None:
+def test_a_small_body_is_not_mistaken_for_the_static_world() -> None:
     seen, x, y, _ = scene_with_body(400, 60, 'across', (600, 760))
     result = estimate(x, y)
     assert result.status is Status.OK
@@ -147,25 +147,25 @@ def test_a_small_body_leaves_no_doubt_about_the_world() -> None:
 
 @pytest.mark.parametrize('stuck', [200, 500])
 @pytest.mark.parametrize('seed', range(3))
-def test_what_keeps_its_pixels_before_a_camera_that_turns_is_not_the_sky(
+def test_matches_attached_to_a_rotating_camera_are_removed(
         stuck: int, seed: int) -> None:
-    """A bonnet in the lower part of the image, as many matches as the world has or fewer."""
+    """A bonnet in the lower part of the image, with up to as many matches as the world."""
     rng = np.random.default_rng(seed)
     seen = two_views(rng, count=400, t=FORWARD, turn=(0.0, 0.012, 0.0))
     bonnet = rng.uniform((0, 250), SIZE, (stuck, 2))
     x = np.concatenate([seen.x, bonnet])
     y = np.concatenate([seen.y, bonnet])
     y += rng.normal(0, NOISE, y.shape) * np.where(np.arange(len(y)) < 400, 1.0, 0.2)[:, None]
-    # It went straight on before, as the bonnet has it all the time.
-    for before in (None, Pose(np.eye(3), seen.t)):
-        result = estimate(x, y, before)
+    # The prior has no rotation, as the bonnet.
+    for prior in (None, Pose(np.eye(3), seen.t)):
+        result = estimate(x, y, prior)
         assert result.status is Status.OK
         assert rotation_angle(result.R, seen.R) < 1e-3
         assert direction_angle(result.t, seen.t) < 0.02
         assert squared_error(result, seen) < chi2.ppf(0.9999, 5)
 
 
-def test_a_sky_that_keeps_its_pixels_while_the_camera_drives_straight_on_is_of_the_world() -> None:
+def test_a_static_sky_before_a_camera_without_rotation_is_kept() -> None:
     rng = np.random.default_rng(6)
     seen = two_views(rng, count=300, t=FORWARD, turn=(0.0, 0.0, 0.0))
     sky = rng.uniform((0, 0), (SIZE[0], 120), (200, 2))
@@ -176,13 +176,13 @@ def test_a_sky_that_keeps_its_pixels_while_the_camera_drives_straight_on_is_of_t
 
 
 def squared_error(result: RelativePose, seen: TwoViews) -> float:
-    """Give the squared error of a pose over its covariance, 5 on average."""
+    """Return the squared error of a pose over its covariance, 5 on average."""
     return squared_distance(result.covariance_5,
                             pose_difference(result.R, result.t, Pose(seen.R, seen.t)))
 
 
 def plane_of_two_motions() -> tuple[np.ndarray, np.ndarray]:
-    """Give noisy matches on one plane, which move alike under two motions."""
+    """Return noisy matches on one plane, which two motions explain."""
     rng = np.random.default_rng(4)
     x = rng.uniform((50, 50), (1190, 330), (200, 2))
     R = Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix()
@@ -191,63 +191,64 @@ def plane_of_two_motions() -> tuple[np.ndarray, np.ndarray]:
     return x, y[:, :2] / y[:, 2:] + rng.normal(0, NOISE, (200, 2))
 
 
-def test_where_another_motion_explains_the_matches_as_well_the_pose_says_so() -> None:
+def test_an_equally_likely_motion_makes_a_pose_ambiguous() -> None:
     result = estimate(*plane_of_two_motions())
     assert result.status is Status.AMBIGUOUS
-    # Its guess is one of them, and its covariance spans a large part of the way to the other.
+    # Its best guess is one of them, and its covariance spans a large part of the distance to the
+    # other.
     assert result.t.any()
     assert np.sqrt(np.trace(result.covariance_5[3:, 3:])) > 0.1
 
 
-def test_a_pair_without_its_parallax_turns_as_its_matches_do_and_doubts_the_bent_one() -> None:
+def test_as_pure_rotation_fits_the_rotation_and_widens_the_covariance() -> None:
     rng = np.random.default_rng(3)
     x, R = rng.uniform((50, 50), (1190, 330), (300, 2)), Rotation.from_rotvec(TURN).as_matrix()
     y, _ = project(K, np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T @ R.T)
     seen = estimate(x, y + rng.normal(0, NOISE, y.shape))
     wrong = rotation_exp(np.array([0.002, -0.003, 0.001])) @ seen.R
-    bent = replace(seen, status=Status.OK, R=wrong, t=unit(np.asarray(SIDEWAYS)))
-    turn = as_turn(bent, K)
+    biased = replace(seen, status=Status.OK, R=wrong, t=unit(np.asarray(SIDEWAYS)))
+    turn = as_turn(biased, K)
     assert turn.status is Status.NO_PARALLAX and not turn.t.any()
     assert rotation_angle(turn.R, R) < 1e-4
     off = Rotation.from_matrix(wrong @ R.T).as_rotvec()
     assert unit(off) @ turn.covariance_5[:3, :3] @ unit(off) > 0.9 * off @ off
 
 
-def test_the_motion_before_decides_between_them() -> None:
+def test_the_prior_decides_between_two_motions() -> None:
     x, y = plane_of_two_motions()
     guess = estimate(x, y)
     assert estimate(x, y, Pose(guess.R, guess.t)).status is Status.OK
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_no_picture_of_a_plane_alone_is_sure_of_the_wrong_one_of_its_motions(seed: int) -> None:
+def test_no_planar_pair_is_certain_of_the_wrong_twin(seed: int) -> None:
     rng, estimator, sure = np.random.default_rng(seed), TwoViewEstimator(), 0
     for _ in range(8):
         R, t, *pictures = pictures_of_a_plane(rng)
         result = estimator.estimate(*(estimator.view(gray, CLOSE_UP) for gray in pictures))
         assert result.status in (Status.OK, Status.AMBIGUOUS)
-        # Where it is wrong, its ellipsoid spans both.
+        # If it is wrong, its ellipsoid spans both.
         off = pose_difference(result.R, result.t, Pose(R, unit(t)))
         assert squared_distance(result.covariance_5, off) < chi2.ppf(0.999, 5)
         sure += result.status is Status.OK and np.linalg.norm(off) < 0.02
-    # The other motion has some of what is seen behind it, often.
+    # The other motion often has some of the points behind the camera.
     assert sure >= 2
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_who_drives_towards_a_wall_is_not_sure_of_the_wrong_one_of_its_motions(seed: int) -> None:
-    """Both are in one basin, and what goes on before may lead all starts to the same."""
+def test_motion_towards_a_wall_is_not_certain_of_the_wrong_twin(seed: int) -> None:
+    """Both are in one basin, and the prior may lead all starts to the same one."""
     t = -0.06 * Rotation.from_euler('y', 10, degrees=True).as_matrix()[:, 2]
-    estimator, before = TwoViewEstimator(), None
+    estimator, prior = TwoViewEstimator(), None
     views = [estimator.view(gray, CLOSE_UP)
              for gray in pictures_towards_a_wall(np.random.default_rng([seed, 11]), t, 14)]
     for pair in pairwise(views):
-        before = estimator.estimate(*pair, before)
-        off = pose_difference(before.R, before.t, Pose(np.eye(3), unit(t)))
-        assert squared_distance(before.covariance_5, off) < chi2.ppf(1 - 1e-5, 5)
+        prior = estimator.estimate(*pair, prior)
+        off = pose_difference(prior.R, prior.t, Pose(np.eye(3), unit(t)))
+        assert squared_distance(prior.covariance_5, off) < chi2.ppf(1 - 1e-5, 5)
 
 
-def test_each_motion_of_a_plane_is_the_other_one_of_the_other() -> None:
+def test_planar_twins_are_mutual() -> None:
     x, y = plane_of_two_motions()
     one = Pose(Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix(), unit([0.2, 0.1, -0.3]))
     other = planar_twin(one, K, x, y, NOISE)
@@ -260,51 +261,51 @@ def test_each_motion_of_a_plane_is_the_other_one_of_the_other() -> None:
     assert planar_twin(one, K, x, y, NOISE) is None
 
 
-def test_what_stands_out_of_a_plane_tells_its_motions_apart() -> None:
+def test_points_off_a_plane_exclude_its_twin() -> None:
     x, y = plane_of_two_motions()
     assert is_planar(x, y, NOISE)
     y[:30] += 2.0  # one of seven, ten standard deviations
     assert not is_planar(x, y, NOISE)
 
 
-def going_on(x: np.ndarray, y: np.ndarray, before: Pose) -> RelativePose:
-    """Estimate from matches that were found where a motion before foresaw them."""
+def estimate_predicted(x: np.ndarray, y: np.ndarray, prior: Pose) -> RelativePose:
+    """Estimate from matches that were predicted by a previous motion."""
     return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_pair(
-        Pair(uniform_view(), uniform_view(), x, y, before, predicted=before))
+        Pair(uniform_view(), uniform_view(), x, y, prior, predicted=prior))
 
 
 @pytest.mark.parametrize('t', [FORWARD, SIDEWAYS])
 @pytest.mark.parametrize('off', [0.0, 0.02, 0.1])
-def test_going_on_ends_where_all_starts_end(t: Sequence[float], off: float) -> None:
+def test_a_predicted_pair_converges_as_with_all_starts(t: Sequence[float], off: float) -> None:
     rng = np.random.default_rng(8)
     seen = two_views(rng, count=600, t=t)
     y = seen.y + rng.normal(0, NOISE, seen.y.shape)
     y[::5] += rng.uniform(-24, 24, y[::5].shape)  # false ones, as near as they are sought
-    one = going_on(seen.x, y, Pose(*moved_pose(seen.R, seen.t, off, rng)))
+    one = estimate_predicted(seen.x, y, Pose(*moved_pose(seen.R, seen.t, off, rng)))
     other = estimate(seen.x, y)
     assert one.status is other.status is Status.OK
     assert rotation_angle(one.R, other.R) < 1e-4
     assert direction_angle(one.t, other.t) < 1e-3
 
 
-def test_going_on_with_a_wrong_motion_finds_the_right_one_nevertheless() -> None:
+def test_a_wrong_prediction_still_finds_the_right_motion() -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
         seen = two_views(rng, count=600, t=FORWARD)
         wrong = Pose(seen.R, unit(np.asarray(SIDEWAYS)))
-        result = going_on(seen.x, seen.y + rng.normal(0, NOISE, seen.y.shape), wrong)
+        result = estimate_predicted(seen.x, seen.y + rng.normal(0, NOISE, seen.y.shape), wrong)
         assert result.status is Status.OK
         assert direction_angle(result.t, seen.t) < 0.02
 
 
-def test_going_on_does_not_decide_between_motions_that_are_both_far_from_the_one_before() -> None:
+def test_a_distant_prediction_does_not_decide() -> None:
     x, y = plane_of_two_motions()
     guess = estimate(x, y)
-    assert going_on(x, y, Pose(guess.R, -unit(np.cross(guess.t, (0.3, 0.8, 0.1))))).status \
-        is Status.AMBIGUOUS
+    distant = Pose(guess.R, -unit(np.cross(guess.t, (0.3, 0.8, 0.1))))
+    assert estimate_predicted(x, y, distant).status is Status.AMBIGUOUS
 
 
-def test_points_in_space_leave_no_choice() -> None:
+def test_points_in_general_position_have_no_rivals() -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
         seen = two_views(rng, count=100)
@@ -312,7 +313,7 @@ def test_points_in_space_leave_no_choice() -> None:
         assert result.status is Status.OK
 
 
-def test_false_matches_agree_with_no_motion_that_is_believed() -> None:
+def test_false_matches_give_no_significant_motion() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         x = rng.uniform((0, 0), SIZE, (250, 2))
@@ -321,7 +322,7 @@ def test_false_matches_agree_with_no_motion_that_is_believed() -> None:
         assert estimate(x, y).status not in (Status.OK, Status.NO_PARALLAX)
 
 
-def test_a_motion_that_a_few_of_many_agree_with_is_expected_by_chance() -> None:
+def test_few_inliers_among_many_matches_are_not_significant() -> None:
     assert false_alarms(20, 332, 0.02) > 0
     assert false_alarms(5, 332, 0.02) == np.inf
     assert false_alarms(100, 332, 0.02) < 0
@@ -335,7 +336,7 @@ def preference_between(x: np.ndarray, y: np.ndarray, one: Pose, other: Pose) -> 
     return float(preferences(losses, x, 0)[1])
 
 
-def test_of_two_motions_equally_wrong_neither_is_preferred_more_often_than_chance_has_it() -> None:
+def test_preferences_between_equally_wrong_motions_are_calibrated() -> None:
     found = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -348,7 +349,7 @@ def test_of_two_motions_equally_wrong_neither_is_preferred_more_often_than_chanc
     assert 0.7 < np.std(found) < 1.2
 
 
-def test_repeating_every_match_next_to_itself_makes_no_preference_stronger() -> None:
+def test_duplicated_matches_do_not_strengthen_a_preference() -> None:
     rng = np.random.default_rng(0)
     seen = two_views(rng, count=100)
     y = seen.y + rng.normal(0, NOISE, seen.y.shape)
@@ -359,7 +360,7 @@ def test_repeating_every_match_next_to_itself_makes_no_preference_stronger() -> 
         pytest.approx(once)
 
 
-def test_a_covariance_that_spans_a_pose_is_that_of_errors_where_it_may_be_true() -> None:
+def test_a_covariance_widened_to_span_is_the_expected_squared_error() -> None:
     rng = np.random.default_rng(5)
     A, t = rng.normal(size=(5, 5)) * 0.01, unit(rng.normal(size=3))
     R = rotation_exp(rng.normal(size=3))
@@ -369,7 +370,7 @@ def test_a_covariance_that_spans_a_pose_is_that_of_errors_where_it_may_be_true()
     assert squared_distance(five, off) < 9  # a third of it is one standard deviation at least
     assert np.linalg.eigvalsh(five - A @ A.T).min() > -1e-12
     assert np.linalg.norm(six[3:, 3:] @ t) < 1e-12  # t keeps its length
-    # Errors of the two, as often as either is true, have that covariance.
+    # The errors of both, weighted by their probabilities, have that covariance.
     errors = rng.multivariate_normal(np.zeros(5), A @ A.T, 200_000)
     errors[rng.random(len(errors)) < 1 / 9] += off
     assert np.allclose(errors.T @ errors / len(errors), five, atol=0.03 * np.abs(five).max())
@@ -378,7 +379,7 @@ def test_a_covariance_that_spans_a_pose_is_that_of_errors_where_it_may_be_true()
 @pytest.mark.parametrize(('preference', 'two_bodies', 'spanned'), [
     (2.4, False, True), (4.5, False, True), (4.8, False, False), (8.0, False, False),
     (4.8, True, True)])
-def test_a_motion_far_off_that_is_true_of_less_than_one_pair_of_a_hundred_blurs_none_of_them(
+def test_an_improbable_distant_rival_does_not_widen_the_covariance(
         preference: float, two_bodies: bool, spanned: bool) -> None:
     seen = two_views(np.random.default_rng(7), count=100)
     around, aside = np.cross(seen.t, (0, 0, 1)), np.radians(60)
@@ -388,22 +389,22 @@ def test_a_motion_far_off_that_is_true_of_less_than_one_pair_of_a_hundred_blurs_
     _, (covariance, _) = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
                                               sign_open=False)
     claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
-    # As far as it is off, as often as it is the true one; else what is known of the pose alone.
+    # The squared distance times its probability; otherwise only the covariance of the pose.
     probable = norm.cdf(-preference / 2) if spanned else 0.0
     assert claimed == pytest.approx(np.hypot(
         0.2 * np.sqrt(2), np.degrees(np.sqrt(probable) * np.sin(aside))), rel=0.01)
 
 
-def test_only_what_is_like_the_motion_before_goes_on() -> None:
-    before, turned = Pose(np.eye(3), unit(np.array([0.0, 0, -1]))), rotation_exp(
+def test_only_a_motion_like_the_previous_one_continues_it() -> None:
+    prior, turned = Pose(np.eye(3), unit(np.array([0.0, 0, -1]))), rotation_exp(
         np.array([0, 0.02, 0]))
-    alike, unlike = Pose(turned, before.t), Pose(np.eye(3), unit(np.array([1.0, 0, -1])))
-    assert continues_motion(before, alike, unlike)
-    assert not continues_motion(before, unlike, alike)
-    assert not continues_motion(before, alike, Pose(turned.T, before.t))  # as like as the other
+    alike, unlike = Pose(turned, prior.t), Pose(np.eye(3), unit(np.array([1.0, 0, -1])))
+    assert continues_motion(prior, alike, unlike)
+    assert not continues_motion(prior, unlike, alike)
+    assert not continues_motion(prior, alike, Pose(turned.T, prior.t))  # as like as the other
 
 
-def test_directions_all_round_leave_no_large_gap() -> None:
+def test_hemisphere_directions_leave_no_large_gap() -> None:
     starts = np.array([pose.t for pose in hemisphere_starts(np.eye(3), 10)])
     assert np.allclose(np.linalg.norm(starts, axis=1), 1)
     sphere = unit(np.random.default_rng(6).normal(size=(500, 3)))
@@ -411,10 +412,10 @@ def test_directions_all_round_leave_no_large_gap() -> None:
 
 
 @pytest.mark.parametrize(('ours', 'others'), [(3, 5), (5, 3), (3, 6), (6, 3)])
-def test_of_minima_beside_one_another_the_lowest_is_taken_and_no_pose_is_sure_of_it(
+def test_the_lowest_nearby_minimum_is_taken_with_the_others_as_rivals(
         ours: int, others: int) -> None:
-    # What is far tells the rotation, and the few that are near the direction: some of them are
-    # wrong by some widths of the loss. Each group has a minimum, all in one basin.
+    # Distant points determine the rotation, the few near ones the direction; some of these are
+    # wrong by some scales of the loss. Each group has a minimum, all in one basin.
     rng = np.random.default_rng(3)
     one = Pose(rotation_exp(np.array(TURN)), unit(np.array(SIDEWAYS)))
     other = Pose(one.R, rotation_exp(np.array([0, 0, 0.005])) @ one.t)
@@ -435,7 +436,7 @@ def test_of_minima_beside_one_another_the_lowest_is_taken_and_no_pose_is_sure_of
     assert min(unsigned_distance(rival.pose, end.pose) for rival in beside) < 1e-9
 
 
-def test_a_lone_minimum_has_none_beside_it() -> None:
+def test_a_single_minimum_has_no_neighbours() -> None:
     rng = np.random.default_rng(6)
     views = two_views(rng, 300)
     y = views.y + rng.normal(0, 0.05, views.y.shape)

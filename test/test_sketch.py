@@ -1,4 +1,4 @@
-"""Starting poses refined side by side: the same least squares as one by one."""
+"""Joint refinement of starting poses: the same least squares as for single ones."""
 
 from djet_ros.core.geometry import direction_angle, rotation_angle
 from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise
@@ -14,7 +14,7 @@ STARTS = 7
 
 
 def problem_of(rng, t, kind='bowls'):
-    """Exact matches, a fifth of them false, and poses around the true one."""
+    """Exact matches, a fifth of them replaced by outliers, and poses around the true one."""
     views = two_views(rng, 300, t)
     y = views.y.copy()
     y[::5] += rng.normal(0, 40, y[::5].shape)
@@ -28,7 +28,7 @@ def problem_of(rng, t, kind='bowls'):
 
 @pytest.mark.parametrize('kind', ['bowls', 'indefinite'])
 @pytest.mark.parametrize('name', LOSSES)
-def test_without_a_step_costs_and_residuals_are_those_of_each_pose(name, kind):
+def test_without_steps_costs_and_residuals_are_those_of_each_pose(name, kind):
     _, problem, starts = problem_of(np.random.default_rng(1), SIDEWAYS, kind)
     loss = Loss(name, 2.0)
     sketch = refine_all(problem, starts, loss, 0)
@@ -41,7 +41,7 @@ def test_without_a_step_costs_and_residuals_are_those_of_each_pose(name, kind):
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 8),
        t=st.sampled_from([SIDEWAYS, FORWARD]), name=st.sampled_from(LOSSES))
 @settings(max_examples=30, deadline=None)
-def test_no_start_ends_above_its_cost_whatever_the_others_do(seed, steps, t, name):
+def test_no_start_ends_above_its_cost(seed, steps, t, name):
     _, problem, starts = problem_of(np.random.default_rng(seed), t)
     loss = Loss(name, 1.0)
     together = refine_all(problem, starts, loss, steps)
@@ -52,7 +52,7 @@ def test_no_start_ends_above_its_cost_whatever_the_others_do(seed, steps, t, nam
 
 
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD])
-def test_in_the_true_basin_it_ends_where_the_optimiser_does(t):
+def test_refinement_in_the_true_basin_agrees_with_the_optimiser(t):
     views, problem, starts = problem_of(np.random.default_rng(4), t)
     loss = Loss('geman_mcclure', 1.0)
     sketch = refine_all(problem, starts, loss, 40)
@@ -64,7 +64,7 @@ def test_in_the_true_basin_it_ends_where_the_optimiser_does(t):
     assert np.isclose(sketch.costs[best], there.costs[0], rtol=1e-3, atol=1e-6)
 
 
-def test_a_start_with_nothing_to_go_by_stays_where_it_is():
+def test_a_degenerate_start_stays_where_it_is():
     _, problem, starts = problem_of(np.random.default_rng(2), SIDEWAYS)
     empty = problem.subset(np.zeros(len(problem.blur), bool))
     sketch = refine_all(empty, starts, Loss(), 3)

@@ -59,7 +59,7 @@ def project(K: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def moved_pose(R: np.ndarray, t: np.ndarray, by: float,
                rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a pose and its direction by an angle in radians, each about an axis by chance."""
+    """Rotate a pose and its direction by an angle in radians, each about a random axis."""
     axes = unit(rng.normal(size=(2, 3)))
     axes[1] = unit(np.cross(axes[1], t))
     return (Rotation.from_rotvec(by * axes[0]).as_matrix() @ R,
@@ -67,7 +67,7 @@ def moved_pose(R: np.ndarray, t: np.ndarray, by: float,
 
 
 def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
-    """Image (H, W) uint8 as cameras see them: soft shades, sharp edges and fine grain."""
+    """Image (H, W) uint8 like that of a camera: soft shades, sharp edges and fine grain."""
     width, height = size
     shades = cv2.GaussianBlur(rng.normal(0, 900, (height, width)), (0, 0), 12)
     image = 128 + shades + cv2.GaussianBlur(rng.normal(0, 60, (height, width)), (0, 0), 1.5)
@@ -79,14 +79,14 @@ def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
 
 
 def some(features: Features, chosen: np.ndarray | slice) -> Features:
-    """Give some of the features, by index or slice."""
+    """Return a subset of the features, by index or slice."""
     return Features.described(
         features.points[chosen], features.octaves[chosen], features.angles[chosen],
         features.responses[chosen], features.descriptors[chosen])
 
 
 def uniform_view(K: np.ndarray = K, size: tuple[int, int] = SIZE, gray: int = 90) -> View:
-    """View of a wall without any texture."""
+    """View of a textureless wall."""
     return TwoViewEstimator().view(np.full(size[::-1], gray, np.uint8), K)
 
 
@@ -96,7 +96,7 @@ CLOSE_UP, SMALL = np.array([[268.0, 0, 319.5], [0, 268.0, 170], [0, 0, 1]]), (64
 
 def pictures_of_a_plane(rng: np.random.Generator
                         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Give R (3, 3), t (3,) and both pictures (H, W) of one textured plane, on some motion."""
+    """Return R (3, 3), t (3,) and both pictures (H, W) of one textured plane, on some motion."""
     texture = _texture(rng)
     turned = Rotation.from_euler('xy', rng.uniform(-40, 40, 2), degrees=True).as_matrix()
     R = Rotation.from_euler('xyz', rng.normal(0, 2, 3), degrees=True).as_matrix()
@@ -108,7 +108,7 @@ def pictures_of_a_plane(rng: np.random.Generator
 
 def pictures_towards_a_wall(rng: np.random.Generator, t: np.ndarray, count: int
                             ) -> list[np.ndarray]:
-    """Give pictures (H, W) of a wall that a camera faces, each a step t (3,) after another."""
+    """Return pictures (H, W) of a wall that a camera faces, each a step t (3,) after another."""
     texture = _texture(rng)
     return [_view_of_a_plane(rng, texture, np.eye(3), np.eye(3), i * t) for i in range(count)]
 

@@ -193,8 +193,8 @@ def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss
 def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
     """Return whether a rotation alone brings three quarters of the matches close to y."""
     rays_x, rays_y = problem.rays_x.T, problem.rays_y.T
-    turned = rays_x @ fit_rotation(rays_x, rays_y).T
-    offsets = np.linalg.norm(turned[:, :2] / turned[:, 2:] - rays_y[:, :2], axis=1)
+    rotated = rays_x @ fit_rotation(rays_x, rays_y).T
+    offsets = np.linalg.norm(rotated[:, :2] / rotated[:, 2:] - rays_y[:, :2], axis=1)
     # Size of a pixel in viewing-ray units, as for a surface of typical sharpness.
     pixel = np.sqrt(median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
     return bool(quantile(offsets, 0.75) < parallax * pixel)

@@ -91,11 +91,11 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
         return _detect_octave(gray, octave, most, contrast, mask, smoothed)
 
     wanted = [round(share * max_features) for share in _QUOTAS]
-    found = Features.together(each(lambda octave: octave_corners(octave, wanted[octave]),
-                                   _DEFAULT_OCTAVES))
+    found = Features.concatenated(each(lambda octave: octave_corners(octave, wanted[octave]),
+                                       _DEFAULT_OCTAVES))
     if len(found) < _ENOUGH * sum(wanted[octave] for octave in _DEFAULT_OCTAVES):
-        return Features.together([found, octave_corners(_MIDDLE, max_features - len(found))])
-    return replace(found, others=lambda: octave_corners(_MIDDLE, wanted[_MIDDLE]))
+        return Features.concatenated([found, octave_corners(_MIDDLE, max_features - len(found))])
+    return replace(found, additional=lambda: octave_corners(_MIDDLE, wanted[_MIDDLE]))
 
 
 def detect_large_corners(gray: Image, max_features: int, contrast: float,
@@ -109,7 +109,7 @@ def detect_large_corners(gray: Image, max_features: int, contrast: float,
     if len(large) >= _MANY_LARGE * max_features:
         return large
     small = _detect_octave(gray, _FINE, max_features - len(large), contrast, mask, smoothed)
-    return Features.together([small, large])
+    return Features.concatenated([small, large])
 
 
 def noise_of(image: Image) -> float:

@@ -217,12 +217,12 @@ class _Cells:
 
     @cached_property
     def H(self) -> Array:
-        """Return the matrices H (C, 5, 5) of the cells."""
+        """Return H of each cell, (C, 5, 5)."""
         return self.sums[_FULL].T.reshape(-1, 5, 5)
 
     @property
     def gradients(self) -> Array:
-        """Return the gradients (5, C) of the cells."""
+        """Return the gradient of each cell, (5, C)."""
         return self.sums[15:20]
 
     def determine_pose(self) -> bool:

@@ -86,7 +86,7 @@ class TwoViewEstimator:
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
         """Detect all features of a gray image (H, W) uint8, except where a mask (H, W) is True."""
-        return self._detected(gray, mask, None).with_others
+        return self._detected(gray, mask, None).with_additional
 
     def _detected(self, gray: NDArray[np.uint8], mask: Mask | None,
                   smoothed: NDArray[np.uint8] | None) -> Features:
@@ -125,7 +125,7 @@ class TwoViewEstimator:
         # Otherwise match in the whole search radius.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
-        sought = len(previous.features.with_others)
+        sought = len(previous.features.with_additional)
         return self.estimate_pair(Pair(previous, current, x, y, _prior_pose(prior), known,
                                        sought=sought, timings=timings))
 

@@ -35,7 +35,7 @@ class Turn:
         """Return the rotation vectors (…, 3) that correct R, (3, 3) or (N, 3, 3), to this one."""
         return rotation_log(self.R @ R.swapaxes(-1, -2))
 
-    def may_be(self, R: Array) -> bool:
+    def compatible_with(self, R: Array) -> bool:
         """Return whether a rotation (3, 3) is compatible: not a thousand times less likely."""
         return bool(self._square(R) <= _DECIDED)
 

@@ -101,7 +101,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     search_radius: as a share of the longer image side; 1 matches all with all, by descriptors
     alone.
     """
-    previous, current = (replace(view, features=view.features.with_others)
+    previous, current = (replace(view, features=view.features.with_additional)
                          for view in (previous, current))
     there, here = previous.features, current.features
     if search_radius >= 1:
@@ -110,7 +110,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
     rotated = predict_at_infinity(there, here, current.K, rotations, radius,
-                                  sure=known.turn is not None)
+                                  measured=known.turn is not None)
     y, bits = track_features(previous, current, rotated, radius)
     pairs = _match_rotated(previous, current, rotated, prior, radius)
     y, bits = _resolved(previous, current, y, bits, pairs)
@@ -146,13 +146,13 @@ def _resolved(previous: View, current: View, y: Array, bits: Array, pairs: NDArr
     """
     there, here = pairs.T
     matched, y, bits = current.features.points[here], y.copy(), bits.copy()
-    alike = match_distances(previous.smoothed, previous.features.points[there], current.smoothed,
-                            matched)
+    distance = match_distances(previous.smoothed, previous.features.points[there],
+                               current.smoothed, matched)
     lost = np.isinf(bits[there])
     elsewhere = ~lost & (np.linalg.norm(y[there] - matched, axis=1) > _SAME_PLACE)
-    better = lost | (elsewhere & (alike < bits[there] - _CLEAR_BITS))
-    neither = elsewhere & ~better & ~(alike > bits[there] + _CLEAR_BITS)
-    y[there[better]], bits[there[better]] = matched[better], alike[better]
+    better = lost | (elsewhere & (distance < bits[there] - _CLEAR_BITS))
+    neither = elsewhere & ~better & ~(distance > bits[there] + _CLEAR_BITS)
+    y[there[better]], bits[there[better]] = matched[better], distance[better]
     bits[there[neither]] = np.inf
     return y, bits
 

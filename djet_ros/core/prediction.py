@@ -29,15 +29,15 @@ _MARGIN = 20.0
 
 
 def predict_at_infinity(previous: Features, current: Features, K: Array, known: Sequence[Array],
-                        reach: float, sure: bool = False) -> Array:
+                        reach: float, measured: bool = False) -> Array:
     """
     Predict the pixels (N, 2) of the previous features under the rotation alone (infinite depth).
 
     known: likely rotations (3, 3), such as that of the previous motion; reach: search radius in
-    pixels, for the displacement by parallax; sure: whether known[0] is measured, so that no
+    pixels, for the displacement by parallax; measured: whether known[0] is measured, so that no
     rotation has to be estimated.
     """
-    R = known[0] if sure else likely_rotation(previous, current, K, known, reach)
+    R = known[0] if measured else likely_rotation(previous, current, K, known, reach)
     return _project(K, rays(K, previous.points) @ R.T)
 
 
@@ -49,16 +49,16 @@ def predict_constant_motion(previous: Features, K: Array, R: Array, prior: Relat
     nearest inlier of that motion, predicted from its depth.
     """
     x, y = (places.compress(prior.inliers, axis=0) for places in (prior.x, prior.y_opt))
-    turned = rays(K, previous.points) @ R.T
+    rotated = rays(K, previous.points) @ R.T
     if not prior.t.any() or not len(x):
-        return _project(K, turned)
+        return _project(K, rotated)
     seen = rays(K, x)
     rho = inverse_depths(prior.R, prior.t, seen, rays(K, y))[0].clip(0, _MAX_INVERSE_DEPTH)
     step = rho[:, None] * prior.t
     # Points scaled to z = 1 in the first camera, so that the step is rho t for any depth.
     there = (seen @ prior.R.T + step) @ R.T
     shift = _project(K, there + step) - _project(K, there)
-    return np.asarray(_project(K, turned) + shift[nearest(y, previous.points)])
+    return np.asarray(_project(K, rotated) + shift[nearest(y, previous.points)])
 
 
 def nearest(points: Array, others: Array) -> NDArray[np.int64]:
@@ -81,9 +81,11 @@ def search_radius_after(motion: RelativePose, K: Array) -> float:
     For the next pair, with a margin for a camera that accelerates by half.
     """
     x, y = motion.x[motion.inliers], motion.y_opt[motion.inliers]
-    turned = rays(K, x) @ (K @ motion.R).T
-    ways = np.linalg.norm(turned[:, :2] / turned[:, 2:] - y, axis=1)
-    return _MARGIN + 1.5 * float(np.quantile(ways, _QUANTILE)) if len(ways) else np.inf
+    rotated = rays(K, x) @ (K @ motion.R).T
+    displacements = np.linalg.norm(rotated[:, :2] / rotated[:, 2:] - y, axis=1)
+    if not len(displacements):
+        return np.inf
+    return _MARGIN + 1.5 * float(np.quantile(displacements, _QUANTILE))
 
 
 def likely_rotation(previous: Features, current: Features, K: Array, known: Sequence[Array],
@@ -99,8 +101,8 @@ def likely_rotation(previous: Features, current: Features, K: Array, known: Sequ
     tried = np.stack([*known, np.eye(3)])
     if len(x) >= 2:
         one, other = np.random.default_rng(0).integers(0, len(x), (2, _HYPOTHESES))
-        turned = _frames(y[one], y[other]) @ _frames(x[one], x[other]).transpose(0, 2, 1)
-        tried = np.concatenate([tried, turned])
+        rotated = _frames(y[one], y[other]) @ _frames(x[one], x[other]).transpose(0, 2, 1)
+        tried = np.concatenate([tried, rotated])
     # y^T R x of all hypotheses in one product.
     cosines = tried.reshape(-1, 9) @ (y[:, :, None] * x[:, None]).reshape(-1, 9).T
     agreement = 1 - 2 * (1 - cosines) * (K[0, 0] / reach)**2

@@ -140,9 +140,9 @@ def hemisphere_starts(R: Array, count: int) -> list[Pose]:
 @lru_cache(maxsize=8)
 def _hemisphere(count: int) -> Array:
     z = (np.arange(count) + 0.5) / count
-    turn = np.pi * (1 + np.sqrt(5)) * (np.arange(count) + 0.5)
+    angle = np.pi * (1 + np.sqrt(5)) * (np.arange(count) + 0.5)
     ring = np.sqrt(1 - z**2)
-    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
     directions.setflags(write=False)
     return directions
 

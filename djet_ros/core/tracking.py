@@ -134,9 +134,7 @@ class Track:
 
     @cached_property
     def scale(self) -> float:
-        """
-        Return the robust standard deviation of the residuals, in pixels of a typical surface.
-        """
+        """Return the robust standard deviation of the residuals, in pixels."""
         return _scale(self.residuals.r)
 
     def inliers(self) -> NDArray[np.bool_]:
@@ -170,7 +168,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     rivals = _planar_preferences(track, first, surface.x)
     if rivals is not track.rivals:
         track = replace(track, rivals=rivals)
-    if measured is not None and not measured.may_be(track.pose.R):
+    if measured is not None and not measured.compatible_with(track.pose.R):
         for rival in first.rivals:
             candidate = _Algorithm(_images_only(pair), surface, config, all_alive).run([rival])
             if candidate is not None and measured.prefers(candidate.pose.R, track.pose.R):
@@ -529,13 +527,13 @@ def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
 
 def _advanced(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Array:
     """Move keypoints towards their optimum by the configured strategy ("Keypoint iterations")."""
-    way = optimum - keypoints
+    step = optimum - keypoints
     if config.step == 'share':
-        return keypoints + config.step_share * way
-    length = np.linalg.norm(way, axis=1, keepdims=True)
+        return keypoints + config.step_share * step
+    length = np.linalg.norm(step, axis=1, keepdims=True)
     # Beyond the sampled window the paraboloid is not valid, so no step is longer than that.
     longest = 1.0 if config.step == 'pixel' else config.window / 2
-    return np.asarray(keypoints + way * np.minimum(1.0, longest / np.maximum(length, 1e-12)))
+    return np.asarray(keypoints + step * np.minimum(1.0, longest / np.maximum(length, 1e-12)))
 
 
 def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -557,7 +555,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     x, y, rays_x, rays_y = (places.take(there, axis=0) for places in (x, y, rays_x, rays_y))
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
     slopes = slopes_of_all(x, rho, TRACK_TUNING.depth_noise / K[0, 0] * sigma)
-    leaning = warp.take(there, axis=0) + slant_warp(K, pose.t, y, seen[there], slopes)
-    alike = comparable(leaning)
-    warp[there[alike]] = leaning[alike]
+    slanted = warp.take(there, axis=0) + slant_warp(K, pose.t, y, seen[there], slopes)
+    slant_ok = comparable(slanted)
+    warp[there[slant_ok]] = slanted[slant_ok]
     return warp, plausible

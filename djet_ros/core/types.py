@@ -48,8 +48,8 @@ class Features:
 
     points: (N, 2) pixels at full resolution, pixel centres at integers; octaves: (N,) pyramid
     levels; angles: (N,) degrees; responses: (N,); describe: computes the descriptors, on first
-    access only, as predicted pairs never need them; others: detects additional features on demand,
-    which only help if views are far apart.
+    access only, as predicted pairs never need them; additional: detects additional features on
+    demand, which only help if views are far apart.
     """
 
     points: Array
@@ -57,10 +57,10 @@ class Features:
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]
     describe: Callable[[], NDArray[np.uint8]]
-    others: Callable[[], Features] | None = None
+    additional: Callable[[], Features] | None = None
 
     @classmethod
-    def together(cls, parts: Sequence[Features]) -> Features:
+    def concatenated(cls, parts: Sequence[Features]) -> Features:
         """Concatenate features of one image, without their additional ones."""
         # Captures the callables only: a reference to the parts would keep all of their arrays
         # alive.
@@ -86,9 +86,11 @@ class Features:
         return self.describe()
 
     @cached_property
-    def with_others(self) -> Features:
+    def with_additional(self) -> Features:
         """Return these features and the additional ones, if there are any."""
-        return self if self.others is None else Features.together([self, self.others()])
+        if self.additional is None:
+            return self
+        return Features.concatenated([self, self.additional()])
 
 
 class Picture(Protocol):

@@ -177,7 +177,7 @@ def _compare_with_rivals(pose: Pose, covariances: tuple[Array, Array], track: Tr
     degree into one of five degrees.
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
-    unsure: list[Array] = []
+    undecided_rivals: list[Array] = []
     for rival in (*track.rivals, *track.nearby):
         off = pose_difference(pose.R, pose.t, rival.pose)
         if squared_distance(covariances[0], off) < CHI2_999:
@@ -189,10 +189,10 @@ def _compare_with_rivals(pose: Pose, covariances: tuple[Array, Array], track: Tr
         if track.body_ambiguous or probability > ndtr(-DECIDED):
             covariances = widened_to_span(covariances[0], pose.t, off, probability)
         if undecided:
-            unsure.append(_covariance_of(rival.pose, track, places))
+            undecided_rivals.append(_covariance_of(rival.pose, track, places))
     # Only after all rivals were compared: the uncertainty of one rival must not make another one
     # look covered.
-    for own in unsure:
+    for own in undecided_rivals:
         covariances = widened(covariances[0], pose.t, own)
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
