@@ -65,7 +65,7 @@ _NOISE_FACTOR = 0.8
 # Second difference along rows of that along columns: zero on gradients and on horizontal or
 # vertical edges, and with a gain of six on the standard deviation of noise (Immerkaer, CVIU 64,
 # 1996).
-_LAPLACIAN_2D = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
+_MIXED_DIFFERENCE = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
 _NOISE_GAIN = 6.0
 
 # Noise estimation: side of the blocks in pixels, spacing of the rows of blocks, and the quantile
@@ -127,7 +127,7 @@ def _block_curvatures(image: Image) -> NDArray[np.int32]:
         return compiled.curved_blocks(image, _NOISE_BLOCK, _ROW_SPACING)
     first = np.arange(0, len(image) - _NOISE_BLOCK - 1, _ROW_SPACING)
     rows = image[first[:, None] + np.arange(_NOISE_BLOCK + 2)]
-    curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_16S, _LAPLACIAN_2D)
+    curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_16S, _MIXED_DIFFERENCE)
     # The outer rows are only needed for the differences.
     across = image.shape[1] // _NOISE_BLOCK
     sizes = np.abs(curved.reshape(rows.shape)[:, 1:-1, :across * _NOISE_BLOCK])

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-# Standard deviations by which matches have to prefer a pose for a decision: a one-sided error of 1
-# %.
+# Standard deviations by which matches have to prefer a pose for a decision: one error in a hundred
+# (one-sided).
 DECIDED = 2.33
 
 # rad; chosen: bound of the change of a camera's motion from one pair to the next.

@@ -351,7 +351,7 @@ class _Algorithm:
             found = self._optimised(paraboloids, voting, poses, predicted, by_points)
             if number == 1:
                 self.first = found
-            last = (found.converged and self._warped) or number == most
+            last = (found.converged and self._is_warped) or number == most
             if last:
                 found, placed, rivals, nearby = self._concluded(found)
             # Keypoints move towards their optimum on the epipolar line of the new pose.
@@ -373,8 +373,8 @@ class _Algorithm:
                      placed, optimum, self._losses, no_minimum, tuple(rounds), rivals, nearby)
 
     @property
-    def _warped(self) -> bool:
-        """Whether the surfaces are sampled under warps, if warps are in use."""
+    def _is_warped(self) -> bool:
+        """Return whether the surfaces are sampled under warps, if these are in use."""
         return (self._warp is not None or not self._config.warp_reference
                 or self._config.method == 'rpe')
 
