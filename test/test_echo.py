@@ -1,4 +1,4 @@
-"""What ``djet echo`` shows of a node: that node's, and as it was said."""
+"""What ``djet echo`` shows: the diagnostics of the named node only, and unchanged."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ def shown(printed: object) -> str:
     return out.file.getvalue()
 
 
-def test_the_state_shown_is_that_of_the_node_and_of_no_other() -> None:
+def test_only_the_status_of_the_named_node_is_shown() -> None:
     view = Monitor('left/vo_node')
     for other in ('right/vo_node', 'vo_node', 'very/left/vo_node'):
         view.diagnostics(diagnostics(other, 'lost'))
     view.diagnostics(diagnostics('left/vo_node', 'lost', 'pose graph'))
-    assert (view.summary, view.news) == ('nothing heard yet', False)
+    assert (view.summary, view.updated) == ('no diagnostics received yet', False)
     view.diagnostics(diagnostics('left/vo_node', 'tracking'))
     view.diagnostics(diagnostics('right/vo_node', 'lost'))
     assert (view.summary, view.values) == ('tracking', {'frames processed': '9'})
 
 
-@pytest.mark.parametrize('said', ['tracking [/b]', '[red]tracking', 'no mask of [/camera/image]'])
-def test_a_state_is_shown_as_it_was_said_brackets_and_all(said: str) -> None:
+@pytest.mark.parametrize('text', ['tracking [/b]', '[red]tracking', 'no mask of [/camera/image]'])
+def test_brackets_in_a_status_are_not_interpreted_as_markup(text: str) -> None:
     view = Monitor('vo_node')
-    view.diagnostics(diagnostics('vo_node', said))
-    view.values['matches'] = said
-    assert shown(view.table()).count(said) == 2
+    view.diagnostics(diagnostics('vo_node', text))
+    view.values['matches'] = text
+    assert shown(view.table()).count(text) == 2
 
 
-def test_a_recording_may_be_named_with_brackets() -> None:
+def test_brackets_in_the_name_of_a_recording_are_not_interpreted_as_markup() -> None:
     name = 'drive [/b] [red]'
     table = new_table(f'{name}: djet', name)
     table.add_row(name)

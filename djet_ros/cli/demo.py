@@ -1,4 +1,4 @@
-"""``djet demo``: from images to trajectories, with the commands that a user would type."""
+"""``djet demo``: render, convert, replay and compare, by running the other commands."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from djet_ros.replay.results import PLOT, SUMMARY
 from rich.table import Table
 
 DESCRIPTION = """\
-Render a road with known camera poses (or take a KITTI sequence), convert it to a bag, replay the
-bag with D-JET and with re-projection error (RP-E), and compare the two.
+Render a road with exact ground truth (or take a KITTI sequence), convert it to a bag, replay the
+bag with D-JET and with reprojection error (RP-E), and compare their errors.
 """
 
 METHODS = ('djet', 'rpe')
@@ -26,12 +26,12 @@ METHODS = ('djet', 'rpe')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('sequence', nargs='?', type=Path, metavar='SEQUENCE_DIR',
-                        help='folder such as sequences/00 (default: render a road)')
-    add_output(parser, 'folder of everything that is written', 'demo')
+                        help='KITTI sequence, such as sequences/00 (default: render a road)')
+    add_output(parser, 'folder for everything that is written', 'demo')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the commands one after another, then print what they found side by side."""
+    """Run the commands in order, then print the errors of both methods side by side."""
     overwrite = ['--overwrite'] if args.overwrite else []
     sequence = args.sequence
     if sequence is None:
@@ -55,12 +55,12 @@ def _djet(*arguments: str | Path) -> None:
     print(f'\n$ djet {shlex.join(words)}', flush=True)
     code = main.run(words)
     if code:
-        raise DjetError(f"the demo ends here: 'djet {arguments[0]}' gave exit code {code}")
+        raise DjetError(f"the demo stopped: 'djet {arguments[0]}' failed with exit code {code}")
 
 
 def _comparison(summaries: dict[str, dict[str, Any]]) -> Table:
     table = new_table('errors against ground truth, in degrees: mean / median / p95 / max',
-                      'method', 'pairs', 'pairs/s', 'rotation', 'direction of translation')
+                      'method', 'pairs', 'pairs/s', 'rotation', 'translation direction')
     for method, summary in summaries.items():
         rate = summary['pairs'] / summary['seconds']
         table.add_row(method, str(summary['pairs']), f'{rate:.1f}',

@@ -1,4 +1,4 @@
-"""``djet echo``: what a live odometry says, in a terminal."""
+"""``djet echo``: print poses or diagnostics of a running odometry."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from rich.table import Table
 from rich.text import Text
 
 DESCRIPTION = f"""\
-Show the integrated poses of a live odometry (djet live, or vo_node under ROS), a line each; with
---diagnostics its state, rate, latency and path length, as a view that changes or, where the
-output is no terminal, as lines.
+Print the integrated poses of a running odometry (djet live, or vo_node under ROS), one line each:
+time stamp, position and orientation quaternion, as in a TUM file. With --diagnostics show its
+state, rate, latency and path length instead: as a table that is updated in place, or, if the
+output is not a terminal, one line per message.
 {ENVIRONMENT}"""
 
-# Of the diagnostics, what is worth a glance.
+# Keys of the diagnostics that are shown.
 _SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames received',
           'frames processed', 'frames dropped', 'frames rejected', 'frames lost on the way',
           'matches', 'inliers', 'median residual (px)')
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
-# Seconds without a message after which it is said what is waited for.
-_PATIENCE_S = 2.0
+# Seconds without a message before the user is told which topic is silent.
+_SILENCE_WARNING_S = 2.0
 
 _UNITS = {'metric': 'm', 'relative': 'lengths of the first step'}
 
@@ -44,13 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--diagnostics', action='store_true',
                         help='state, rate, latency and path length instead of poses')
     parser.add_argument('--node', default=NODE_NAME, metavar='NAME',
-                        help='name of the node, with its namespace if it has one '
+                        help='name of the node, with its namespace if any '
                         '(default: %(default)s)')
     add_remappings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show what comes until SIGINT or SIGTERM."""
+    """Print messages until SIGINT or SIGTERM."""
     stop = stop_by_signal()
 
     from djet_ros.dds.graph import Graph
@@ -66,32 +67,36 @@ def run(args: argparse.Namespace) -> int:
 
     with Graph() as graph:
         graph.listen(topic, _ODOMETRY, pose)
-        waiting = _Waiting(view, graph, topic)
+        silence = _SilenceWarning(view, graph, topic)
         if args.diagnostics:
             graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
                          view.diagnostics)
-            _show(view, graph, stop, waiting)
+            _show(view, graph, stop, silence)
         while not stop.is_set():
             graph.spin(0.1)
-            waiting.say()
+            silence.check()
     return 0
 
 
 @dataclass
 class Monitor:
-    """What is known of the odometry, from its messages so far."""
+    """
+    State of the odometry, from its messages so far.
+
+    updated: whether diagnostics have arrived since they were last printed.
+    """
 
     node: str
     path_length: float = 0.0
     poses: int = 0
-    summary: str = 'nothing heard yet'
+    summary: str = 'no diagnostics received yet'
     level: int = 3
     values: dict[str, str] = field(default_factory=dict)
-    news: bool = False
+    updated: bool = False
     _last: Any = None
 
     def odometry(self, message: Any) -> None:
-        """Add a step to the path; a pose back at the origin begins a new one."""
+        """Add a step to the path length; a pose at the origin starts a new path."""
         at = message.pose.pose.position
         position = np.array([at.x, at.y, at.z])
         self.poses += 1
@@ -102,21 +107,21 @@ class Monitor:
         self._last = position
 
     def diagnostics(self, message: Any) -> None:
-        """Take the status of the node, if it is its."""
+        """Update the state, if the message has the status of this node."""
         for status in message.status:
             if status.name == f'{self.node}: visual odometry':
                 self.values = {pair.key: pair.value for pair in status.values}
-                self.summary, self.news = status.message, True
+                self.summary, self.updated = status.message, True
                 self.level = int(status.level)
 
     @property
     def length(self) -> str:
-        """Length of the path, in metres where they are known."""
+        """Length of the path with its unit, metres if the scale is metric."""
         unit = _UNITS.get(self.values.get('scale', ''), 'steps of unit length')
         return f'{self.path_length:.1f} {unit}'
 
     def table(self) -> Table:
-        """Show it all."""
+        """Lay out the state as a table."""
         table = Table(title=self.node, show_header=False, min_width=48)
         table.add_row('state', Text(self.summary, _COLOURS.get(self.level, 'red')))
         table.add_row('path', self.length)
@@ -125,26 +130,26 @@ class Monitor:
         return table
 
     def line(self) -> str:
-        """Say it all in a line."""
+        """Return the state as one line."""
         shown = '; '.join(f'{name}: {self.values[name]}' for name in _SHOWN if name in self.values)
         return f'{self.summary}; path: {self.length}; {shown}'
 
 
-class _Waiting:
-    """Says once, if nothing is heard for a while, over which topic nothing comes."""
+class _SilenceWarning:
+    """Warns once, on stderr, if no message has arrived after a while, with the likely reason."""
 
     def __init__(self, view: Monitor, graph: Any, topic: str) -> None:
         self._view, self._graph, self._topic = view, graph, topic
-        self._end: float | None = monotonic() + _PATIENCE_S
+        self._deadline: float | None = monotonic() + _SILENCE_WARNING_S
 
-    def say(self) -> None:
-        if self._end is None or monotonic() < self._end:
+    def check(self) -> None:
+        if self._deadline is None or monotonic() < self._deadline:
             return
-        self._end = None
+        self._deadline = None
         if not self._view.poses and not self._view.values:
-            print(f'waiting for {self._topic}: {self._why()}', file=sys.stderr, flush=True)
+            print(f'waiting for {self._topic}: {self._reason()}', file=sys.stderr, flush=True)
 
-    def _why(self) -> str:
+    def _reason(self) -> str:
         if offers := self._graph.offers(self._topic):
             return f'{len(offers)} publish it, none sends'
         near = get_close_matches(self._topic, self._graph.published(_ODOMETRY), n=1, cutoff=0.0)
@@ -152,26 +157,26 @@ class _Waiting:
 
 
 def _print_pose(message: Any) -> None:
-    """Stamp, position and orientation as in a TUM file."""
+    """Print stamp, position and orientation as a line of a TUM file."""
     stamp, pose = message.header.stamp, message.pose.pose
-    at, turn = pose.position, pose.orientation
-    print(f'{stamp.sec}.{stamp.nanosec:09d} {at.x:.6f} {at.y:.6f} {at.z:.6f} '
-          f'{turn.x:.6f} {turn.y:.6f} {turn.z:.6f} {turn.w:.6f}', flush=True)
+    p, q = pose.position, pose.orientation
+    print(f'{stamp.sec}.{stamp.nanosec:09d} {p.x:.6f} {p.y:.6f} {p.z:.6f} '
+          f'{q.x:.6f} {q.y:.6f} {q.z:.6f} {q.w:.6f}', flush=True)
 
 
-def _show(view: Monitor, graph: Any, stop: Event, waiting: _Waiting) -> None:
-    """Keep a terminal up to date, or print a line for each diagnostics message."""
+def _show(view: Monitor, graph: Any, stop: Event, silence: _SilenceWarning) -> None:
+    """Update a table in a terminal, else print a line for each diagnostics message."""
     console = terminal.console()
     if console.is_terminal:
         with Live(view.table(), console=console, auto_refresh=False) as live:
             while not stop.is_set():
                 graph.spin(0.2)
-                waiting.say()
+                silence.check()
                 live.update(view.table(), refresh=True)
         return
     while not stop.is_set():
         graph.spin(0.2)
-        waiting.say()
-        if view.news:
-            view.news = False
+        silence.check()
+        if view.updated:
+            view.updated = False
             print(view.line(), flush=True)

@@ -1,4 +1,4 @@
-"""``djet export``: the pose graph of a replay, for a SLAM backend."""
+"""``djet export``: write the pose graph of a replay for a SLAM back end."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from djet_ros.replay.graph_of_results import read_results
 
 DESCRIPTION = """\
 Write the pose graph of a replay: a vertex for each tracked frame, and an edge for each pair with
-its relative pose and information matrix (inverse covariance). Where the scale is unknown, the
-information along the translation is weak. g2o files are read by GTSAM and g2o; csv has the
-covariances; tum and kitti have the poses alone. Neighbouring pairs err alike, which a graph does
-not know: see --chained.
+its relative pose and information matrix (inverse covariance). If the scale is unknown, the
+information along the translation direction is weak. g2o files are read by GTSAM and g2o; csv has
+the covariances; tum and kitti have the poses only. Errors of neighbouring pairs are correlated,
+which a pose graph cannot express: see --chained.
 """
 
 
@@ -28,14 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--format', choices=tuple(FORMATS), default='g2o',
                         help='default: %(default)s')
     parser.add_argument('--chained', action='store_true',
-                        help='make edges of the odometry as unsure as they have to be where long '
-                        'chains of them meet, as djet slam does, in place of what each pair is by '
-                        'itself')
-    add_output(parser, 'where the graph goes', metavar='FILE')
+                        help='inflate the covariances of odometry edges for the correlation of '
+                        'their errors, so that long chains of them have a realistic covariance, '
+                        'as djet slam does (default: the covariance of each pair by itself)')
+    add_output(parser, 'file of the pose graph', metavar='FILE')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the file, and say what is in it."""
+    """Write the file, and print the number of poses and edges."""
     graph = read_results(args.results, warn)
     if args.chained:
         graph = replace(graph, edges=tuple(edge.in_graph() for edge in graph.edges))
@@ -44,5 +44,5 @@ def run(args: argparse.Namespace) -> int:
     unscaled = sum(not edge.scale_known for edge in graph.edges)
     print(f'{args.output}: {len(graph.poses)} poses, {len(graph.edges)} edges ('
           + ', '.join(f'{count} {kind}' for kind, count in kinds.items())
-          + (f'; {unscaled} of unknown length' if unscaled else '') + ')')
+          + (f'; {unscaled} of unknown scale' if unscaled else '') + ')')
     return 0

@@ -1,4 +1,4 @@
-"""Options that the commands on the graph share, and their end by a signal."""
+"""Options of the commands that join a ROS 2 graph, and how signals stop them."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import signal
 from threading import Event
 
 ENVIRONMENT = """\
-The graph is that of ROS_DOMAIN_ID; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps to this machine,
-also where it has no multicast. What CYCLONEDDS_URI says comes on top.
+ROS_DOMAIN_ID selects the ROS 2 domain. ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST restricts discovery
+to this machine, and works without multicast. Settings of CYCLONEDDS_URI are applied on top.
 """
 
 
 def add_remappings(parser: argparse.ArgumentParser) -> None:
     """Add -r from:=to."""
     parser.add_argument('-r', '--remap', action='append', default=[], metavar='FROM:=TO',
-                        help='another name for a topic or service, or for the node (__node, '
-                        '__ns); may be repeated')
+                        help='remap a topic or service, or the node (__node, __ns); may be '
+                        'repeated')
 
 
 def stop_by_signal() -> Event:
     """
-    Give an event that SIGINT, SIGTERM and SIGHUP set, instead of ending the process.
+    Return an event that SIGINT, SIGTERM and SIGHUP set instead of ending the process.
 
-    Another thread sets it: a signal may come while the main thread holds the event's lock, as it
-    does at each look, and a handler that waits for that would wait for itself.
+    The handler sets it from another thread: a signal may arrive while the main thread holds the
+    event's lock (as in each ``is_set``), and a handler that waited for it would deadlock.
     """
     stop = Event()
     numbers = [signal.SIGINT, signal.SIGTERM]
-    # With nohup a terminal may close.
+    # nohup ignores SIGHUP; keep that.
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
     for number in numbers:

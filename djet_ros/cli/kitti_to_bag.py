@@ -1,4 +1,4 @@
-"""``djet kitti-to-bag``: a KITTI odometry sequence as a rosbag2."""
+"""``djet kitti-to-bag``: convert a KITTI odometry sequence to a rosbag2."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from djet_ros.recordings.bag_writers import STORAGES, write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
 
 DESCRIPTION = """\
-Write a KITTI odometry sequence (image_0/*.png, calib.txt, times.txt) as a rosbag2 with
-/camera/image_rect, /camera/camera_info, /tf_static and, where there are poses,
-/ground_truth/pose. Stamps are those of times.txt plus 1000 s, because ROS takes 0 for "no time".
+Convert a KITTI odometry sequence (image_0/*.png, calib.txt, times.txt) to a rosbag2 with
+/camera/image_rect, /camera/camera_info, /tf_static and, if there is ground truth,
+/ground_truth/pose. Stamps are those of times.txt plus 1000 s, because in ROS a stamp of 0 means
+"no time".
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('sequence', type=Path, metavar='SEQUENCE_DIR',
-                        help='folder such as sequences/00')
+                        help='folder of the sequence, such as sequences/00')
     parser.add_argument('out', type=Path, metavar='OUT', help='folder of the new bag')
     parser.add_argument('--poses', type=Path, metavar='FILE',
-                        help='ground truth (default: ../../poses/NN.txt where it exists)')
+                        help='ground truth poses (default: ../../poses/NN.txt of the sequence, '
+                        'if it exists)')
     parser.add_argument('--storage', choices=tuple(STORAGES), default='mcap',
                         help='file format of the bag (default: %(default)s)')
     add_frames(parser)
@@ -31,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert, with a progress bar on stderr, and say what was written."""
+    """Convert, with a progress bar on stderr, and print what was written."""
     sequence = KittiSequence(args.sequence, args.poses, args.start, args.end)
     with progress_bar(sequence.name, len(sequence)) as progress:
         write_kitti_bag(sequence, args.out, args.storage, overwrite=args.overwrite,

@@ -1,4 +1,4 @@
-"""``djet live``: the odometry on a ROS 2 graph, without ROS."""
+"""``djet live``: run the odometry on a ROS 2 graph, without ROS."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from djet_ros.errors import DjetError
 from djet_ros.live.parameters import with_live_values
 
 DESCRIPTION = f"""\
-Do on a ROS 2 graph, where no ROS is installed, what 'ros2 run djet_ros vo_node' does where it is:
-the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/relative_pose_status,
+Run the odometry on a ROS 2 graph from a machine without ROS, with the interface of 'ros2 run
+djet_ros vo_node': the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/relative_pose_status,
 ~/odometry, ~/path, ~/landmarks, ~/debug_image, /diagnostics, /tf), services (~/reset, ~/pause,
 ~/resume) and parameters.
 {ENVIRONMENT}"""
@@ -25,15 +25,15 @@ the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/rel
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('--params', type=Path, metavar='FILE',
-                        help='parameters as YAML, in the layout of ROS or plain')
+                        help='YAML file of parameters, plain or in the layout of ROS')
     parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
                         help='a parameter, such as ros.queue_policy:=every, or '
-                        'use_sim_time:=true; on top of the file; may be repeated')
+                        'use_sim_time:=true; overrides the file; may be repeated')
     add_remappings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Work until SIGINT or SIGTERM."""
+    """Run the odometry until SIGINT or SIGTERM."""
     stop = stop_by_signal()
     names = Names(NODE_NAME, args.remap)
     config, use_sim_time = _configuration(args, names.full_node)
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _configuration(args: argparse.Namespace, node: str) -> tuple[Config, bool]:
-    """Read file and command line for a node by its full name; the boolean is use_sim_time."""
+    """Return (configuration, use_sim_time) from file and command line; node: its full name."""
     config = Config() if args.params is None else load_yaml(
         args.params, take=with_live_values, nodes=[node])
     known = flat(config)
@@ -55,7 +55,7 @@ def _configuration(args: argparse.Namespace, node: str) -> tuple[Config, bool]:
     for given in args.param:
         name, mark, text = given.partition(':=')
         if not mark:
-            raise DjetError(f"'{given}' is no parameter; write it as name:=value")
+            raise DjetError(f"--param is '{given}'; write it as name:=value")
         if name == 'use_sim_time':
             if text not in ('true', 'false'):
                 raise DjetError(f"use_sim_time is '{text}'; it must be true or false")

@@ -1,4 +1,4 @@
-"""The ``djet`` command's frame: the list of subcommands and the one error handler."""
+"""Entry point of the ``djet`` command: subcommands, signals and error handling."""
 
 from __future__ import annotations
 
@@ -18,41 +18,42 @@ from djet_ros.errors import DjetError
 from djet_ros.libraries import how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
-# Only the module of the command that is called gets imported: help is quick, and no command
-# needs the libraries of another.
+# Only the module of the called command is imported: help is fast, and no command needs the
+# libraries of another.
 COMMANDS = {
-    'replay': 'get the trajectory of a camera from a recording',
-    'live': 'the odometry on a ROS 2 graph, without ROS',
-    'play': 'a recording onto a ROS 2 graph, without ROS',
-    'echo': 'what a live odometry says, in the terminal',
-    'slam': 'close loops offline and optimise the trajectory with GTSAM',
-    'export': 'write the pose graph of a replay for a SLAM backend',
-    'lens': 'what the calibration leaves of the lens, from a recording of turns',
-    'kitti-to-bag': 'write a KITTI odometry sequence as a rosbag2',
-    'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
-    'lab': 'measure and draw: errors, speed, memory, surfaces (djet lab --help)',
+    'replay': 'estimate the trajectory of a camera from a recording',
+    'live': 'run the odometry on a ROS 2 graph, without ROS',
+    'play': 'publish a recording on a ROS 2 graph, without ROS',
+    'echo': 'print poses or diagnostics of a running odometry',
+    'slam': 'close loops offline and optimise the pose graph with GTSAM',
+    'export': 'write the pose graph of a replay for a SLAM back end',
+    'lens': 'estimate the residual radial distortion of a calibrated camera',
+    'kitti-to-bag': 'convert a KITTI odometry sequence to a rosbag2',
+    'demo': 'replay a sequence with D-JET and with reprojection error, and compare',
+    'lab': 'evaluate and plot: errors, speed, memory, surfaces (djet lab --help)',
 }
 LAB = {
-    'evaluate': 'estimate all pairs by several methods: tables and plots against ground truth',
-    'ablate': 'estimate all pairs by variants of D-JET: what each part contributes',
-    'closure': 'how well the rotations of three frames agree: no ground truth needed',
-    'coverage': 'are poses as sure as they say? errors against covariances, scene by scene',
-    'beside': 'what a gyro and masks are good for, on rendered scenes, with and without them',
-    'lengths': 'how far do lengths drift, and are they as sure as they say? on rendered streets',
-    'bench': 'measure the speed, as ratios against OpenCV from one run',
-    'soak': 'run many frames through the odometry: does memory or latency grow?',
-    'similarity': "draw how alike descriptors around keypoints are (the paper's Figure 1)",
-    'surfaces': 'draw one match on its Hamming surface, round by round',
-    'imu-offset': "find the offset of an IMU's clock, and how it is mounted, from a recording",
+    'evaluate': 'compare methods on all pairs of sequences, against ground truth',
+    'ablate': 'compare variants of D-JET on all pairs: the contribution of each part',
+    'closure': 'rotation closure error of frame triplets, without ground truth',
+    'coverage': 'covariance calibration: coverage of ellipsoids and NEES, scene by scene',
+    'beside': 'benefit of a gyro and of masks, on rendered scenes',
+    'lengths': 'scale drift and its covariance, on rendered streets',
+    'bench': 'measure the speed, as ratios to an OpenCV pipeline in the same run',
+    'soak': 'long run: does memory or latency grow?',
+    'similarity': "plot descriptor distances around keypoints (the paper's Figure 1)",
+    'surfaces': 'plot one match on its Hamming surface, iteration by iteration',
+    'imu-offset': 'estimate time offset and rotation between IMU and camera, and the gyro bias',
     'render': 'render a scene with exact ground truth as a KITTI sequence',
 }
 
 
 class _Parser(argparse.ArgumentParser):
     """
-    A parser that reports a wrong command line in one line, without the whole usage.
+    Parser that reports a wrong command line in one line, without the usage text.
 
-    Options stand in full: ``--imu`` must not be ``--imu-topic`` where there is no ``--imu``.
+    Options cannot be abbreviated: if a command lacks ``--imu``, that must not mean
+    ``--imu-topic``.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -62,24 +63,25 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'djet: error: {message} (see {self.prog} --help)\n')
 
 
-# What ends a command beside Ctrl-C; SIGHUP comes where its terminal is closed.
-_ENDS = (signal.SIGTERM, signal.SIGHUP)
+# Signals that end a command like Ctrl-C; SIGHUP is sent when its terminal closes.
+_TERMINATING = (signal.SIGTERM, signal.SIGHUP)
 
 
 class _Terminated(KeyboardInterrupt):
-    """What such a signal raises, so that it ends as by Ctrl-C: nothing is left half done."""
+    """Raised by these signals, so that a command cleans up as it does after Ctrl-C."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Run a command line; the exit code is 2 for what the user can mend.
+    Run a command line and return its exit code.
 
-    It is 130 for Ctrl-C, 143 for SIGTERM and 129 for SIGHUP, as a shell would have it.
+    It is 2 for errors that the user can correct, and by the convention of shells 130 for Ctrl-C,
+    143 for SIGTERM and 129 for SIGHUP.
     """
     one_blas_thread()
     sleep_while_waiting()
-    _print_anything()
-    with _heeding_signals():
+    _escape_unprintable()
+    with _terminating_signals():
         return _main(argv)
 
 
@@ -93,7 +95,7 @@ def _main(argv: Sequence[str] | None) -> int:
     except ModuleNotFoundError as error:
         return _fail(_how_to_install(error))
     except _Terminated as end:
-        # Of a terminal that was closed nothing is left to print to.
+        # After SIGHUP the terminal may be gone.
         with suppress(OSError):
             print('djet: terminated', file=sys.stderr)
         return 128 + int(end.args[0])
@@ -101,23 +103,23 @@ def _main(argv: Sequence[str] | None) -> int:
         print('djet: interrupted', file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of our output has gone; Python would flush to it once more at its exit.
+        # The reader of our output has closed it; Python would fail to flush once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
         return _fail(f'{error.filename}: {error.strerror}' if error.filename else str(error))
 
 
-def _print_anything() -> None:
-    """Let names of files that are no text, and signs that a terminal lacks, end no command."""
+def _escape_unprintable() -> None:
+    """Escape what stdout cannot encode: undecodable file names, characters missing in ASCII."""
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors='backslashreplace')
 
 
 @contextmanager
-def _heeding_signals() -> Iterator[None]:
-    """Let signals interrupt, unless the command or who started it has something else in mind."""
-    ours = [number for number in _ENDS if current_thread() is main_thread()
+def _terminating_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise, except those that already have another handler."""
+    ours = [number for number in _TERMINATING if current_thread() is main_thread()
             and signal.getsignal(number) is signal.SIG_DFL]
     for number in ours:
         signal.signal(number, _terminate)
@@ -134,7 +136,7 @@ def _terminate(number: int, _: object) -> NoReturn:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run one subcommand, letting its exceptions through."""
+    """Run one subcommand and return its exit code; its exceptions propagate."""
     parser = _Parser(prog='djet', description='Visual odometry by D-JET, from bags and datasets.')
     parser.add_argument('--version', action='version', version=f'djet_ros {__version__}')
     _add_commands(parser, COMMANDS, argv)
@@ -147,15 +149,15 @@ def run(argv: Sequence[str]) -> int:
 
 def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, str],
                   words: Sequence[str], package: str = 'djet_ros.cli') -> None:
-    """Add all commands by name, and the arguments of the one that the words call."""
+    """Add all commands by name, and the arguments of the one that is called."""
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
-    place = _first_plain(words)
+    place = _first_positional(words)
     for name, summary in commands.items():
         command = subparsers.add_parser(name, help=summary)
         if place is None or words[place] != name:
             continue
         if name == 'lab':
-            command.description = 'Measure the odometry, and draw what goes on in it.'
+            command.description = 'Evaluate the odometry, and plot its intermediate results.'
             _add_commands(command, LAB, words[place + 1:], f'{package}.lab')
         else:
             module = import_module(f"{package}.{name.replace('-', '_')}")
@@ -164,8 +166,8 @@ def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, str],
             command.set_defaults(run=module.run, parser=command)
 
 
-def _first_plain(words: Sequence[str]) -> int | None:
-    """Where the first word stands that is no option."""
+def _first_positional(words: Sequence[str]) -> int | None:
+    """Return the index of the first word that is not an option."""
     return next((i for i, word in enumerate(words) if not word.startswith('-')), None)
 
 

@@ -12,19 +12,19 @@ from djet_ros.libraries import how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
-Topics, parameters and the rest are given as to every ROS node:
+Remappings and parameters are given as for any ROS node:
   {name} --ros-args -r image:=/camera/image_raw --params-file vo.yaml
 """
 
 
 def vo_node() -> int:
-    """Run the odometry until a signal; 2 where it can't be run, with the reason."""
+    """Run the odometry until a signal; return the exit code, 2 if it can't be run."""
     return _run('vo_node', 'Visual odometry by D-JET as a ROS 2 node.',
                 without_ros="without ROS, 'djet replay' works on recorded bags")
 
 
 def pose_graph_node() -> int:
-    """Run the pose graph until a signal; 2 where it can't be run, with the reason."""
+    """Run the pose graph until a signal; return the exit code, 2 if it can't be run."""
     return _run('pose_graph_node', "Closes the loops of vo_node's odometry, as a ROS 2 node.",
                 without_ros="without ROS, 'djet slam' works on recorded bags",
                 library='gtsam')
@@ -33,14 +33,14 @@ def pose_graph_node() -> int:
 def _run(name: str, description: str, *, without_ros: str,
          library: str = '') -> int:
     """
-    Run a node until a signal; gives the exit code.
+    Run a node until a signal and return the exit code.
 
-    2 means something that the user can mend, said in one line; without_ros: what can be had
-    where ROS is missing; library: one that it needs beside ROS.
+    It is 2 for errors that the user can correct, reported in one line. without_ros: the
+    alternative to suggest if ROS is missing; library: Python module needed besides ROS.
     """
     one_blas_thread()
     sleep_while_waiting()
-    # First of all: the imports take their time, and end no worse than anything later.
+    # Before the slow imports, so that a signal during them ends the node cleanly too.
     stop = stop_by_signal()
     if find_spec('rclpy') is None:
         return _fail(name, "rclpy is missing: install ROS 2 and 'source "
@@ -53,15 +53,16 @@ def _run(name: str, description: str, *, without_ros: str,
         running = import_module('djet_ros.ros.running')
         make = import_module(f'djet_ros.ros.{name}').make
     except ImportError as error:
-        # Such as an rclpy that was built for another Python.
-        return _fail(name, f'this Python ({sys.executable}) lacks something: {one_line(error)}')
+        # For example an rclpy built for another Python version.
+        return _fail(name, f'an import failed in this Python ({sys.executable}): '
+                           f'{one_line(error)}')
     parser = argparse.ArgumentParser(
         prog=name, description=description, epilog=_EPILOG.format(name=name),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
         if (rest := parser.parse_known_args(running.own_words())[1]):
-            raise DjetError(f"nobody knows what '{one_line(rest[0])}' is; words for ROS, such as "
-                            "-r image:=/camera/image_raw, stand after '--ros-args'")
+            raise DjetError(f"unrecognized argument '{one_line(rest[0])}'; ROS arguments, such as "
+                            "-r image:=/camera/image_raw, must follow '--ros-args'")
         return 0 if stop.is_set() else int(running.run_node(name, make, stop))
     except DjetError as error:
         return _fail(name, str(error))

@@ -1,4 +1,4 @@
-"""``djet play``: a recording onto a ROS 2 graph, without ROS."""
+"""``djet play``: publish a recording on a ROS 2 graph, without ROS."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from djet_ros.errors import DjetError
 from djet_ros.recordings.recording import BESIDE, open_recording
 
 DESCRIPTION = f"""\
-Publish the images of a recording, their CameraInfo, the ground truth, and what of speeds, IMU,
-other odometry, masks and tf was recorded beside them, at the pace of the recording. It begins when
-somebody subscribes to the images. All is offered reliably: for a subscriber that asks for it, the
-player rather waits than loses an image; CameraInfo is latched.
+Publish the images of a recording with their CameraInfo, ground truth, and any recorded speeds,
+IMU, other odometry, masks and tf, at the recorded rate. Playback starts when a node subscribes to
+the images. All topics are offered as reliable: with a reliable subscriber, the player waits rather
+than drops an image. CameraInfo is latched (transient local).
 {ENVIRONMENT}"""
 
 
@@ -24,16 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     parser.add_argument('--rate', type=float, default=1.0, metavar='R',
-                        help='times the recorded pace (default: %(default)s)')
-    parser.add_argument('--loop', action='store_true', help='begin again at the end')
+                        help='playback speed as a multiple of the recorded (default: '
+                        '%(default)s)')
+    parser.add_argument('--loop', action='store_true', help='start again at the end')
     parser.add_argument('--clock', action='store_true',
-                        help='publish the time of recording on /clock')
+                        help='publish the recorded time on /clock')
     add_topics(parser, 'image', 'info')
     add_remappings(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play until the end, SIGINT or SIGTERM, and say how many images that was."""
+    """Play until the end, SIGINT or SIGTERM, and print the number of images."""
     if not (args.rate > 0 and math.isfinite(args.rate)):
         raise DjetError(f'--rate is {args.rate}; it must be a positive number')
     stop = stop_by_signal()
@@ -57,5 +58,5 @@ def run(args: argparse.Namespace) -> int:
     finally:
         source.close()
     late = f', the last {player.played.late:.1f} s late' if player.played.late > 0.1 else ''
-    print(f'{player.played.images} images sent on {player.image_topic}{late}')
+    print(f'{player.played.images} images published on {player.image_topic}{late}')
     return 0

@@ -1,4 +1,4 @@
-"""``djet replay``: the trajectory of a camera from a recording."""
+"""``djet replay``: estimate the trajectory of a camera from a recording."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ from rich.table import Table
 
 DESCRIPTION = """\
 Run a recording through the odometry and write, into one folder, the trajectory (TUM and KITTI
-formats, camera in the first camera along optical axes), an output bag, a row per image, a summary
-and a plot. Errors against ground truth are angles between true and estimated rotation, and
-between true and estimated direction of translation where the camera went at least 1 cm; drift
-is told per 100 m, as the KITTI benchmark has it, where the way is that long.
+formats: pose of the camera in the optical frame of the first one), an output bag, a CSV row per
+image, a summary and a plot. Errors against ground truth are angles between true and estimated
+rotation, and between true and estimated translation direction of pairs with at least 1 cm of true
+translation. If the path is at least 100 m long, drift is computed per 100 m as in the KITTI
+benchmark.
 """
 
 _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
@@ -39,38 +40,39 @@ _FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value'
           'odometry.guess_frame', 'odometry.mask', 'odometry.mask_file')
 
 
-# By what parameters that is asked for of which an option names the topic.
-_ASKED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true',
-             'guess': 'odometry.guess to true or odometry.scale to guess, without a guess_frame',
-             'mask': 'odometry.mask to true'}
+# Parameters that enable the use of a topic, by the option that names the topic.
+_ENABLED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true',
+               'guess': 'odometry.guess to true or odometry.scale to guess, without a '
+               'guess_frame',
+               'mask': 'odometry.mask to true'}
 
-# What the table says of the lengths of a trajectory.
-_LENGTHS = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the first step',
-            Scale.UNKNOWN: 'unknown'}
+# Scale of a trajectory, as printed.
+_SCALES = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the first step',
+           Scale.UNKNOWN: 'unknown'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
-    add_output(parser, 'folder of the results')
+    add_output(parser, 'folder for the results')
     add_replay_options(parser, _FLAGS)
 
 
 def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) -> None:
-    """Add what decides how a recording is replayed."""
+    """Add the options that decide how a recording is replayed."""
     parser.add_argument('--config', type=Path, metavar='FILE',
-                        help='parameters as YAML, plain or in the layout of ROS; flags come on '
-                        'top, and --preset replaces all its values of the estimator')
+                        help='YAML file of parameters, plain or in the layout of ROS; flags '
+                        'override it, and --preset overrides all its estimator.* values')
     add_flags(parser, flags)
     parser.add_argument('--poses', type=Path, metavar='FILE',
-                        help="ground truth instead of the recording's own: a TUM file, or a KITTI "
-                        'file with a row for each image')
+                        help="ground truth, in place of the recording's own: a TUM file, or a "
+                        'KITTI file with a row per image')
     add_topics(parser, 'image', 'info', *(what for what in BESIDE if what != 'tf'))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay with a progress bar on stderr, and show what came of it on stdout."""
-    with prepared(args, configured(args), args.source, args.output) as replay:
+    """Replay with a progress bar on stderr, and print the summary on stdout."""
+    with opened_replay(args, configuration(args), args.source, args.output) as replay:
         outcome = replay()
     if outcome.summary['frames']:
         console().print(_table(outcome.summary))
@@ -84,21 +86,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def configured(args: argparse.Namespace, *nodes: str) -> Config:
-    """Give the parameters of --config for some nodes with those of the flags on top."""
+def configuration(args: argparse.Namespace, *nodes: str) -> Config:
+    """Return the parameters of --config for the named nodes, overridden by the flags."""
     config = load_yaml(args.config, nodes=nodes or (NODE_NAME,)) if args.config else Config()
     return with_values(config, flag_values(args))
 
 
 @contextmanager
-def prepared(args: argparse.Namespace, config: Config, recording: Path, folder: Path
-             ) -> Iterator[Callable[[], Outcome]]:
+def opened_replay(args: argparse.Namespace, config: Config, recording: Path, folder: Path
+                  ) -> Iterator[Callable[[], Outcome]]:
     """
-    Open a recording, of which the options tell the topics and poses; give what replays it.
+    Open a recording with the topics and poses of the options; yield a function that replays it.
 
-    Then make room in the folder, where an earlier run's results stay if anything is refused.
+    The results folder is cleared only after the recording was opened: on an error the results of
+    an earlier run are kept.
     """
-    wanted = _wanted_beside(config.odometry)
+    wanted = _auxiliary_inputs(config.odometry)
     check_topics(args, wanted)
     with open_recording(recording, args.image_topic, args.info_topic, args.poses,
                         beside={what: getattr(args, f'{what}_topic', None)
@@ -110,16 +113,16 @@ def prepared(args: argparse.Namespace, config: Config, recording: Path, folder: 
 
 
 def check_topics(args: argparse.Namespace, wanted: Collection[str]) -> None:
-    """Raise DjetError where an option names the topic of something that is not asked for."""
-    for what, ask in _ASKED_BY.items():
+    """Raise DjetError if an option names a topic that the configuration does not use."""
+    for what, setting in _ENABLED_BY.items():
         topic = getattr(args, f'{what}_topic', None)
         if topic is not None and what not in wanted:
-            raise DjetError(f"--{what}-topic is '{topic}', but nothing asks for it; set {ask}, "
-                            'or leave it out')
+            raise DjetError(f"--{what}-topic is '{topic}', but the configuration does not use "
+                            f'it; set {setting}, or omit the option')
 
 
-def _wanted_beside(config: OdometryConfig) -> list[str]:
-    """Name what the odometry goes by beside the images."""
+def _auxiliary_inputs(config: OdometryConfig) -> list[str]:
+    """Return the names of the inputs that the odometry uses besides images and CameraInfo."""
     wanted = {'speed': config.scale == 'speed', 'imu': config.imu, 'mask': config.mask,
               'guess': config.guess_by_topic, 'tf': config.guess_by_tf}
     return [what for what, is_wanted in wanted.items() if is_wanted]
@@ -138,21 +141,21 @@ def _table(summary: dict[str, Any]) -> Table:
         for reason, count in sorted(summary[what].items()):
             table.add_row(f'{name}: {reason}', str(count))
     if summary['status'].get(Status.OK.value):
-        table.add_row('lengths', _LENGTHS[summary['scale_kind']])
+        table.add_row('scale', _SCALES[summary['scale_kind']])
     if 'compared_pairs' in summary:
         table.add_row('pairs with ground truth', str(summary['compared_pairs']))
         table.add_row('  failures (rotation / direction)',
                       f"{summary['failures']} / {summary['translation_failures']}")
         table.add_row('error in degrees', 'mean / median / p95 / max')
         table.add_row('  rotation', spread(summary['rotation_error_deg']))
-        table.add_row('  direction of translation', spread(summary['translation_error_deg']))
+        table.add_row('  translation direction', spread(summary['translation_error_deg']))
     if positions := summary.get('positions'):
-        table.add_row('positions, rmse after alignment',
-                      f"{positions['rmse_m']:.3f} m on {positions['way_m']:.1f} m")
+        table.add_row('position RMSE after alignment (APE)',
+                      f"{positions['rmse_m']:.3f} m over a path of {positions['way_m']:.1f} m")
         if positions['scale_change'] is not None:
-            table.add_row('  scale, end over start', f"{positions['scale_change']:.3f}")
+            table.add_row('  scale drift, end / start', f"{positions['scale_change']:.3f}")
     if drift := summary.get('drift'):
-        table.add_row('drift over 100 m and more', f"{drift['segments']} segments, "
+        table.add_row('drift (KITTI)', f"{drift['segments']} segments of 100 m "
                       f"to {drift['longest']} m")
         table.add_row('  rotation (r_rel)', f"{drift['rotation_deg_per_100m']:.3f} deg per 100 m")
         if drift['translation_percent'] is not None:

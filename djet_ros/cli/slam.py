@@ -1,4 +1,4 @@
-"""``djet slam``: loops closed and the trajectory optimised, by GTSAM."""
+"""``djet slam``: close loops offline and optimise the pose graph with GTSAM."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.cli.options import add_output
-from djet_ros.cli.replay import add_replay_options, check_topics, configured, prepared
+from djet_ros.cli.replay import add_replay_options, check_topics, configuration, opened_replay
 from djet_ros.cli.terminal import console, new_table, progress_bar, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
@@ -26,11 +26,12 @@ from djet_ros.replay.results import SUMMARY as REPLAY_SUMMARY
 from rich.table import Table
 
 DESCRIPTION = """\
-Close loops offline: take the odometry's keyframes, propose places seen before by their ORB
-descriptors, verify them with the two-view estimator, and optimise the graph of odometry and loops
-with GTSAM. Writes the trajectory before and after, the graph (g2o, csv), a plot and slam.json.
-Loops get their length from the depths that the odometry gives to the points they share; how well
-the odometry's own lengths are known (--scale, --scale-uncertainty) decides what loops may change.
+Close loops offline: select keyframes of the odometry, propose loop candidates by the similarity
+of ORB descriptors, verify them with the two-view estimator, and optimise the pose graph of
+odometry and loop edges with GTSAM. Writes the trajectory before and after, the graph (g2o, csv), a
+plot and slam.json. The scale of a loop edge comes from the depths of the landmarks that it shares
+with the odometry; the uncertainty of the odometry's own scale (--scale, --scale-uncertainty)
+decides how far loops may change it.
 """
 
 _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale_value',
@@ -42,34 +43,34 @@ _REPLAY_FLAGS = ('estimator.method', 'preset', 'odometry.scale', 'odometry.scale
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('input', type=Path, metavar='RESULTS_OR_RECORDING',
-                        help="folder that 'djet replay' wrote, or what it can replay")
-    add_output(parser, 'folder of what is written', 'slam')
+                        help="results folder of 'djet replay', or a recording to replay first")
+    add_output(parser, 'folder for the results', 'slam')
     parser.add_argument('--source', type=Path, metavar='RECORDING',
-                        help='where the recording of RESULTS is now, if it was moved')
+                        help='path of the recording that RESULTS are of, if it was moved')
     add_replay_options(parser, _REPLAY_FLAGS)
     add_flags(parser.add_argument_group('keyframes and loops'), PARAMETERS)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, with progress on stderr, and show what came of it."""
+    """Close loops, with progress on stderr, and print a summary."""
     given = flag_values(args)
-    of_slam = {name: given.pop(name) for name in PARAMETERS if name in given}
-    config = configured(args, NODE_NAME, GRAPH_NAME)
+    slam_values = {name: given.pop(name) for name in PARAMETERS if name in given}
+    config = configuration(args, NODE_NAME, GRAPH_NAME)
     check_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
         if args.config or given:
-            raise DjetError(f'{results} holds results, which have their parameters already; give '
-                            'the recording itself, to replay it with others')
+            raise DjetError(f'{results} holds the results of a replay, whose parameters cannot '
+                            'be changed; name the recording, to replay it with others')
     else:
         results = args.output / 'replay'
-        with prepared(args, config, args.input, results) as replay:
-            # They would be of another replay than the one beside them.
+        with opened_replay(args, config, args.input, results) as replay:
+            # Earlier results of slam would not belong to the new replay.
             make_room(args.output, FILES, args.overwrite)
             outcome = replay()
         if outcome.problem:
             raise DjetError(outcome.problem)
-    config = with_values(load_yaml(results / 'config.yaml'), of_slam)
+    config = with_values(load_yaml(results / 'config.yaml'), slam_values)
     source, name = _source(results, args, config)
     try:
         steps = read_steps(results, warn)
@@ -87,21 +88,21 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Recording, str]:
-    """Open the recording that results are of, and give its name too."""
+    """Open the recording that the results are of; return it and its name."""
     summary = read_yaml(results / REPLAY_SUMMARY)
     replayed, topic = (summary.get(what) if isinstance(summary, dict) else None
                        for what in ('source', 'image_topic'))
     name = replayed if isinstance(replayed, str) else args.source and str(args.source)
     if name is None:
-        raise DjetError(f'{results / REPLAY_SUMMARY} does not say which recording was replayed; '
-                        'say it with --source')
+        raise DjetError(f'{results / REPLAY_SUMMARY} does not name the replayed recording; '
+                        'name it with --source')
     beside = {'mask': args.mask_topic} if config.odometry.mask else {}
     if results == args.input:
         check_topics(args, beside)
     path = args.source or Path(name)
     if not path.exists():
-        raise DjetError(f'{path}, of which {results} are the results, is not there; say with '
-                        '--source where it is')
+        raise DjetError(f'{path}, the recording that {results} was replayed from, does not exist; '
+                        'name its new path with --source')
     if not is_bag(path) or not isinstance(topic, str):
         topic = None
     return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, beside,
@@ -115,7 +116,7 @@ def _table(summary: dict[str, Any]) -> Table:
     for kind, number in sorted(summary['edges'].items()):
         rejected = summary['rejected'].get(kind, 0)
         table.add_row(f'edges: {kind}', '',
-                      f'{number}, {rejected} not trusted' if rejected else str(number))
+                      f'{number}, {rejected} rejected as outliers' if rejected else str(number))
     if 'errors' in summary:
         before, after = summary['errors']['before'], summary['errors']['after']
         for name in before:
@@ -123,5 +124,5 @@ def _table(summary: dict[str, Any]) -> Table:
     return table
 
 
-_TITLES = {'ape_m': 'positions, rmse in m', 'evo_ape_m': 'evo: APE, rmse in m',
-           'evo_rpe_m': 'evo: RPE, rmse in m', 'evo_rpe_deg': 'evo: RPE, rmse in deg'}
+_TITLES = {'ape_m': 'APE, RMSE in m', 'evo_ape_m': 'evo: APE, RMSE in m',
+           'evo_rpe_m': 'evo: RPE, RMSE in m', 'evo_rpe_deg': 'evo: RPE, RMSE in deg'}

@@ -1,4 +1,4 @@
-"""What commands show in a terminal while they work and in the end."""
+"""Terminal output of the commands: progress bars, warnings and tables."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rich.table import Table
 from rich.text import Text
 
 
-# Columns of tables that go to a file or to another program, where nothing has to be cut.
+# Width in characters of tables written to a file or a pipe, wide enough to truncate nothing.
 _FILE_WIDTH = 200
 
 
 def console() -> Console:
     """
-    Give what tables are printed on: as wide as the terminal, or as wide as they are.
+    Return the console for tables, as wide as the terminal or, for a file, as wide as needed.
 
-    Names come from strangers' folders and bags: what looks like rich's markup is not.
+    Markup is disabled: brackets in the names of folders and topics are not markup.
     """
     found = Console(markup=False)
     return (found if found.is_terminal or 'COLUMNS' in os.environ
@@ -38,7 +38,7 @@ def console() -> Console:
 
 
 def warn(line: str) -> None:
-    """Say in a line on stderr what did not keep a command from its end."""
+    """Print a warning of one line on stderr."""
     print(f'djet: warning: {line}', file=sys.stderr)
 
 
@@ -52,29 +52,29 @@ class _Rate(ProgressColumn):
 @contextmanager
 def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """
-    Show a bar on stderr, if that is a terminal; give the function that moves it.
+    Show a progress bar on stderr, if that is a terminal; yield the function that updates it.
 
-    That goes on by one without arguments, else to (done) or (done, of how many).
+    Without arguments it advances by one; else it sets (done) or (done, total).
     """
     console = Console(stderr=True)
     bar = Progress(TextColumn('{task.description}', markup=False), BarColumn(),
                    MofNCompleteColumn(), _Rate(), TimeRemainingColumn(), console=console,
                    transient=True, disable=not console.is_terminal)
-    # A bar of rich 13 that is disabled still leaves an empty line behind where it ends.
+    # In rich 13 even a disabled bar prints an empty line when it ends.
     with bar if console.is_terminal else nullcontext():
         task = bar.add_task(what, total=total)
 
-        def move(done: int | None = None, total: int | None = None) -> None:
+        def update(done: int | None = None, total: int | None = None) -> None:
             if done is None:
                 bar.advance(task)
             else:
                 bar.update(task, completed=done, total=total)
 
-        yield move
+        yield update
 
 
 def new_table(title: str, *headings: str) -> Table:
-    """Give a table with a column of names and others of figures; two without headings."""
+    """Return a table of a column of names and columns of numbers; of two without headings."""
     table = Table(title=title, show_header=bool(headings))
     for index, heading in enumerate(headings or ('', '')):
         table.add_column(heading, justify='right' if index else 'left')
@@ -82,7 +82,7 @@ def new_table(title: str, *headings: str) -> Table:
 
 
 def compact_table(*headings: str, names: int = 1, title: str | None = None) -> Table:
-    """Give a table of many columns without lines between; names: columns that hold no figures."""
+    """Return a narrow table without rules; names: number of leading columns of text."""
     table = Table(title=title, title_justify='left', box=SIMPLE_HEAD, padding=0)
     for index, heading in enumerate(headings):
         table.add_column(heading, justify='right' if index >= names else 'left', no_wrap=True)
@@ -90,7 +90,7 @@ def compact_table(*headings: str, names: int = 1, title: str | None = None) -> T
 
 
 def spread(statistics: dict[str, float] | None) -> str:
-    """Statistics of errors as ``mean / median / p95 / max``."""
+    """Return statistics of errors as ``mean / median / p95 / max``."""
     if statistics is None:
         return 'none'
     return ' / '.join(f'{statistics[name]:.3f}' for name in ('mean', 'median', 'p95', 'max'))
