@@ -114,7 +114,7 @@ def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
         base = rng.chisquare(3, 40)
         ratio = ratio_of(base * rng.lognormal(0, 0.3, 40) / np.exp(0.3**2 / 2), base)
         assert ratio.least < ratio.value < ratio.most
-        inside += not ratio.told
+        inside += not ratio.significant
     # 95 % of them, and a few less, as a bootstrap of 40 has it
     assert 0.88 < inside / 300 < 0.99
 
@@ -122,13 +122,13 @@ def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
 def test_what_is_better_pair_by_pair_is_told_although_pairs_differ_more():
     base = np.random.default_rng(1).chisquare(1, 60)
     better = ratio_of(0.9 * base, base)
-    assert better.value == pytest.approx(0.9) and better.told
+    assert better.value == pytest.approx(0.9) and better.significant
     assert ratio_of(base, base) == Ratio(1.0, 1.0, 1.0)
-    assert not ratio_of(base, base).told
+    assert not ratio_of(base, base).significant
     # One pair that went wrong makes a mean of its own, and no median.
     wrong = np.where(base == base.max(), 1000.0, 0.9 * base)
-    assert ratio_of(wrong, base).value > 10 and not ratio_of(wrong, base).told
+    assert ratio_of(wrong, base).value > 10 and not ratio_of(wrong, base).significant
     assert ratio_of(wrong, base, np.median).value == pytest.approx(0.9)
-    assert ratio_of(wrong, base, np.median).told
+    assert ratio_of(wrong, base, np.median).significant
     unknown = ratio_of([np.nan, 1.0], [1.0, np.nan])
-    assert np.isnan(unknown.value) and not unknown.told
+    assert np.isnan(unknown.value) and not unknown.significant

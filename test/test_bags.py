@@ -591,7 +591,7 @@ def test_messages_within_messages_of_ros_1_are_those_of_jazzy(tmp_path):
 
 
 def test_an_empty_ros1_bag_is_empty_and_not_broken(tmp_path):
-    assert 'holds no message' in source_error(ros1_bag(tmp_path / 'old.bag', count=0))
+    assert 'holds no messages' in source_error(ros1_bag(tmp_path / 'old.bag', count=0))
 
 
 def test_a_topic_of_two_types_is_refused_by_name(tmp_path):
@@ -609,9 +609,9 @@ def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):
 
 
 @pytest.mark.parametrize(('messages', 'said'), [
-    ([], 'holds no message'),
-    ([('/pose', pose(1), 1)], 'has no image topic, but /pose (geometry_msgs/msg/PoseStamped)'),
-    ([('/image', image(1), 1)], 'has no CameraInfo topic, but /image (sensor_msgs/msg/Image)'),
+    ([], 'holds no messages'),
+    ([('/pose', pose(1), 1)], 'has no image topic, only /pose (geometry_msgs/msg/PoseStamped)'),
+    ([('/image', image(1), 1)], 'has no CameraInfo topic, only /image (sensor_msgs/msg/Image)'),
 ])
 @pytest.mark.parametrize('storage', STORAGES)
 def test_a_bag_without_a_camera_is_refused(tmp_path, storage, messages, said):
@@ -827,9 +827,9 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
     honest, liar, absurd, long = run.stdout.splitlines()
     assert f'at most {LARGEST_PIECE} are unpacked' in honest
-    assert 'more than the 1000 bytes announced' in liar
-    assert f'announces {2**63} bytes' in absurd
-    assert 'a zstd message is cut short or too large' in long
+    assert 'more than the 1000 bytes declared' in liar
+    assert f'declares {2**63} bytes' in absurd
+    assert 'a zstd message is truncated or too large' in long
 
 
 def mcap_of(records, times):

@@ -7,7 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from djet_ros.lab.bench import least_in_turn
+from djet_ros.lab.bench import interleaved_minima
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
@@ -54,7 +54,7 @@ def test_repeats_are_made_in_turn_and_the_least_of_each_counts():
             return float(next(times))
         return measurement
 
-    least = least_in_turn({name: noted(name) for name in 'abc'})
+    least = interleaved_minima({name: noted(name) for name in 'abc'})
     assert order == ['a', 'b', 'c'] * (len(order) // 3) and len(order) > 3
     assert least == {'a': 103.0 - len(order), 'b': 102.0 - len(order), 'c': 101.0 - len(order)}
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 from djet_ros.core.types import RelativePose, Status
-from djet_ros.lab.closure import closures, remaining_rotation, summary
+from djet_ros.lab.closure import closure_rotation, closures, summary
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.recordings.datasets import open_sequence
 import numpy as np
@@ -41,7 +41,7 @@ def test_what_remains_is_the_error_of_the_three_and_as_large_as_claimed() -> Non
         sigmas = rng.uniform(1e-4, 1e-3, 3)
         motions = [motion(Rotation.from_rotvec(rng.normal(0, sigma, 3)) * true, sigma)
                    for true, sigma in zip((before, after, after * before), sigmas)]
-        remains, covariance = remaining_rotation(*motions)
+        remains, covariance = closure_rotation(*motions)
         squares.append(remains @ np.linalg.solve(covariance, remains))
     # 300 chi-squared of 3 degrees of freedom: within 4.5 of their standard deviations
     assert np.mean(squares) == pytest.approx(3, abs=4.5 * np.sqrt(6 / 300))
@@ -49,7 +49,7 @@ def test_what_remains_is_the_error_of_the_three_and_as_large_as_claimed() -> Non
 
 def test_rotations_that_follow_from_one_another_leave_nothing() -> None:
     a, b = Rotation.from_euler('xyz', [[1, 2, 3], [-2, 1, 0.5]], degrees=True)
-    assert np.allclose(remaining_rotation(*(motion(R, 1e-3) for R in (a, b, b * a)))[0], 0)
+    assert np.allclose(closure_rotation(*(motion(R, 1e-3) for R in (a, b, b * a)))[0], 0)
 
 
 def test_what_remains_on_a_street_is_thousandths_of_a_degree_as_claimed(road: Path) -> None:
@@ -90,4 +90,4 @@ def test_two_frames_are_no_triangle(tmp_path: Path) -> None:
     pair = render_sequence('road', tmp_path, 2, size=(320, 96))
     answer = djet(pair, '--output', tmp_path / 'closure.json')
     assert answer.returncode == 2
-    assert 'a triangle needs three' in answer.stderr
+    assert 'too few for a triplet' in answer.stderr

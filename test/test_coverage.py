@@ -71,7 +71,7 @@ def test_a_direction_is_as_far_off_as_its_angle_says(degrees: float) -> None:
 def test_a_direction_that_is_sure_and_points_backwards_lies_in_no_ellipsoid() -> None:
     flipped = record(square=off_by(180.0), failed=True)
     row, = coverage_rows([flipped])
-    assert flipped.wrong_and_sure and row.failed == 1
+    assert flipped.overconfident and row.failed == 1
     assert all(share == 0 for share, _, _ in row.inside)
 
 
@@ -85,12 +85,12 @@ def test_the_bounds_of_a_share_hold_it_with_the_confidence_that_they_claim() -> 
 
 
 def test_only_what_is_wrong_and_claims_to_be_exact_is_both() -> None:
-    assert record(failed=True).wrong_and_sure
+    assert record(failed=True).overconfident
     for humble in (record(failed=False), record(failed=True, claims=(0.5, 1.0)),
                    record(failed=True, claims=(0.1, 5.0)),
                    record(failed=True, status=Status.DEGENERATE),
                    record(failed=True, status=Status.NO_PARALLAX)):
-        assert not humble.wrong_and_sure
+        assert not humble.overconfident
 
 
 def test_pairs_are_summed_up_by_scene() -> None:

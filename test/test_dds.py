@@ -127,7 +127,7 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
     # Twenty times as fast: the player has to wait for the node.
     player = start('play', bag, '--rate', '20')
     peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
-    assert f'{FRAMES} images sent on {RECTIFIED}' in player.finish()
+    assert f'{FRAMES} images published on {RECTIFIED}' in player.finish()
     assert len(expected[poses[0]]) == FRAMES - 1
     for topic in poses:
         assert [serialised(m) for m in peer.heard[topic]] == expected[topic]

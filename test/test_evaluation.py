@@ -534,7 +534,7 @@ def test_a_damaged_store_is_named(road, tmp_path):
     (['road', '--methods', 'djet,djet'], "method 'djet' is given twice"),
     (['road', '--presets', 'worst'], "there is no preset 'worst'; choose from best, fast, paper"),
     (['road', '--workers', '0'], 'workers is 0; at least one is needed'),
-    (['road', '--start', '7'], '8 frames, of which 1 are chosen'),
+    (['road', '--start', '7'], '8 frames, of which --start, --end and --stride select 1'),
     (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),
     (['road', '--workers', '2', '--scheduler', 'tcp://x'], 'not allowed with argument'),
 ])
@@ -555,7 +555,7 @@ def test_missing_poses_are_one_line_and_exit_code_2(small_kitti, tmp_path):
     answer = djet('evaluate', folder, '--output', tmp_path / 'results')
     assert answer.returncode == 2
     assert answer.stderr.count('\n') == 1
-    assert 'has no ground truth for two frames in a row' in answer.stderr
+    assert 'has no ground truth for two consecutive frames' in answer.stderr
 
 
 def test_a_scheduler_that_is_not_there_is_one_line_and_costs_no_earlier_records(road, tmp_path):

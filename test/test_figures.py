@@ -14,7 +14,7 @@ from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.similarity import cross_similarity, read_image, self_similarity
-from djet_ros.lab.surface_steps import follow, RADIUS, telling_match
+from djet_ros.lab.surface_steps import illustrative_match, RADIUS, trace_rounds
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
@@ -78,13 +78,13 @@ def test_rounds_end_where_the_estimator_ends(road):
         estimator = TwoViewEstimator(preset(name))
         views = [estimator.view(sequence.image(i), sequence.K) for i in (0, 1)]
         x, y = estimator.match(*views)
-        trace = follow(*views, x, y, estimator.config)
+        trace = trace_rounds(*views, x, y, estimator.config)
         result = estimator.estimate_matched(*views, x, y)
         assert len(trace.rounds) == result.iterations
         assert np.array_equal(trace.rounds[-1].optimum, result.y_opt)
         assert np.array_equal(trace.result.inliers, result.inliers)
         # The chosen match has moved, but stays within the figure.
-        match = telling_match(trace)
+        match = illustrative_match(trace)
         assert 0 < np.linalg.norm(trace.rounds[-1].optimum[match] - trace.y[match]) < RADIUS
 
 
@@ -133,7 +133,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     (['surfaces', 'image', 'image', '--camera', '1,2'], "--camera is '1,2'; give FX,FY,CX,CY"),
     (['surfaces', 'image', 'image', '--camera', '0,1,1,1'], 'focal lengths must be positive'),
     (['surfaces', 'flat', 'flat', '--camera', '9,9,9,9'], 'have 0 matches, 20 are needed'),
-    (['surfaces', 'road', '--pair', '2'], 'pair 2 was asked for'),
+    (['surfaces', 'road', '--pair', '2'], '--pair is 2'),
     (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),
     (['surfaces', 'road', '--output', 'a.jpg'], 'its name must end in .png or .gif'),
 ])

@@ -9,7 +9,7 @@ from djet_ros.cli.main import main
 from djet_ros.core.geometry import rotation_angle, rotation_exp
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.lab.imu_offset import fit_imu, VisualTurns
+from djet_ros.lab.imu_offset import fit_imu, VisualRotations
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.lab.scenes.walk import HandHeld
@@ -19,12 +19,12 @@ import pytest
 PERIOD = 10**8
 
 
-def seen(poses: Array, noise: float, seed: int = 0) -> VisualTurns:
+def seen(poses: Array, noise: float, seed: int = 0) -> VisualRotations:
     rng = np.random.default_rng(seed)
     R = np.stack([rotation_exp(rng.normal(0, noise, 3)) @ (a[:3, :3].T @ b[:3, :3]).T
                   for a, b in pairwise(poses)])
     start = 5 * 10**9 + np.arange(len(R), dtype=np.int64) * PERIOD
-    return VisualTurns(start, start + PERIOD, R)
+    return VisualRotations(start, start + PERIOD, R)
 
 
 def way(frames: int = 150, seed: int = 0) -> Array:
@@ -55,7 +55,7 @@ def test_some_pairs_that_are_wrong_do_not_matter() -> None:
 def test_a_camera_that_hardly_turns_tells_nothing() -> None:
     poses = np.tile(np.eye(4), (60, 1, 1))
     felt = feel(poses, 0.1, Mems(), 1)
-    with pytest.raises(DjetError, match='tell no offset; record at least 20, and turn the camera'):
+    with pytest.raises(DjetError, match='do not determine an offset; record at least 20'):
         fit_imu(seen(poses, 1e-5), felt.stamps_ns + 5 * 10**9, felt.rates)
 
 
@@ -81,4 +81,4 @@ def test_the_command_prints_what_goes_into_a_parameter_file(
 def test_a_recording_without_an_imu_is_named(
         small_kitti: object, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lab', 'imu-offset', str(small_kitti())]) == 2  # type: ignore[operator]
-    assert 'holds nothing of an IMU' in capsys.readouterr().err
+    assert 'holds no IMU data' in capsys.readouterr().err

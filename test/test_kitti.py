@@ -93,12 +93,12 @@ DAMAGES = {
     '07.txt has 5 lines for 6 images': lambda f: cut_last_line(f / '../../poses/07.txt'),
     "times.txt line 2: 'abc' is not a": lambda f: replace(f / 'times.txt', '1.036223e-01', 'abc'),
     "'nan' is not a finite number": lambda f: replace(f / 'times.txt', '1.036223e-01', 'nan'),
-    "'-1' is no stamp": lambda f: replace(f / 'times.txt', '0.000000e+00', '-1'),
-    "'1e300' is no stamp": lambda f: replace(f / 'times.txt', '1.036223e-01', '1e300'),
+    "'-1' is not a stamp": lambda f: replace(f / 'times.txt', '0.000000e+00', '-1'),
+    "'1e300' is not a stamp": lambda f: replace(f / 'times.txt', '1.036223e-01', '1e300'),
     'is not after the one before': lambda f: replace(f / 'times.txt', '1.036223e-01', '0'),
     '07.txt line 1 has 11 numbers, 12': lambda f: replace(f / '../../poses/07.txt', ' 0 ', ' '),
-    'pose 0 is no rigid motion': lambda f: replace(f / '../../poses/07.txt', '1', '2'),
-    'pose 1 is no rigid motion (':
+    'pose 0 is no rigid transformation': lambda f: replace(f / '../../poses/07.txt', '1', '2'),
+    'pose 1 is no rigid transformation (':
         lambda f: replace(f / '../../poses/07.txt', '9.998000066666e-01', '1e300'),
     'pose 0 is at [0.0, 0.0, 1e+300] m, farther than':
         lambda f: replace(f / '../../poses/07.txt', ' 0.000000000000e+00\n', ' 1e300\n'),
@@ -129,15 +129,15 @@ def test_a_wrong_folder_is_named_in_one_line(small_kitti, said):
 
 def test_the_dataset_folder_lists_its_sequences(small_kitti):
     folder = small_kitti()
-    with pytest.raises(DjetError, match='it holds sequences/07: give one of these'):
+    with pytest.raises(DjetError, match='it holds sequences/07: name one of these'):
         KittiSequence(folder.parent.parent)
-    with pytest.raises(DjetError, match='it holds 07: give one of these'):
+    with pytest.raises(DjetError, match='it holds 07: name one of these'):
         KittiSequence(folder.parent)
 
 
 @pytest.mark.parametrize(('start', 'end'), [(-1, 3), (3, 3), (4, 2), (0, 7), (9, None)])
 def test_a_range_outside_the_sequence_is_refused(small_kitti, start, end):
-    with pytest.raises(DjetError, match=f'frames {start} to .* were asked for, .* has 0 to 6'):
+    with pytest.raises(DjetError, match=f'--start {start} --end .* is outside of the 6 frames'):
         KittiSequence(small_kitti(frames=6), start=start, end=end)
 
 

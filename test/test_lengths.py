@@ -9,7 +9,14 @@ from pathlib import Path
 from djet_ros.cli.main import main
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.types import Status
-from djet_ros.lab.lengths import go, step_squares, stretch_squares, Way, way_of, WayChunk
+from djet_ros.lab.lengths import (
+    Drive,
+    drive_results,
+    DriveChunk,
+    run_drive,
+    segment_squares,
+    step_squares,
+)
 from djet_ros.lab.store import RecordStore
 from djet_ros.odometry.scale import Common
 from djet_ros.odometry.visual_odometry import OdometryResult
@@ -75,7 +82,7 @@ def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: f
     own = np.full(len(walk), 1e-3)
     told = 7 * np.exp(walk + rng.normal(0, own))
     results = results_of(told, own * told, (claimed * 0.004)**2 * np.arange(1, len(walk) + 1))
-    turns, poses = stretch_squares(straight(np.ones(len(walk))), results, 20)
+    turns, poses = segment_squares(straight(np.ones(len(walk))), results, 20)
     assert len(turns) == len(poses) == 298
     assert np.median(turns) < 1e-6
     # Nothing errs but the length.
@@ -83,11 +90,11 @@ def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: f
 
 
 def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
-    true, chunk = np.full(300, 1.0), WayChunk('road', 0, None, 301, 100)
+    true, chunk = np.full(300, 1.0), DriveChunk('road', 0, None, 301, 100)
     told = 5 * np.exp(1e-3 * np.arange(300))
     metric = true * np.where((np.arange(300) >= 60) & (np.arange(300) < 160), 0.98, 1.0)
-    way = way_of(chunk, straight(true), results_of(told, 0.01 * told, np.zeros(300)),
-                 results_of(metric, 0.01 * metric))
+    way = drive_results(chunk, straight(true), results_of(told, 0.01 * told, np.zeros(300)),
+                        results_of(metric, 0.01 * metric))
     assert way.tracked == 300
     assert way.scale_change == pytest.approx(np.exp(0.27), rel=0.01)
     assert way.hidden_length == pytest.approx(0.98)
@@ -100,17 +107,17 @@ def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
         claimed = 0.01 * np.sqrt(metres + metres**2 / 10)
         assert square == pytest.approx((off / claimed)**2 / chi2.median(6), rel=0.15)
     lost = [replace(one, status=Status.AMBIGUOUS) for one in results_of(told, told)]
-    assert way_of(chunk, straight(true), lost, lost).tracked == 0
+    assert drive_results(chunk, straight(true), lost, lost).tracked == 0
 
 
 def test_the_command_tells_what_became_of_a_way(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config, chunk = EstimatorConfig(), WayChunk('road', 0, (620, 188), 3, 0)
-    ways = go(chunk, config)
+    config, chunk = EstimatorConfig(), DriveChunk('road', 0, (620, 188), 3, 0)
+    ways = run_drive(chunk, config)
     assert ways[0].tracked == 2
     assert ways[0].scale_change == pytest.approx(1, abs=0.05)
     settings = {'frames': 3, 'hidden': 0, 'half': True, 'estimator': asdict(config)}
-    with RecordStore(tmp_path, Way, settings) as store:
+    with RecordStore(tmp_path, Drive, settings) as store:
         store.add(chunk.name, ways)
     assert main(['lab', 'lengths', '--seeds', '0', '--frames', '3', '--hidden', '0', '--half',
                  '--workers', '1', '--output', str(tmp_path)]) == 0

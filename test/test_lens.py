@@ -214,7 +214,7 @@ def test_a_wrong_calibration_is_detected_and_corrected(
     # With that flag next to nothing remains.
     assert main(['lens', str(distorted), flag, k1]) == 0
     again = capsys.readouterr().out
-    assert f'({float(k1):.4g} so far)' in again and 'not worth correcting' in again
+    assert f'(calibrated: {float(k1):.4g})' in again and 'not worth correcting' in again
     # A driver's images are raw, and these are not.
     assert [path.name for path in output.iterdir()] == ['lens.png']
     assert (output / 'lens.png').read_bytes().startswith(b'\x89PNG')
@@ -279,7 +279,7 @@ def test_a_driver_gets_a_file_where_its_images_are_raw(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lens', str(raw_bag), '--output', str(tmp_path / 'out')]) == 0
     said = capsys.readouterr().out
-    assert '(0.01 so far)' in said
+    assert '(calibrated: 0.01)' in said
     assert 'camera_info_manager' in said and 'calib.txt' not in said
     written = yaml.safe_load((tmp_path / 'out' / 'lens.yaml').read_text())
     D = written['distortion_coefficients']['data']

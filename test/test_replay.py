@@ -551,8 +551,8 @@ def bad_config(tmp_path, bag):
 
 
 @pytest.mark.parametrize('make, message', [
-    (missing, 'does not exist'), (empty_bag, 'holds no message'), (no_images, 'no image topic'),
-    (device, '/dev/null is neither a file nor a folder; give a bag or a folder'),
+    (missing, 'does not exist'), (empty_bag, 'holds no messages'), (no_images, 'no image topic'),
+    (device, '/dev/null is neither a file nor a folder; name a bag or a folder'),
     (no_info, 'no CameraInfo'), (zeros, 'all zeros'),
     (late_info, f'came after a CameraInfo on {INFO_TOPIC} (the first one was recorded 8.000 s '
                 'after the first image); record it before'),
@@ -565,7 +565,7 @@ def bad_config(tmp_path, bag):
     (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
     (lambda t, b: [b, '--imu', 'true', '--imu-topic', '/other'], "no topic '/other' for 'imu'"),
     *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
-       f"--{what}-topic is '/some', but nothing asks for it; set odometry.")
+       f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
       for what in ('speed', 'imu', 'guess', 'mask')],
 ])
 def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
@@ -580,8 +580,8 @@ def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_
         verb, folder, tmp_path):
     file = tmp_path / 'bad.yaml'
     file.write_text('')
-    for place, why in ((file / 'x.png', f'{file} exists and is no folder; choose another'),
-                       ('/proc/x/y.png', 'could not be made: ')):
+    for place, why in ((file / 'x.png', f'{file} exists and is not a folder; choose another'),
+                       ('/proc/x/y.png', 'could not be created: ')):
         said = djet(*verb, folder, '--output', place, expect=2).stderr
         assert why in said
         assert said.count('\n') == 1

@@ -711,7 +711,7 @@ def test_the_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     assert 'links is 0' in refused.stderr
     refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--scale', 'constant',
                    expect=2)
-    assert 'have their parameters already' in refused.stderr
+    assert 'whose parameters cannot be changed' in refused.stderr
 
 
 def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_path):
@@ -722,8 +722,8 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
                           ((drive, '--mask-file', tmp_path / 'absent.png'), 'absent.png'),
                           ((drive, '--loop-gap', '-1'), 'loop_gap is -1'),
                           ((results, '--source', tmp_path / 'absent'), 'absent'),
-                          ((results, '--mask-topic', '/mask'), 'nothing asks for it'),
-                          ((results, '--imu-topic', '/imu'), 'nothing asks for it')):
+                          ((results, '--mask-topic', '/mask'), 'does not use it'),
+                          ((results, '--imu-topic', '/imu'), 'does not use it')):
         refused = djet('slam', *mistake, '--output', tmp_path / 'slam', '--overwrite', expect=2)
         assert said in refused.stderr
         assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')

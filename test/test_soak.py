@@ -97,7 +97,8 @@ def test_resident_memory_is_what_the_process_has() -> None:
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
-    (('--frames', 3), '3 frames are too few'), ((), 'exists already; choose another name')])
+    (('--frames', 3), '--frames is 3; it must be at least 100'),
+    ((), 'exists already; choose another name')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
         tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
     output = tmp_path / 'soak.json'

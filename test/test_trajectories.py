@@ -97,9 +97,9 @@ def test_an_existing_file_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize(('line', 'said'), [
-    ('1.0 0 0 0 0 0 0', 'has 7 numbers, 8 belong there'),
+    ('1.0 0 0 0 0 0 0', 'has 7 numbers; it must have 8'),
     ('x 0 0 0 0 0 0 1', "'x' is not a number"),
-    ('-3e9 0 0 0 0 0 0 1', "'-3e9' is no stamp"),
+    ('-3e9 0 0 0 0 0 0 1', "'-3e9' is not a stamp"),
     ('1.0 0 0 inf 0 0 0 1', "'inf' is not a finite number"),
     ('1.0 0 0 0 0 0 0 0', 'quaternion of pose 0 has length 0'),
 ])

@@ -70,7 +70,7 @@ def _write(folder: Path, report: LensReport, args: argparse.Namespace) -> None:
 def _summary(report: LensReport, source: Path) -> str:
     fit, k1 = report.fit, report.camera.k1
     pixels, sigma = (report.moved_pixels(value) for value in (fit.k1, k1 + fit.sigma))
-    before = f' (calibration so far: {k1:.4g})' if k1 else ''
+    before = f' (calibrated: {k1:.4g})' if k1 else ''
     text = (f'k1 = {fit.k1:.4f} +- {fit.sigma:.4f}{before}, from {len(fit.linearised)} of '
             f'{report.pairs} pairs with {report.turned_deg:.0f} degrees of rotation in total\n'
             f'that moves the outermost matches by {pixels:.1f} +- {sigma:.1f} pixels: ')
@@ -80,7 +80,7 @@ def _summary(report: LensReport, source: Path) -> str:
 
 
 def _correction(report: LensReport, source: Path) -> str:
-    """Return how to apply the correction, by kind of source: each keeps its calibration elsewhere."""
+    """Return how to apply the correction, by where the kind of source keeps its calibration."""
     if report.rectified:
         return ('by recalibrating on the raw images, or by this flag of djet replay '
                 f'(odometry.residual_k1 of a node):\n--residual-k1 {report.fit.k1:.5f}')

@@ -16,9 +16,9 @@ from djet_ros.live.parameters import with_live_values
 
 DESCRIPTION = f"""\
 Run the odometry on a ROS 2 graph from a machine without ROS, with the interface of 'ros2 run
-djet_ros vo_node': the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov, ~/relative_pose_status,
-~/odometry, ~/path, ~/landmarks, ~/debug_image, /diagnostics, /tf), services (~/reset, ~/pause,
-~/resume) and parameters.
+djet_ros vo_node': the same topics (image, camera_info; ~/relative_pose, ~/relative_pose_cov,
+~/relative_pose_status, ~/odometry, ~/path, ~/landmarks, ~/debug_image, /diagnostics, /tf),
+services (~/reset, ~/pause, ~/resume) and parameters.
 {ENVIRONMENT}"""
 
 

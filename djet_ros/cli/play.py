@@ -10,7 +10,7 @@ import sys
 from djet_ros.cli.graph_options import add_remappings, ENVIRONMENT, stop_by_signal
 from djet_ros.cli.options import add_topics, RECORDINGS
 from djet_ros.errors import DjetError
-from djet_ros.recordings.recording import BESIDE, open_recording
+from djet_ros.recordings.recording import AUXILIARY, open_recording
 
 DESCRIPTION = f"""\
 Publish the images of a recording with their CameraInfo, ground truth, and any recorded speeds,
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.player import Player
     names = Names('player', args.remap)
     source = open_recording(args.source, args.image_topic, args.info_topic,
-                            beside=dict.fromkeys(BESIDE), strict=False)
+                            beside=dict.fromkeys(AUXILIARY), strict=False)
     try:
         with Graph() as graph:
             player = Player(graph, source, names, args.rate, args.clock)

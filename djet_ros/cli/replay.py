@@ -19,7 +19,7 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.scale import Scale
-from djet_ros.recordings.recording import BESIDE, open_recording
+from djet_ros.recordings.recording import AUXILIARY, open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import PLOT, ResultsFolder
 from rich.table import Table
@@ -67,7 +67,7 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth, in place of the recording's own: a TUM file, or a "
                         'KITTI file with a row per image')
-    add_topics(parser, 'image', 'info', *(what for what in BESIDE if what != 'tf'))
+    add_topics(parser, 'image', 'info', *(what for what in AUXILIARY if what != 'tf'))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""What each part of D-JET contributes: the paper's Table 2, and single changes of a preset."""
+"""Ablation of D-JET: single changes of a preset, as in the paper's Table 2."""
 
 from __future__ import annotations
 
@@ -14,45 +14,46 @@ from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.summary import common_errors
 import numpy as np
 
-# Parameters that re-projection error has as well: a change of these is tried on both.
-_OF_BOTH = {'starts', 'loss', 'search_radius'}
+# Parameters that RP-E has too; changes of these are applied to both.
+_SHARED_WITH_RPE = {'starts', 'loss', 'search_radius'}
 
-# Keypoints that go only part of the way need more rounds to arrive, and each moves the pose by so
-# little that it would be taken to rest.
+# Limited steps need more iterations, and a smaller threshold of convergence, because each of them
+# moves the pose little.
 _ROUNDS = 20
-_UNHURRIED: dict[str, Any] = {'max_iterations': _ROUNDS, 'epsilon': 1e-9}
+_SMALL_STEPS: dict[str, Any] = {'max_iterations': _ROUNDS, 'epsilon': 1e-9}
 
-# Re-projection error where D-JET's gray levels have the matches: all that joining adds but for the
-# surfaces. The places themselves are seen through the warps of D-JET's pose.
+# RP-E on matches refined by D-JET's gray-level alignment: all that joining adds except for the
+# surfaces. The refinement uses the warps of D-JET's pose.
 ON_PLACES = 'on places by gray levels'
 WEIGHED = f'{ON_PLACES}, weighed by them'
 
-# Of the bootstrap.
+# Resamples of the bootstrap.
 _DRAWS = 2000
 
 
 @dataclass(frozen=True)
 class Change:
-    """Some parameters that are set otherwise, and what that is in words."""
+    """Changed parameters, and their description."""
 
     text: str
     values: Mapping[str, Any]
 
     def is_in(self, config: EstimatorConfig) -> bool:
-        """Tell whether a configuration has these values already."""
+        """Return whether a configuration has these values already."""
         return all(getattr(config, name) == value for name, value in self.values.items())
 
 
 def changes(windows: Sequence[int]) -> dict[str, list[Change]]:
-    """Give all changes by the part of the method that they concern."""
+    """Return all changes by the part of the method that they affect; windows: sides in pixels."""
     return {
         'window': [Change(f'window {side}×{side}', {'window': side}) for side in windows],
         'weights': [Change('all samples weigh alike', {'window_sigma': 0.0}),
                     Change('samples weighed, sigma 1 px', {'window_sigma': 1.0})],
         'step': [Change('step: full', {'step': 'full'}),
-                 Change(f'step: 1 px at most, {_ROUNDS} rounds', {'step': 'pixel', **_UNHURRIED}),
+                 Change(f'step: 1 px at most, {_ROUNDS} rounds', {
+                     'step': 'pixel', **_SMALL_STEPS}),
                  *(Change(f'step: {share:.0%} of the way, {_ROUNDS} rounds', {
-                     'step': 'share', 'step_share': share, **_UNHURRIED})
+                     'step': 'share', 'step_share': share, **_SMALL_STEPS})
                    for share in (0.1, 0.2, 0.3))],
         'loss': [Change(f'loss: {word}', {'loss': name})
                  for name, word in (('none', 'squares'), ('huber', 'Huber'), ('cauchy', 'Cauchy'),
@@ -86,12 +87,12 @@ PARTS = tuple(changes(()))
 def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequence[int],
                      values: Mapping[str, Any], *, good_start: bool = False) -> list[Method]:
     """
-    Let D-JET start with each preset and with each single change of it.
+    Return D-JET with each preset and with each single change of it, and methods to compare.
 
-    Beside them start RP-E, with the changes that it knows too, and the 5-point method; where
-    joining is changed, RP-E on the places that gray levels give as well, all alike and each as
-    exact as these say. good_start: see Method; presets with the 5-point start take it among
-    several then. Raises DjetError on unknown names and on windows that can't be.
+    These are RP-E, with the changes that apply to it, and the 5-point method; if joining is
+    varied, also RP-E on matches refined by gray levels, with equal weights and weighted by their
+    covariances. good_start: see Method; it sets 'starts' to 'several', so that the given pose is
+    one of them. Raises DjetError on unknown names and invalid windows.
     """
     check_names('preset', presets, PRESETS)
     check_names('part', parts, PARTS)
@@ -108,7 +109,7 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
             if change.is_in(base['djet'].config):
                 continue
             competing.append(_changed(base['djet'], change))
-            if change.values.keys() <= _OF_BOTH:
+            if change.values.keys() <= _SHARED_WITH_RPE:
                 competing.append(_changed(base['rpe'], change))
         if 'joining' in parts and base['djet'].config.join_matches:
             competing += [replace(base['rpe'], change=change, on_places=True, weighed=weighed)
@@ -118,26 +119,26 @@ def ablation_methods(presets: Sequence[str], parts: Sequence[str], windows: Sequ
 
 @dataclass(frozen=True)
 class Ratio:
-    """One error over another's on the same pairs, and the bounds of its 95 % interval."""
+    """Ratio of two errors on the same pairs, and the bounds of its 95 % confidence interval."""
 
     value: float
     least: float
     most: float
 
     @property
-    def told(self) -> bool:
-        """Whether one is outside: otherwise the pairs do not tell which is better."""
+    def significant(self) -> bool:
+        """Return whether the interval excludes 1, so that one of the two is better."""
         return self.least > 1 or self.most < 1
 
 
 def ratio_of(errors: Sequence[float] | Array, base: Sequence[float] | Array,
              statistic: Callable[..., Array] = np.mean) -> Ratio:
     """
-    Mean or median of errors over that of base, pair by pair the same ones; of pairs both know.
+    Return the mean or median of errors over that of base, on the pairs where both are finite.
 
-    The interval is that of the percentile bootstrap over pairs (Efron and Tibshirani, An
-    Introduction to the Bootstrap, chapter 13), always by the same draws; all NaN where nothing
-    is known, or no error is left to divide by.
+    errors, base: (N,), of the same pairs. The interval is that of the percentile bootstrap over
+    pairs (Efron and Tibshirani, An Introduction to the Bootstrap, chapter 13), with a fixed seed.
+    All NaN if there is no such pair, or a resample of base is zero.
     """
     both = np.array([errors, base], dtype=float)
     both = both[:, np.isfinite(both).all(axis=0)]
@@ -154,7 +155,7 @@ def ratio_of(errors: Sequence[float] | Array, base: Sequence[float] | Array,
 
 def ratios_to_base(records: Sequence[PairRecord], base: Sequence[PairRecord]
                    ) -> dict[str, dict[str, Ratio]]:
-    """Errors over those of base on the same pairs: 'rotation', 'direction'; 'mean', 'median'."""
+    """Return error ratios on common pairs, by 'rotation', 'direction' and 'mean', 'median'."""
     return {what: {kind: ratio_of(errors[:, 0], errors[:, 1], statistic)
                    for kind, statistic in (('mean', np.mean), ('median', np.median))}
             for what, errors in common_errors(records, base).items()}

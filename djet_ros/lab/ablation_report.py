@@ -31,20 +31,19 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
 _CAPTION = f'D-JET with one change at a time from a preset; – is the preset itself. {CAPTION}'
-_GOOD_START = ('All were given the pose of RP-E, preset best, as a start, and only the matches '
-               'that agree with it.')
+_GOOD_START = 'All started from the pose of RP-E, preset best, with only its inliers as matches.'
 _PUBLISHED = ("The paper's Table 2, as printed there: another sequence (VAROS, all frames), and "
               'errors in what the table calls degrees.')
-_RATIOS = ('Mean and median errors over those of D-JET as the preset has it, on the pairs that '
-           'both tell. In brackets is the 95 % interval of a paired bootstrap over pairs: where '
-           'it holds 1, the pairs do not tell which is better.')
+_RATIOS = ('Ratios of mean and median errors to those of D-JET with the unchanged preset, on the '
+           'pairs that both estimated. In brackets is the 95 % interval of a paired bootstrap '
+           'over pairs: if it contains 1, the difference is not significant.')
 _MARKERS = {'djet': 'o', 'rpe': 'D', 'five_point': 's'}
 _LINE = 0.24
 
 
 def write_ablation(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method],
                    records: Sequence[PairRecord]) -> list[Table]:
-    """Write everything but the records' store into the folder; gives the readable tables."""
+    """Write everything but the record store into the folder; return the readable tables."""
     rows = table_rows(records)
     caption = f'{_CAPTION} {_GOOD_START}' if methods[0].good_start else _CAPTION
     tables = [ablation_table(caption, rows), ratios_table(records),
@@ -58,13 +57,13 @@ def write_ablation(folder: Path, datasets: Sequence[Dataset], methods: Sequence[
         path = folder / 'plots' / f'{dataset.name}_ablation.png'
         plot_ablation(path, dataset.name, [row for row in rows if row.sequence == dataset.name])
         pictures[dataset.name] = [Picture(path, 'mean and median error of each variant')]
-    write_page(folder, 'D-JET: what each part contributes', tables, pictures, methods,
+    write_page(folder, 'D-JET: ablation', tables, pictures, methods,
                ['ablation.csv', 'ablation.md', 'pairs.csv', 'timings.csv'])
     return tables
 
 
 def ratios_table(records: Sequence[PairRecord]) -> Table:
-    """Lay out how mean errors compare with D-JET's, by sequence and preset."""
+    """Return the table of error ratios to D-JET's, by sequence and preset."""
     variants: dict[tuple[str, ...], list[PairRecord]] = {}
     for record in records:
         variants.setdefault((record.sequence, record.preset, record.method, record.change),
@@ -87,7 +86,7 @@ def _in_words(ratio: Ratio) -> str:
 
 
 def plot_ablation(path: Path, title: str, rows: Sequence[TableRow]) -> None:
-    """Draw mean and median errors of one sequence, a line per change, a panel per preset."""
+    """Plot mean and median errors of one sequence, a line per change, a panel per preset."""
     by_preset = {preset: [row for row in rows if row.preset == preset] for preset in PRESETS}
     by_preset = {preset: found for preset, found in by_preset.items() if found}
     heights = [len(_changes(found)) + 3 for found in by_preset.values()]
@@ -121,11 +120,11 @@ def _draw(axes: Axes, kind: str, rows: Sequence[TableRow]) -> None:
         axes.hlines(places, medians, means, color=COLOURS[method], lw=1)
         axes.plot(means, places, label=TITLES[method], **look)
         axes.plot(medians, places, markerfacecolor='white', **look)
-        # The preset itself, to read the changes against.
+        # The unchanged preset, for reference.
         axes.axvline(means[0], color=COLOURS[method], lw=0.8, ls=(0, (4, 4)))
     axes.set_xscale('log')
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter('{x:g}')
     axes.xaxis.set_minor_formatter('')
     axes.set_ylim(len(changes) - 0.4, -0.6)
-    axes.set_yticks(range(len(changes)), [change or 'as it is' for change in changes])
+    axes.set_yticks(range(len(changes)), [change or 'unchanged' for change in changes])

@@ -1,4 +1,4 @@
-"""Frames of a bag as files: pairs are wanted in any order, bags are read in one."""
+"""Extraction of the frames of a bag to files, for random access."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _INDEX = 'frames.npz'
 
 
 class ExtractedSequence(FrameSequence):
-    """Images that were rectified when they were taken out of a bag."""
+    """Images of a bag, rectified when they were extracted."""
 
     def __init__(self, folder: Path) -> None:
         images = ImageFiles(sorted(folder.glob('*.png')))
@@ -32,20 +32,20 @@ class ExtractedSequence(FrameSequence):
         self._left_out: NDArray[np.bool_] | None = unseen if unseen.size else None
 
     def _unseen(self) -> NDArray[np.bool_] | None:
-        """Give what the images in the bag did not show, before they were rectified."""
+        """Return the rectified pixels (H, W) that the images of the bag do not show, or None."""
         return self._left_out
 
 
 def is_extracted(folder: Path) -> bool:
-    """Tell whether a folder holds the frames of a bag."""
+    """Return whether a folder holds the extracted frames of a bag."""
     return (folder / _INDEX).exists()
 
 
 def extract(recording: BagRecording, folder: Path) -> Path:
     """
-    Write the frames of a bag into a new folder, rectified, and the truth at their stamps.
+    Extract the frames of a bag, rectified, to a new folder, with the ground truth at their stamps.
 
-    Gives the folder. Raises DjetError where the bag has no usable frames.
+    Returns the folder. Raises DjetError if the bag has no usable frames.
     """
     folder.mkdir(parents=True)
     camera: Camera | None = None
@@ -62,7 +62,8 @@ def extract(recording: BagRecording, folder: Path) -> Path:
             (folder / f'{len(stamps):06d}.png').write_bytes(_png(image))
             stamps.append(stamp_ns(message.header))
     if camera is None or not stamps:
-        raise DjetError(f'{recording.bag.path} has no image after its first CameraInfo')
+        raise DjetError(f'{recording.bag.path} has no image after its first CameraInfo; record '
+                        'CameraInfo from the start')
     stamps_ns = np.array(stamps, np.int64)
     poses = truth.at(stamps_ns) if len(truth) else np.empty((0, 4, 4))
     unseen = camera.unseen(image.shape)
@@ -72,6 +73,6 @@ def extract(recording: BagRecording, folder: Path) -> Path:
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
-    # Fast compression: the files live as long as the run.
+    # Fast compression: the files are temporary.
     _, data = cv2.imencode('.png', image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return data.tobytes()

@@ -1,8 +1,8 @@
 """
-How fast the pipeline is: ratios against OpenCV's plain chain, measured side by side in one run.
+Speed of the pipeline, as ratios to a plain OpenCV pipeline measured in the same run.
 
-Absolute times mean little on another machine; the ratios hold, because both sides of each were
-measured in turn, again and again, in the same process.
+Absolute times depend on the machine. Ratios are comparable, because both sides are measured
+alternately and repeatedly in the same process.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 POINTS = (250, 500, 1000, 2000, 4000)
 WINDOWS = (3, 5, 7, 9, 11, 13, 15)
 
-# The number of points at which the D-JET stage is quoted.
+# Number of matches for which the time of the D-JET stage is reported.
 QUOTED_POINTS = 1000
 
+# Repetitions of each measurement, of which the minimum counts.
 _REPEATS = 7
 
 Key = TypeVar('Key')
@@ -41,16 +42,16 @@ Key = TypeVar('Key')
 def bench(source: Path, pairs: int,
           progress: Callable[[str], None] = lambda stage: None) -> dict[str, Any]:
     """
-    Measure the first pairs of a recording with one thread, then with all that OpenCV takes.
+    Measure the first pairs of a recording with one thread, then with OpenCV's default number.
 
-    Gives the figures of the single-threaded run, and those of the other under 'all_cores'.
-    The frames of a bag are unpacked first, so that decoding one costs what it does in a folder.
-    Raises DjetError where the source is no recording of at least two frames.
+    Returns the results of the single-threaded run, and those of the other under 'all_cores'.
+    The frames of a bag are extracted first, so that decoding costs the same as for a folder.
+    Raises DjetError if the source is no recording of at least two frames.
     """
     with TemporaryDirectory(prefix='djet-') as workspace:
         sequence = readable_frames(source, Path(workspace))
         if len(sequence) < 2:
-            raise DjetError(f'{source} has {len(sequence)} frame; the bench needs at least 2')
+            raise DjetError(f'{source} has {len(sequence)} frames; at least 2 are needed')
         progress('one thread')
         cv2.setNumThreads(1)
         figures = measure(sequence, pairs)
@@ -61,17 +62,17 @@ def bench(source: Path, pairs: int,
 
 
 def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
-    """Measure everything: pipeline, D-JET stage, kernel, growth with points and window, memory."""
+    """Measure everything: pipeline, D-JET stage by matches and window, descriptors, memory."""
     figures = measure_pipeline(sequence, pairs)
     figures['compiled_loops'] = compiled.library is not None
     previous, current, x, y = _crowded_pair(sequence)
     figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
     figures['kernel_tests'] = preset('best').binary_tests
-    by_points = least_in_turn({n: _stage(previous, current, x[:n], y[:n])
-                               for n in POINTS if n <= len(x)})
+    by_points = interleaved_minima({n: _stage(previous, current, x[:n], y[:n])
+                                    for n in POINTS if n <= len(x)})
     figures['djet_ms_by_points'] = by_points
     figures['djet_stage_ms'] = by_points.get(QUOTED_POINTS, float('nan'))
-    figures['djet_ms_by_window'] = least_in_turn({
+    figures['djet_ms_by_window'] = interleaved_minima({
         w: _stage(previous, current, x[:QUOTED_POINTS], y[:QUOTED_POINTS], window=w)
         for w in WINDOWS})
     figures['bytes_per_frame'] = view_bytes(_estimator().view(sequence.image(0), sequence.K))
@@ -79,18 +80,18 @@ def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
 
 
 def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
-    """Time decoding to pose, both our presets and OpenCV's chain, in turn on each new frame."""
+    """Measure times from decoding to pose, of two presets and OpenCV, in turn on each frame."""
     ours, fast, plain = (_Pipeline(sequence, 'best'), _Pipeline(sequence, 'fast'),
                          _PlainChain(sequence))
     times: dict[str, list[float]] = {'ours': [], 'fast': [], 'plain': []}
     for index in range(min(pairs + 1, len(sequence))):
-        # Who goes first changes, so that neither always finds the file in the cache.
+        # Alternate the order, so that none always finds the file in the cache.
         order = [('ours', ours.take), ('fast', fast.take), ('plain', plain.take)]
         for name, step in order if index % 2 else reversed(order):
             start = perf_counter()
             step(index)
             times[name].append(perf_counter() - start)
-    # The first frame has no pair, and warms the caches up.
+    # The first frame has no pair; it warms up the caches.
     ours_s, fast_s, plain_s = (float(np.median(times[name][1:])) for name in times)
     return {'pairs': len(times['ours']) - 1, 'pipeline_over_opencv': ours_s / plain_s,
             'pairs_per_second': 1 / float(np.mean(times['ours'][1:])),
@@ -101,7 +102,7 @@ def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
 
 
 class _Pipeline:
-    """Our pipeline, frame by frame, from the file to the pose, as a replay has it."""
+    """Our pipeline from file to pose, frame by frame, as in a replay."""
 
     def __init__(self, sequence: FrameSequence, preset_name: str) -> None:
         self._sequence = sequence
@@ -112,7 +113,7 @@ class _Pipeline:
         self._timings: list[dict[str, float]] = []
 
     def take(self, index: int) -> None:
-        """Estimate the pair that ends with a frame, and prepare the next frame beside it."""
+        """Estimate the pair that ends with a frame, preparing the next frame in parallel."""
         start = perf_counter()
         view = self._ahead or self._view_of(index)
         last = len(self._sequence) - 1
@@ -122,7 +123,7 @@ class _Pipeline:
         self._view, self._ahead = view, following()
         if self._prior is not None:
             timings = self._prior.timings
-            # What was done beside the pair took no time: stages add up to all of it.
+            # Work done in parallel to the pair does not count: stages add up to the total.
             rest = perf_counter() - start - sum(timings.values())
             self._timings.append({'decode + features': rest, **timings})
 
@@ -130,7 +131,7 @@ class _Pipeline:
         return self._estimator.view(self._sequence.image(index), self._sequence.K)
 
     def stages_ms(self) -> dict[str, float]:
-        """Means over all pairs, so that stages which some pairs do without add up to the whole."""
+        """Return mean times over all pairs, 0 for pairs without a stage, so that they add up."""
         stages = dict.fromkeys(stage for timings in self._timings for stage in timings)
         return {stage: 1e3 * float(np.mean([timings.get(stage, 0.0) for timings in self._timings]))
                 for stage in stages}
@@ -159,11 +160,10 @@ class _PlainChain:
 
 def kernel_speedup(view: View) -> float:
     """
-    Time of cv2.ORB.compute over that of our surfaces, as preset best has them, on as many pixels.
+    Return the time of cv2.ORB.compute over that of our surfaces (preset best) on as many pixels.
 
-    OpenCV's side compares all 256 tests, on keypoints that are there already, and stops at the
-    descriptors. Ours compares as many tests as the preset says ('kernel_tests' of the figures),
-    and has the distances in the end.
+    OpenCV computes all 256 tests on given keypoints, but no distances. Ours computes the tests of
+    the preset ('kernel_tests' of the results) and the distances.
     """
     config = preset('best')
     distances, radius = DescriptorDistances(config), config.window // 2
@@ -185,12 +185,12 @@ def kernel_speedup(view: View) -> float:
         seen = distances.seen(view.gray)
         distances.surfaces(distances.reference(seen, points), seen, points, radius)
 
-    least = least_in_turn({'opencv': _seconds(opencv), 'ours': _seconds(ours)})
+    least = interleaved_minima({'opencv': _seconds(opencv), 'ours': _seconds(ours)})
     return least['opencv'] / least['ours']
 
 
 def view_bytes(view: View) -> int:
-    """Count the memory in bytes that a frame takes while it is kept."""
+    """Return the memory of a frame's view in bytes."""
     features = view.features
     arrays: tuple[NDArray[Any], ...] = (
         view.gray, view.smoothed, view.tested, features.points, features.octaves, features.angles,
@@ -203,8 +203,8 @@ def _estimator(**changes: Any) -> TwoViewEstimator:
 
 
 def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
-    """First two frames with very many matches, in random order: any first n are a fair n."""
-    # Corners keep apart from one another: there are never so many of them.
+    """Return views and many matches of the first two frames, in random order for subsetting."""
+    # ORB: our corners keep a minimum distance, which limits their number.
     crowd = _estimator(detector='orb', max_features=4 * max(POINTS), fast_threshold=5)
     previous, current = (crowd.view(sequence.image(i), sequence.K) for i in (0, 1))
     x, y = crowd.match(previous, current)
@@ -214,16 +214,16 @@ def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
 
 def _stage(previous: View, current: View, x: Array, y: Array, **changes: Any
            ) -> Callable[[], float]:
-    """Give what tells the time in ms of surfaces and optimisation together, on given matches."""
+    """Return a function that measures surfaces and optimisation on given matches, in ms."""
     estimator = _estimator(**changes)
     return lambda: 1e3 * estimator.estimate_matched(previous, current, x, y).timings['jet']
 
 
-def least_in_turn(measurements: Mapping[Key, Callable[[], float]]) -> dict[Key, float]:
+def interleaved_minima(measurements: Mapping[Key, Callable[[], float]]) -> dict[Key, float]:
     """
-    Give the least of some repeats of each measurement.
+    Return the minimum over repetitions of each measurement.
 
-    Each is made once before any is made again: what else the machine does is shared by all.
+    All are made once before any is repeated, so that other load of the machine affects all alike.
     """
     rounds = [{key: measurement() for key, measurement in measurements.items()}
               for _ in range(_REPEATS)]

@@ -1,9 +1,9 @@
 """
-What a gyro and a mask are good for: rendered scenes with and without them, held against the truth.
+Benefit of a gyro and of a mask: errors on rendered scenes with and without them.
 
-Each trial is a way through a scene that cameras alone have trouble with, or none; all aids of a
-trial see the same pictures. The gyro has the errors of a MEMS in a telephone, and its bias is not
-known at the start. The mask is exact: what moves by itself is left out.
+Each trial is a trajectory through a scene, most of them hard for a camera alone; all aids of a
+trial get the same images. The gyro has the errors of a MEMS in a telephone, and its bias is
+unknown at the start. The mask excludes exactly the moving objects.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 from numpy.typing import NDArray
 
-# Metres that are none.
-_NOWHERE = 1e-9
+# Translations below this, in metres, count as zero.
+_NO_TRANSLATION_M = 1e-9
 
 NOTHING, GYRO, MASK = 'nothing', 'gyro', 'mask'
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A way through a scene: how many frames, which of them are black, and what is at hand."""
+    """A trajectory through a scene; dark: frames with a black image; aids: to compare."""
 
     scene: str
     frames: int
@@ -56,7 +56,7 @@ TRIALS = {
 
 @dataclass(frozen=True)
 class TrialChunk:
-    """A trial in one place, up to a number of frames."""
+    """A trial with one seed, of at most ``most`` frames."""
 
     trial: str
     seed: int
@@ -64,30 +64,29 @@ class TrialChunk:
 
     @property
     def name(self) -> str:
-        """Name that is the same in every run."""
+        """Return a name that is the same in every run."""
         return f'{self.trial}:{self.seed}'
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Return the number of frames."""
         return min(TRIALS[self.trial].frames, self.most)
 
     @property
     def count(self) -> int:
-        """How many frames have a pair."""
+        """Return the number of pairs."""
         return self.frames - 1
 
 
 @dataclass(frozen=True)
 class Moment:
     """
-    What became of a frame, by its pair and by all of the way to it.
+    Result of one frame: errors of its pair, and of the trajectory up to it.
 
-    dark: whether it or what it is related to is black; tracked: whether a motion was told; stood:
-    whether that was none;
-    failed: see ``pairs.FAILURE``; errors of the pair in degrees, NaN where there is none;
-    dark_off_deg: of the turn in the dark up to a black frame; surprise: its square over its
-    covariance, 3 on average if that is true; bias_off: of the gyro's bias, as a share of it.
+    dark: whether one of the pair's images is black; tracked: whether a motion was estimated;
+    stood: whether that is no motion; failed: see ``pairs.FAILURE``; errors of the pair in degrees,
+    NaN if there is no estimate; dark_off_deg: rotation error since the last frame that was not
+    black; surprise: its NEES, expectation 3; bias_off: relative error of the gyro bias.
     """
 
     trial: str
@@ -109,12 +108,12 @@ class Moment:
 @dataclass(frozen=True)
 class Row:
     """
-    A trial with one aid, all seeds together.
+    Summary of a trial with one aid, over all seeds.
 
-    pairs: not counting those with a black image; failed: how many of them, wrong: how many of
-    these were told as if they were right; stood: pairs that were told as no motion; errors: mean
-    and largest in degrees; dark_off_deg and dark_surprise: the largest of all black frames;
-    bias_off: at the end, by seed.
+    pairs: without those with a black image; failed: number of failed pairs, wrong: of these,
+    those reported as tracked; stood: pairs estimated as no motion; errors: (mean, maximum) in
+    degrees; dark_off_deg and dark_surprise: maxima over all black frames; bias_off: final errors,
+    by seed.
     """
 
     trial: str
@@ -131,7 +130,7 @@ class Row:
 
 
 def run_trial(chunk: TrialChunk, config: EstimatorConfig) -> list[Moment]:
-    """Render the frames of a trial one by one, and show each to all aids."""
+    """Render the frames of a trial, and process each with all aids."""
     cv2.setNumThreads(1)
     trial, scene = TRIALS[chunk.trial], make_scene(TRIALS[chunk.trial].scene, chunk.seed)
     still = replace(scene, world=World(scene.world.panels))
@@ -149,14 +148,14 @@ def run_trial(chunk: TrialChunk, config: EstimatorConfig) -> list[Moment]:
 
 
 class _Run:
-    """An odometry with one aid."""
+    """The odometry with one aid."""
 
     def __init__(self, chunk: TrialChunk, which: str, config: EstimatorConfig, felt: FeltMotion,
                  poses: Array) -> None:
         self._chunk, self._aid, self._felt, self._poses = chunk, which, felt, poses
         self._gyro: Gyro | None = None
-        self._heard = 0
-        # The newest frame that was not black.
+        self._samples = 0
+        # The last frame that was not black.
         self._light: tuple[int, OdometryResult]
         if which == GYRO:
             self._gyro = Gyro(GyroNoise(Mems.gyro, Mems.gyro_walk))
@@ -165,22 +164,22 @@ class _Run:
 
     def see(self, index: int, gray: NDArray[np.uint8], K: Array, moving: NDArray[np.bool_] | None
             ) -> Moment | None:
-        """Take a frame; the first has no pair."""
+        """Process a frame and return its result; the first has none."""
         stamp = round(index * FRAME_PERIOD * 1e9)
-        self._listen(stamp)
+        self._add_samples(stamp)
         result = self._odometry.process(Frame(
             gray, K, stamp, left_out=moving if self._aid == MASK else None))
         if result.relative is None or result.previous_stamp_ns is None:
             return None
         return self._moment(index, result, round(result.previous_stamp_ns / FRAME_PERIOD * 1e-9))
 
-    def _listen(self, stamp_ns: int) -> None:
-        """Hear the gyro up to a stamp."""
+    def _add_samples(self, stamp_ns: int) -> None:
+        """Pass on the samples of the gyro up to a stamp."""
         end = int(np.searchsorted(self._felt.stamps_ns, stamp_ns, 'right'))
         if self._gyro is not None:
-            for number in range(self._heard, end):
+            for number in range(self._samples, end):
                 self._gyro.add(int(self._felt.stamps_ns[number]), self._felt.rates[number])
-        self._heard = end
+        self._samples = end
 
     def _moment(self, index: int, result: OdometryResult, previous: int) -> Moment:
         true_motion = np.linalg.inv(self._poses[previous]) @ self._poses[index]
@@ -195,8 +194,8 @@ class _Run:
         off, surprise = self._off_since_light(index, result) if dark else (float('nan'),) * 2
         if not dark:
             self._light = index, result
-        # A way that was told where there was none is wrong, whatever its rotation.
-        stands = not (np.abs(true_motion[:3, 3]) > _NOWHERE).any()
+        # A translation of a stationary camera is a failure, whatever its rotation.
+        stands = not (np.abs(true_motion[:3, 3]) > _NO_TRANSLATION_M).any()
         invented = tracked and stands and bool(result.motion[:3, 3].any())
         return Moment(
             self._chunk.trial, self._chunk.seed, self._aid, index, result.status.value,
@@ -205,13 +204,13 @@ class _Run:
             surprise, self._bias_off())
 
     def _off_since_light(self, index: int, result: OdometryResult) -> tuple[float, float]:
-        """Give the error in degrees of the turn since it was light, and its surprise."""
+        """Return the rotation error in deg since the last frame not black, and its NEES."""
         before, light = self._light
-        told = result.pose[:3, :3] @ light.pose[:3, :3].T
+        estimated = result.pose[:3, :3] @ light.pose[:3, :3].T
         true = self._poses[index][:3, :3] @ self._poses[before][:3, :3].T
-        # Both along the axes of the first camera, as the covariances are.
+        # Both in the axes of the first camera, like the covariances.
         start = light.pose[:3, :3] @ self._poses[before][:3, :3].T
-        off = rotation_log(start @ true @ start.T @ told.T)
+        off = rotation_log(start @ true @ start.T @ estimated.T)
         covariance = (result.pose_covariance - light.pose_covariance)[3:, 3:]
         return (float(np.degrees(np.linalg.norm(off))),
                 float(off @ np.linalg.solve(covariance, off)))
@@ -219,17 +218,17 @@ class _Run:
     def _bias_off(self) -> float:
         if self._gyro is None:
             return float('nan')
-        true = self._felt.rate_biases[self._heard - 1]
+        true = self._felt.rate_biases[self._samples - 1]
         return float(np.linalg.norm(self._gyro.bias - true) / np.linalg.norm(true))
 
 
 def _moving(scene: Scene, still: Scene, pose: Array, index: int) -> NDArray[np.bool_]:
-    """(H, W) bool, where something is seen that moves by itself."""
+    """Return the pixels (H, W) of moving objects."""
     return np.asarray(scene.depth(pose, index) < still.depth(pose, index))
 
 
 def trial_rows(moments: Iterable[Moment]) -> list[Row]:
-    """Sum up moments by trial and aid, in the order of their first."""
+    """Summarise results by trial and aid, in the order of their first."""
     groups: dict[tuple[str, str], list[Moment]] = {}
     for moment in moments:
         groups.setdefault((moment.trial, moment.aid), []).append(moment)
@@ -250,7 +249,7 @@ def _row(trial: str, which: str, moments: Sequence[Moment]) -> Row:
 
 
 def is_wrong(moment: Moment) -> bool:
-    """Tell whether a pair failed, and was told as if it had not."""
+    """Return whether a pair failed, but was reported as tracked."""
     return moment.failed and moment.tracked
 
 

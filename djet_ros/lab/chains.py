@@ -1,18 +1,19 @@
 """
-Whole chains of other libraries, from two images to their relative pose: what a user would pick.
+Complete pipelines of other libraries, from two images to their relative pose.
 
-Unlike the methods in ``peers``, they find and match points of their own. All that they are set to
-stands here; nothing of it is taken from a preset. Where a setting matters, what served them best
-was taken, by means and medians over nine rendered scenes and held against real frames:
+Unlike the methods in ``peers``, they detect and match their own points. All their settings are
+here; none comes from a preset. Settings that matter were chosen for their lowest errors, by means
+and medians over nine rendered scenes, and checked on real frames:
 
-* Lucas-Kanade: windows of 7, 9, 11, 13, 15, 21 and 31 pixels, 3 to 5 levels over the image. The
-  smaller the window, the more exact, down to 11; more levels find what moved far. OpenCV's own 21
-  and 3 leave 1.4 to 1.9 times the error, and lose some of every fifth frame. Back to 0.5 or 1 px,
-  weaker corners, and larger blocks make no difference in all, or hurt.
+* Lucas-Kanade: windows of 7, 9, 11, 13, 15, 21 and 31 pixels, 3 to 5 pyramid levels. Smaller
+  windows are more accurate, down to 11; more levels track larger motions. OpenCV's defaults, 21
+  and 3, leave 1.4 to 1.9 times the error, and lose some of every fifth frame. Forward-backward
+  thresholds of 0.5 or 1 px, weaker corners, and larger blocks make no difference overall, or are
+  worse.
 * SIFT: ratios of 0.75 to 0.95 differ by a few per cent; lower contrast helps under water only.
-* PoseLib: a Cauchy loss of 0.25 px, instead of its own 0.5 px, takes a seventh of the error away
-  from both; 0.1 px takes more off sharp images and adds to blurred ones. Thresholds of 0.5 to
-  2 px, Huber's and a truncated loss are no better in all.
+* PoseLib: a Cauchy loss of 0.25 px, instead of the default 0.5 px, reduces the error of both by a
+  seventh; 0.1 px improves sharp images further, but not blurred ones. Thresholds of 0.5 to 2 px,
+  the Huber and a truncated loss are no better overall.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _APART, _QUALITY = 8, 0.01
 _WINDOW, _LEVELS = 11, 5
 _THERE_AND_BACK = 1.0
 _THRESHOLD = 1.0
-# Fewer matches than the 5-point method needs for one hypothesis and a vote.
+# Fewest matches for an estimate: more than the 5-point method needs for one hypothesis.
 _MIN_MATCHES = 8
 
 
@@ -50,13 +51,13 @@ class Points:
 
 @dataclass(frozen=True)
 class Chain:
-    """How points are found in an image, and matches x, y (N, 2) in pixels between two of them."""
+    """Functions that detect the points of an image, and match them as x, y (N, 2) in pixels."""
 
     detect: Callable[[Image, Mask | None], Points]
     match: Callable[[Points, Points], tuple[Array, Array]]
 
     def estimate(self, previous: Points, current: Points, K: Array) -> RelativePose:
-        """Estimate the motion between two images (H, W) whose points are known; K (3, 3)."""
+        """Estimate the relative pose of two images from their points; K (3, 3)."""
         x, y = self.match(previous, current)
         if len(x) < _MIN_MATCHES:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
@@ -120,7 +121,7 @@ def _flow(before: Image, after: Image, places: NDArray[np.float32]
 
 
 def _allowed(mask: Mask | None) -> Image | None:
-    """Say as OpenCV does where points may be."""
+    """Return OpenCV's form of a mask: 255 where points are allowed."""
     return None if mask is None else np.where(mask, 0, 255).astype(np.uint8)
 
 

@@ -1,10 +1,9 @@
 """
-How well the rotations of three frames agree with one another: a measure without ground truth.
+Rotation closure error of frame triplets: a measure of accuracy without ground truth.
 
-Of the rotations between frames i, i + 1 and i + 2 each follows from the other two. What remains of
-R(i, i+2) (R(i+1, i+2) R(i, i+1))^T is error of the estimates. It is a lower bound of their error:
-what all three have in common, such as a wrong camera matrix, cancels, and so does part of what is
-wrong with a frame that two of them share.
+With exact rotations R(i, i+2) (R(i+1, i+2) R(i, i+1))^T is the identity. Its deviation is a lower
+bound of the error of the estimates: errors common to all three, such as those of a wrong camera
+matrix, cancel, and so do in part errors of a frame that two pairs share.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ from scipy.spatial.transform import Rotation
 @dataclass(frozen=True)
 class Triangle:
     """
-    What a method makes of frames `first`, first + 1 and first + 2; angles in degrees.
+    Closure of frames first, first + 1 and first + 2 by one method; angles in degrees.
 
-    angle: of the rotation that remains; claimed: its standard deviation by the covariances;
-    normalised_square: 3 on average if those are true and the three errors independent; error: of
-    the first rotation against the ground truth, NaN where there is none.
+    angle: of the closure error; claimed: its standard deviation by the covariances;
+    normalised_square: its NEES, with expectation 3 if the covariances are correct and the three
+    errors independent; error: of the first rotation against ground truth, or NaN without it.
     """
 
     first: int
@@ -46,17 +45,17 @@ def closures(sequence: FrameSequence, methods: Sequence[str], frames: int,
              progress: Callable[[int], None] = lambda done: None
              ) -> dict[str, list[Triangle | None]]:
     """
-    Give the triangles of the first frames of a sequence; None where a pose was not found.
+    Return the triplets of the first frames of a sequence by method, None if a pose has failed.
 
-    Methods start with the preset ``best`` and from the motion before, as in the odometry. Raises
-    DjetError where there are not three frames.
+    Methods use the preset ``best``, with the previous motion as prior, as in the odometry. Raises
+    DjetError if there are fewer than three frames.
     """
     frames = min(frames, len(sequence))
     if frames < 3:
-        raise DjetError(f'there are {frames} frames to use; a triangle needs three')
+        raise DjetError(f'{frames} frames are too few for a triplet; at least three are needed')
     estimators = {name: TwoViewEstimator(preset('best', method=name)) for name in methods}
     found: dict[str, list[Triangle | None]] = {name: [] for name in methods}
-    # All methods see the same features: detection has no parameter of theirs.
+    # All methods share the features: detection does not depend on the method.
     detector = estimators[methods[0]]
     a, b = (sequence.frame(i).view(detector) for i in (0, 1))
     before = {name: one.estimate(a, b) for name, one in estimators.items()}
@@ -76,29 +75,29 @@ def _triangle(first: int, before: RelativePose, after: RelativePose, across: Rel
               poses: Array | None) -> Triangle | None:
     if any(one.status is not Status.OK for one in (before, after, across)):
         return None
-    remains, covariance = remaining_rotation(before, after, across)
+    closure, covariance = closure_rotation(before, after, across)
     return Triangle(
-        first, float(np.degrees(np.linalg.norm(remains))),
+        first, float(np.degrees(np.linalg.norm(closure))),
         float(np.degrees(np.sqrt(np.trace(covariance)))),
-        float(remains @ np.linalg.solve(covariance, remains)),
+        float(closure @ np.linalg.solve(covariance, closure)),
         _error(before, poses, first))
 
 
-def remaining_rotation(before: RelativePose, after: RelativePose,
-                       across: RelativePose) -> tuple[Array, Array]:
+def closure_rotation(before: RelativePose, after: RelativePose,
+                     across: RelativePose) -> tuple[Array, Array]:
     """
-    Give the rotation vector (3,) in rad that three motions leave, and its covariance (3, 3).
+    Return the rotation vector (3,) of the closure error in rad, and its covariance (3, 3).
 
-    before, after: the motions from the first to the second view, and from that to the third;
-    across: that from the first to the third. Their errors are taken to be independent.
+    before, after: motions from the first to the second view, and from the second to the third;
+    across: from the first to the third. Their errors are taken to be independent.
     """
-    remains = Rotation.from_matrix(across.R @ (after.R @ before.R).T).as_rotvec()
+    closure = Rotation.from_matrix(across.R @ (after.R @ before.R).T).as_rotvec()
     C_before, C_after, C_across = (one.covariance_5[:3, :3] for one in (before, after, across))
-    return remains, C_across + C_after + after.R @ C_before @ after.R.T
+    return closure, C_across + C_after + after.R @ C_before @ after.R.T
 
 
 def summary(triangles: Sequence[Triangle | None]) -> dict[str, Any]:
-    """Sum up one method: angles in degrees, 'without' counts triangles with a pose missing."""
+    """Summarise one method: angles in degrees; 'without': triplets without all three poses."""
     closed = [triangle for triangle in triangles if triangle is not None]
 
     def spread(name: str) -> dict[str, float]:

@@ -1,10 +1,10 @@
 """
-Whether poses are as sure as they say: their errors, held against their own covariances.
+Calibration of the covariances of poses: coverage of their ellipsoids, and NEES.
 
-With the error e of rotation and direction and its covariance C, e^T C^-1 e is chi-squared of five
-degrees of freedom where C is true (normalised estimation error squared, NEES; Bar-Shalom, Li and
-Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4). So a share q of
-all poses has to lie inside the ellipsoid that holds a Gaussian with probability q.
+With the error e of rotation and translation direction and its covariance C, e^T C^-1 e has a
+chi-squared distribution of five degrees of freedom if C is correct (normalised estimation error
+squared, NEES; Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, section 5.4). So a share q of all poses must be inside the ellipsoid of probability q.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from djet_ros.replay.pair_errors import angles_off
 import numpy as np
 from scipy.stats import beta, chi2
 
-# Probabilities whose ellipsoids are looked at.
+# Probabilities of the ellipsoids.
 LEVELS = (0.5, 0.9, 0.95, 0.99, 0.999)
 
-# Standard deviations of rotation and direction, in degrees, that a pose claims to be better than
-# where it is called sure.
+# Standard deviations of rotation and translation direction in degrees, below which a failed pair
+# is overconfident.
 SURE_ROTATION, SURE_DIRECTION = 0.3, 3.0
 
-# How pairs are started: each by itself, or by the odometry, which knows what was before.
+# How pairs are started: each by itself, or in the odometry, with the previous motion as prior.
 ALONE, IN_A_ROW = 'alone', 'in a row'
 
-# Pairs of an odometry that are run before those of a chunk count, so that it is under way.
+# Pairs that the odometry processes before those of a chunk, to initialise.
 _LEAD = 3
 
 PAIRS_PER_CHUNK = 20
@@ -45,11 +45,11 @@ PAIRS_PER_CHUNK = 20
 @dataclass(frozen=True)
 class Coverage:
     """
-    A pair of frames, what was claimed about its motion, and how far it was off.
+    Errors and standard deviations of one pair of frames.
 
-    scene: what is seen, whatever the seed; start: ALONE or IN_A_ROW; previous, current: indices of
-    the frames; errors, and claimed standard deviations, in degrees, NaN where there is none;
-    square: e^T C^-1 e; failed: see ``pairs.FAILURE``, of the best guess where a pose is given up.
+    scene: without its seed; start: ALONE or IN_A_ROW; previous, current: indices of the frames;
+    errors and standard deviations ('claim') in degrees, NaN if there is none; square: e^T C^-1 e;
+    failed: see ``pairs.FAILURE``, of the best estimate if no pose was accepted.
     """
 
     scene: str
@@ -68,41 +68,38 @@ class Coverage:
     inliers: int
 
     @property
-    def told(self) -> bool:
-        """Whether a direction and its covariance were told, and are held against the truth."""
+    def has_nees(self) -> bool:
+        """Return whether rotation and direction were estimated and compared with the truth."""
         return self.status == Status.OK.value and bool(np.isfinite(self.square))
 
     @property
-    def untold(self) -> bool:
-        """
-        Whether there is a pose that failed, but no direction to hold against the truth.
-
-        That is a motion which was taken for none: NO_PARALLAX where the camera moved.
-        """
-        return self.status in (s.value for s in TRACKED) and not self.told and self.failed
+    def missed_direction(self) -> bool:
+        """Return whether the pair was tracked without a direction, although the camera moved."""
+        return self.status in (s.value for s in TRACKED) and not self.has_nees and self.failed
 
     @property
-    def wrong_and_sure(self) -> bool:
-        """Whether the pose is far off, and claims to be exact."""
-        return (self.told and self.failed and self.rotation_claim_deg < SURE_ROTATION
+    def overconfident(self) -> bool:
+        """Return whether the pose failed with small standard deviations."""
+        return (self.has_nees and self.failed and self.rotation_claim_deg < SURE_ROTATION
                 and self.direction_claim_deg < SURE_DIRECTION)
 
     @property
-    def needlessly_given_up(self) -> bool:
-        """Whether the best guess of a pose that was given up was right."""
+    def rejected_correct(self) -> bool:
+        """Return whether no pose was accepted, although the best estimate was correct."""
         return self.status not in (s.value for s in TRACKED) and not self.failed
 
 
 @dataclass(frozen=True)
 class CoverageRow:
     """
-    Pairs of one scene and start.
+    Summary of the pairs of one scene and start.
 
-    median: that of the squares, over its expectation; inside: by LEVELS, the share of the told
-    pairs in that ellipsoid, with the bounds that hold the true share with 95 % (Clopper and
-    Pearson, Biometrika 1934); failed: of the told pairs; untold: see Coverage; given_up: pairs
-    without a pose, needlessly: with a right guess. Each pair that went wrong is in one of failed,
-    untold and given_up.
+    told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these;
+    untold: tracked without a direction, see ``Coverage.missed_direction``; given_up: without a
+    pose, needlessly: of these, with a correct best estimate; median: of the NEES, over the median
+    of its distribution; inside: by LEVELS, the share of told pairs inside the ellipsoid, with its
+    95 % confidence interval (Clopper and Pearson, Biometrika 1934). Each failed pair is counted
+    in one of failed, untold and given_up.
     """
 
     scene: str
@@ -119,7 +116,7 @@ class CoverageRow:
 
 
 def cover_chunk(chunk: PairChunk, config: EstimatorConfig) -> list[Coverage]:
-    """Estimate the pairs of a chunk each by itself, and as an odometry does, in a row."""
+    """Estimate the pairs of a chunk each by itself, and in sequence with the odometry."""
     cv2.setNumThreads(1)
     return [*_alone(chunk, config), *_in_a_row(chunk, config)]
 
@@ -149,7 +146,7 @@ def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
 
 def _covered(chunk: PairChunk, start: str, previous: int, current: int,
              pose: RelativePose) -> Iterator[Coverage]:
-    """Hold a pose against the truth, where there is any."""
+    """Yield the record of a pose, if there is ground truth."""
     poses = opened(chunk.dataset).poses
     assert poses is not None  # datasets without poses are refused at the start
     true_motion = np.linalg.inv(poses[previous]) @ poses[current]
@@ -171,15 +168,15 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
 
 
 def _scene(dataset: Dataset) -> str:
-    """Name what is seen; a recorded corridor is none that was rendered."""
+    """Return the scene; recorded ones are marked, to distinguish them from rendered ones."""
     return rendered_scene(dataset.folder) or f'{plain_name(dataset.folder)} (recorded)'
 
 
 def normalised_square(pose: RelativePose, true_motion: Array) -> float:
     """
-    Squared error of a pose over its covariance (5, 5); 5 on average if that is true.
+    Return the NEES of a pose with its covariance (5, 5); its expectation is 5.
 
-    true_motion: (4, 4) the current camera in the previous one.
+    true_motion: (4, 4) pose of the current camera in the previous one.
     """
     R = true_motion[:3, :3].T
     t = unit(-R @ true_motion[:3, 3])
@@ -188,7 +185,7 @@ def normalised_square(pose: RelativePose, true_motion: Array) -> float:
 
 
 def coverage_rows(records: Iterable[Coverage]) -> list[CoverageRow]:
-    """Sum up records by scene and start, in the order of their first."""
+    """Summarise records by scene and start, in the order of their first."""
     groups: dict[tuple[str, str], list[Coverage]] = {}
     for record in records:
         groups.setdefault((record.scene, record.start), []).append(record)
@@ -196,22 +193,22 @@ def coverage_rows(records: Iterable[Coverage]) -> list[CoverageRow]:
 
 
 def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
-    squares = np.array([record.square for record in records if record.told])
+    squares = np.array([record.square for record in records if record.has_nees])
     tracked = [status.value for status in TRACKED]
     return CoverageRow(
         scene, start, len(records), len(squares),
-        sum(record.failed for record in records if record.told),
-        sum(record.untold for record in records),
+        sum(record.failed for record in records if record.has_nees),
+        sum(record.missed_direction for record in records),
         sum(record.status not in tracked for record in records),
-        sum(record.needlessly_given_up for record in records),
-        sum(record.wrong_and_sure for record in records),
+        sum(record.rejected_correct for record in records),
+        sum(record.overconfident for record in records),
         float(np.median(squares) / chi2.median(5)) if len(squares) else float('nan'),
         tuple(share_with_bounds(int((squares <= chi2.ppf(level, 5)).sum()), len(squares))
               for level in LEVELS))
 
 
 def share_with_bounds(hits: int, tries: int) -> tuple[float, float, float]:
-    """Share of hits, and the bounds of 95 % of the true probability, all NaN without a try."""
+    """Return the share of hits with its 95 % confidence interval, all NaN without a try."""
     if not tries:
         return (float('nan'),) * 3
     tail = 0.025
@@ -222,9 +219,9 @@ def share_with_bounds(hits: int, tries: int) -> tuple[float, float, float]:
 
 def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
     """
-    Plot the share of poses that lie inside against the probability that was claimed, by scene.
+    Plot the share of poses inside their ellipsoids against its probability, by scene.
 
-    On the right the share beyond, on logarithmic axes: that is where backends break.
+    On the right the share outside, with logarithmic axes, for the tails: outliers break back ends.
     """
     from djet_ros.lab.style import figure
     from matplotlib import colormaps
@@ -232,7 +229,7 @@ def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
     with figure(path, 9.0, 4.0) as empty:
         left, right = empty.subplots(1, 2)
         for number, scene in enumerate(scenes):
-            squares = np.sort([r.square for r in records if r.scene == scene and r.told])
+            squares = np.sort([r.square for r in records if r.scene == scene and r.has_nees])
             if not len(squares):
                 continue
             claimed, found = chi2.cdf(squares, 5), np.arange(1, len(squares) + 1) / len(squares)
@@ -241,9 +238,9 @@ def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
             right.step(np.maximum(chi2.sf(squares, 5), 1e-6), 1 - found + 1 / len(squares), **look)
         left.plot([0, 1], [0, 1], 'k:', lw=1)
         right.plot([1e-6, 1], [1e-6, 1], 'k:', lw=1)
-        left.set(xlabel='claimed probability', ylabel='share of poses inside', xlim=(0, 1),
-                 ylim=(0, 1))
-        right.set(xlabel='claimed probability of an error so large', xscale='log', yscale='log',
+        left.set(xlabel='probability of the ellipsoid', ylabel='share of poses inside',
+                 xlim=(0, 1), ylim=(0, 1))
+        right.set(xlabel='probability of an error outside', xscale='log', yscale='log',
                   ylabel='share of poses', xlim=(1e-6, 1), ylim=(1e-4, 1))
-        # Where a true claim leaves it empty.
+        # The corner that calibrated covariances leave empty.
         left.legend(fontsize=6, loc='lower right')

@@ -1,4 +1,4 @@
-"""Standard trajectory metrics by the tool evo, called as its users call it."""
+"""Trajectory metrics by evo's command-line tools."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from djet_ros.libraries import how_to_get
 @dataclass(frozen=True)
 class TrajectoryMetrics:
     """
-    Root mean squares over a trajectory whose lengths are the truth's.
+    RMSE of a trajectory: APE of positions after alignment, and RPE from frame to frame.
 
-    ape_m: positions after alignment; rpe_m, rpe_deg: from frame to frame.
+    ape_m, rpe_m: in metres; rpe_deg: in degrees.
     """
 
     ape_m: float
@@ -30,9 +30,9 @@ class TrajectoryMetrics:
 
 def trajectory_metrics(truth: Path, estimate: Path, scaled: bool = True) -> TrajectoryMetrics:
     """
-    Compare two TUM files; DjetError where evo is missing or refuses them.
+    Compare two TUM files; raise DjetError if evo is missing or fails.
 
-    Not scaled: the estimate's scale is unknown and is aligned as well.
+    scaled: whether the estimate's scale is known; otherwise it is aligned as well.
     """
     scale = () if scaled else ('--align', '--correct_scale')
     return TrajectoryMetrics(
@@ -42,9 +42,9 @@ def trajectory_metrics(truth: Path, estimate: Path, scaled: bool = True) -> Traj
 
 
 def find_tool(name: str) -> str:
-    """Path of a command of evo, beside this Python or on the search path; else DjetError."""
-    beside = Path(sys.executable).parent / name
-    found = str(beside) if beside.exists() else shutil.which(name)
+    """Return the path of a command of evo, next to this Python or on PATH; raise DjetError."""
+    in_environment = Path(sys.executable).parent / name
+    found = str(in_environment) if in_environment.exists() else shutil.which(name)
     if found is None:
         raise DjetError(f"the command '{name}' is not installed: {how_to_get('evo')}")
     return found

@@ -1,4 +1,4 @@
-"""By how much the clock of an IMU is ahead of a camera's, and how the IMU is turned against it."""
+"""Estimation of the time offset and the rotation between an IMU and a camera."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-# Seconds between the offsets that are tried first, by how fast it turns alone.
+# Step in seconds of the initial search for the offset.
 _COARSE = 0.005
 
-# Pairs that are needed, and rad per second: their rates must differ by so much to tell an offset.
+# Fewest pairs, and smallest standard deviation of their rates in rad/s, to determine an offset.
 _LEAST_PAIRS, _LEAST_CHANGE = 20, 0.02
 
-# rad, rad/s and s by which mounting, bias and offset are varied.
+# Units of the unknowns in the optimisation: rotation (rad), bias (rad/s) and offset (s).
 _UNITS = np.array([0.01] * 6 + [0.002])
 
-# Condition from which on something is not to be told.
-_EVEN = 1e12
+# Condition number of the information above which the problem counts as degenerate.
+_DEGENERATE = 1e12
 
 
 @dataclass(frozen=True)
-class VisualTurns:
-    """Rotations (N, 3, 3) from images at start_ns to those at end_ns (N,), as a RelativePose's."""
+class VisualRotations:
+    """Rotations R (N, 3, 3) of RelativePose, between images at start_ns and end_ns (N,)."""
 
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
     R: Array
 
     def rates(self) -> Array:
-        """Tell how fast it turned on average: (N, 3) in rad/s, along the camera's axes."""
+        """Return mean angular velocities (N, 3) in rad/s, in the camera's axes."""
         seconds = (self.end_ns - self.start_ns) * 1e-9
         return np.asarray(rotation_log(self.R.transpose(0, 2, 1)) / seconds[:, None])
 
@@ -42,11 +42,11 @@ class VisualTurns:
 @dataclass(frozen=True)
 class ImuFit:
     """
-    What suits the turns of the images best.
+    Estimate of time offset, rotation and gyro bias.
 
-    offset, offset_sigma: seconds by which the IMU's clock is ahead; to_camera: (3, 3) rotation of
-    the IMU's axes to those of the camera; bias: (3,) rad/s; residual: rad/s, robust standard
-    deviation of what is left of the rates; pairs: how many were used.
+    offset, offset_sigma: seconds by which the IMU's clock is ahead; to_camera: (3, 3) rotation
+    from the IMU's axes to those of the camera; bias: (3,) rad/s; residual: robust standard
+    deviation of the residual rates in rad/s; pairs: number of pairs used.
     """
 
     offset: float
@@ -57,42 +57,43 @@ class ImuFit:
     pairs: int
 
     def quaternion(self) -> list[float]:
-        """Give to_camera as x y z w."""
+        """Return to_camera as quaternion x, y, z, w."""
         return [float(value) for value in Rotation.from_matrix(self.to_camera).as_quat(
             canonical=True)]
 
 
-def fit_imu(turns: VisualTurns, stamps_ns: NDArray[np.int64], rates: Array,
+def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Array,
             widest: float = 0.5) -> ImuFit:
     """
-    Find the offset, the mounting and the bias of an IMU with samples (M,), rates (M, 3) in rad/s.
+    Estimate offset, rotation and bias of an IMU with stamps (M,) and rates (M, 3) in rad/s.
 
-    How fast both turn tells the offset roughly, within ``widest`` seconds, whatever the mounting;
-    the rotations themselves tell all three, by robust least squares. DjetError where the turns
-    are too few or too even to tell.
+    A search within ``widest`` seconds, which does not depend on the rotation, gives the initial
+    offset; robust least squares on the rotations of the pairs then estimate all three. Raises
+    DjetError if there are too few pairs, or their rotations do not determine the offset.
     """
-    seen = turns.rates()
+    seen = rotations.rates()
     if len(seen) < _LEAST_PAIRS or seen.std(0).max() < _LEAST_CHANGE:
-        raise DjetError(f'{len(seen)} pairs whose rates differ by {seen.std(0).max():.3f} rad/s '
-                        f'tell no offset; record at least {_LEAST_PAIRS}, and turn the camera to '
-                        'and fro about all axes')
+        raise DjetError(f'{len(seen)} pairs whose angular rates vary by {seen.std(0).max():.3f} '
+                        f'rad/s do not determine an offset; record at least {_LEAST_PAIRS}, and '
+                        'rotate the camera back and forth about all axes')
     gyro = _orientations(stamps_ns, rates)
     tried = np.arange(-widest, widest + _COARSE / 2, _COARSE)
-    offset = float(tried[np.argmin([_misfit(turns, seen, gyro, one) for one in tried])])
-    felt, known = _felt(turns, gyro, offset)
+    offset = float(tried[np.argmin([_misfit(rotations, seen, gyro, one) for one in tried])])
+    measured, known = _gyro_rates(rotations, gyro, offset)
     if known.sum() < _LEAST_PAIRS:
-        raise DjetError(f'the IMU covers {known.sum()} of {len(seen)} pairs; are both stamped by '
-                        'clocks that are near one another?')
+        raise DjetError(f'the IMU covers {known.sum()} of {len(seen)} pairs, at least '
+                        f'{_LEAST_PAIRS} are needed; check that images and IMU are stamped by '
+                        'synchronised clocks, or raise --widest')
     R, _ = Rotation.align_vectors(seen[known] - np.median(seen[known], axis=0),
-                                  felt[known] - np.median(felt[known], axis=0))
-    bias = np.median(felt[known] - R.inv().apply(seen[known]), axis=0)
+                                  measured[known] - np.median(measured[known], axis=0))
+    bias = np.median(measured[known] - R.inv().apply(seen[known]), axis=0)
 
     at_first = np.array([0, 0, 0, *bias, offset])
 
     def residuals(z: Array) -> Array:
-        # Unknowns begin at one, in units in which they may change by about as much.
+        # Unknowns are scaled and start at one, so that relative steps suit all of them.
         x = at_first + _UNITS * (z - 1)
-        there, covered = _felt(turns, gyro, x[6])
+        there, covered = _gyro_rates(rotations, gyro, x[6])
         off = seen - (Rotation.from_rotvec(x[:3]) * R).apply(there - x[3:6])
         return np.asarray(np.where((covered & known)[:, None], off, 0.0).ravel())
 
@@ -102,21 +103,21 @@ def fit_imu(turns: VisualTurns, stamps_ns: NDArray[np.int64], rates: Array,
     x = at_first + _UNITS * (found.x - 1)
     sigma = 1.4826 * float(np.median(np.abs(found.fun[found.fun != 0])))
     information = found.jac.T @ found.jac
-    if np.linalg.cond(information) > _EVEN:
-        raise DjetError('the camera turned too evenly to tell the offset; turn it to and fro '
-                        'about all axes')
+    if np.linalg.cond(information) > _DEGENERATE:
+        raise DjetError('the rotations do not determine the offset; rotate the camera back and '
+                        'forth about all axes')
     spread = sigma * float(np.sqrt(np.linalg.inv(information)[6, 6])) * _UNITS[6]
     return ImuFit(float(x[6]), spread, (Rotation.from_rotvec(x[:3]) * R).as_matrix(), x[3:6],
                   sigma, int(known.sum()))
 
 
 def _orientations(stamps_ns: NDArray[np.int64], rates: Array) -> Slerp:
-    """Integrate rates (M, 3), as if they were linear between the samples, by seconds."""
+    """Integrate rates (M, 3), linear between samples, to orientations over time in seconds."""
     stamps, first = np.unique(stamps_ns, return_index=True)
     rates = rates[first]
     if len(stamps) < _LEAST_PAIRS or not np.isfinite(rates).all():
-        raise DjetError(f'{len(stamps)} samples of the IMU, or some that are no rates, tell no '
-                        'offset; give a recording with a whole IMU')
+        raise DjetError(f'the IMU has {len(stamps)} samples, at least {_LEAST_PAIRS} are needed, '
+                        'all of them finite; name a recording with complete IMU data')
     h = np.diff(stamps)[:, None] * 1e-9
     steps = Rotation.from_rotvec(h * (rates[:-1] + rates[1:]) / 2).as_matrix()
     turned = np.empty((len(stamps), 3, 3))
@@ -126,23 +127,24 @@ def _orientations(stamps_ns: NDArray[np.int64], rates: Array) -> Slerp:
     return Slerp(stamps * 1e-9, Rotation.from_matrix(turned))
 
 
-def _felt(turns: VisualTurns, gyro: Slerp, offset: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Mean rates (N, 3) that the gyro felt, and (N,) bool where it covers the pair."""
-    start, end = turns.start_ns * 1e-9 + offset, turns.end_ns * 1e-9 + offset
+def _gyro_rates(rotations: VisualRotations, gyro: Slerp, offset: float
+                ) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the gyro's mean rates (N, 3) over the pairs, and (N,) bool, which pairs it covers."""
+    start, end = rotations.start_ns * 1e-9 + offset, rotations.end_ns * 1e-9 + offset
     known = np.asarray((start >= gyro.times[0]) & (end <= gyro.times[-1]))
-    felt = np.zeros((len(start), 3))
+    rates = np.zeros((len(start), 3))
     if known.any():
-        turn = gyro(start[known]).inv() * gyro(end[known])
-        felt[known] = turn.as_rotvec() / (end - start)[known, None]
-    return felt, known
+        rotation = gyro(start[known]).inv() * gyro(end[known])
+        rates[known] = rotation.as_rotvec() / (end - start)[known, None]
+    return rates, known
 
 
-def _misfit(turns: VisualTurns, seen: Array, gyro: Slerp, offset: float) -> float:
-    """Tell how differently fast the two turn, whatever their axes; infinite without an overlap."""
-    felt, known = _felt(turns, gyro, offset)
+def _misfit(rotations: VisualRotations, seen: Array, gyro: Slerp, offset: float) -> float:
+    """Return the median difference of the rates, infinite without overlap of the recordings."""
+    measured, known = _gyro_rates(rotations, gyro, offset)
     if known.sum() < _LEAST_PAIRS:
         return np.inf
-    # By a linear map, which takes in the mounting and the bias.
-    A = np.column_stack([felt[known], np.ones(known.sum())])
+    # After a linear map, which absorbs rotation and bias.
+    A = np.column_stack([measured[known], np.ones(known.sum())])
     left = seen[known] - A @ np.linalg.lstsq(A, seen[known], rcond=None)[0]
     return float(np.median(np.linalg.norm(left, axis=1)))

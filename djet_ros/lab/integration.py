@@ -1,4 +1,4 @@
-"""From the motions of pairs to a trajectory, with the lengths that the ground truth gives."""
+"""Integration of pairwise motions to a trajectory, with step lengths of the ground truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class StampedTrajectory:
     poses: Array
 
     def write_tum(self, path: Path) -> None:
-        """Write the file anew in TUM's format."""
+        """Write or replace a file in TUM's format."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         with TumWriter(path) as writer:
@@ -33,7 +33,7 @@ class StampedTrajectory:
 
 
 def true_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> StampedTrajectory:
-    """Ground truth over the longest run of pairs among the records of one method."""
+    """Return the ground truth over the longest run of consecutive pairs of one method."""
     sequence, frames = opened(dataset), _frames(_longest_run(records))
     assert sequence.poses is not None  # datasets without poses are refused at the start
     poses = sequence.poses[frames]
@@ -42,10 +42,10 @@ def true_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> StampedT
 
 def estimated_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> StampedTrajectory:
     """
-    Integrate the motions of one method over the longest run of pairs.
+    Integrate the motions of one method over the longest run of consecutive pairs.
 
-    Each unit translation gets its true length, which one camera cannot know. Where no pose was
-    told the camera stands still.
+    Each unit translation is scaled to its true length, which a single camera cannot observe.
+    Pairs without a pose contribute no motion.
     """
     truth = true_trajectory(dataset, records)
     lengths = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
@@ -56,7 +56,7 @@ def estimated_trajectory(dataset: Dataset, records: Sequence[PairRecord]) -> Sta
 
 
 def _camera_motion(record: PairRecord, length: float) -> Array:
-    """Pose (4, 4) of the current camera in the previous one."""
+    """Return the pose (4, 4) of the current camera in the previous one."""
     motion = np.eye(4)
     if math.isfinite(record.rotation_error_deg):
         motion[:3, :3] = Rotation.from_rotvec(record.rotation).as_matrix()

@@ -1,9 +1,9 @@
 """
-How far lengths drift, and whether they are as sure as they say: rendered ways, against the truth.
+Scale drift and consistency of the covariances of lengths, on rendered drives.
 
-Each way is gone twice over the same pictures. Once by images alone: the first step is the unit.
-Once with the camera's height in metres, and for a stretch without any ground in sight, as behind a
-lorry or before a wall: there landmarks have to carry the scale.
+The odometry runs twice on the same images: from images alone, with the first step as unit; and
+with the scale from the camera's height, while the ground is masked for some time, as if hidden by
+a lorry or a wall, so that landmarks have to propagate the scale.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-# Height of the rendered cars' cameras in metres, and from where on, as a share of the picture, all
-# below is hidden: above the nearest ground that is used.
+# Camera height of the rendered cars in metres.
 HEIGHT = 1.65
+# Share of the image height below which everything is masked, to hide all ground that is used.
 _HORIZON = 0.55
 
-# Frames before the ground goes out of sight, and after which the factor to metres is known.
+# Frames before the ground is masked, in which the metric scale is determined.
 _LEAD = 60
 
-# Steps to either side that a step's length is held against, and metres of stretches.
-_NEIGHBOURS, STRETCHES = 5, (25, 50, 100)
+# Steps to either side that a step's length is compared with, and segment lengths in metres.
+_NEIGHBOURS, SEGMENTS_M = 5, (25, 50, 100)
 
-# A stretch begins with every so many frames.
+# Frames between the starts of segments.
 _EVERY = 10
 
 
 @dataclass(frozen=True)
-class WayChunk:
-    """A way through a scene, in one place."""
+class DriveChunk:
+    """A drive through a scene, by its seed."""
 
     scene: str
     seed: int
@@ -57,26 +57,26 @@ class WayChunk:
 
     @property
     def name(self) -> str:
-        """Name that is the same in every run."""
+        """Return a name that is the same in every run."""
         return f'{self.scene}:{self.seed}'
 
     @property
     def count(self) -> int:
-        """How many pairs there are."""
+        """Return the number of pairs."""
         return self.frames - 1
 
 
 @dataclass(frozen=True)
-class Way:
+class Drive:
     """
-    What became of a way.
+    Results of a drive.
 
-    tracked: pairs with a motion; scale_change: scale of its last tenth over that of its first;
-    translation_percent, rotation_deg_per_100m: its drift, in its best unit; squares of errors over
-    their covariances, in the median over what that is if these are true: of the length of a step
-    against its neighbours, of the turn and the pose after 25, 50 and 100 m (see
-    ``stretch_squares``); hidden_length: length over the truth with the camera's height, where no
-    ground was seen. NaN where nothing is told.
+    tracked: pairs with a motion; scale_change: scale of the last tenth over that of the first;
+    translation_percent, rotation_deg_per_100m: drift after scale alignment; *_square_*: median
+    NEES over the median of its distribution, of the length of a step relative to its neighbours,
+    and of rotation and pose after 25, 50 and 100 m (see ``segment_squares``); hidden_length:
+    estimated over true path length with the camera's height, while no ground is visible. NaN if
+    undetermined.
     """
 
     scene: str
@@ -96,8 +96,8 @@ class Way:
     hidden_length: float
 
 
-def go(chunk: WayChunk, config: EstimatorConfig) -> list[Way]:
-    """Render a way, and go it by images alone and with the camera's height."""
+def run_drive(chunk: DriveChunk, config: EstimatorConfig) -> list[Drive]:
+    """Render a drive, and run the odometry from images alone and with the camera's height."""
     cv2.setNumThreads(1)
     scene = make_scene(chunk.scene, chunk.seed, chunk.size)
     poses = scene.trajectory(chunk.frames)
@@ -112,42 +112,42 @@ def go(chunk: WayChunk, config: EstimatorConfig) -> list[Way]:
         results[0].append(alone.process(Frame(gray, scene.K, stamp)))
         results[1].append(metric.process(Frame(
             gray, scene.K, stamp, left_out=ground if covered else None)))
-    return [way_of(chunk, poses, *results)]
+    return [drive_results(chunk, poses, *results)]
 
 
-def way_of(chunk: WayChunk, truth: Array, alone: Sequence[OdometryResult],
-           metric: Sequence[OdometryResult]) -> Way:
-    """Hold two runs over the same frames against true poses (N, 4, 4)."""
+def drive_results(chunk: DriveChunk, truth: Array, alone: Sequence[OdometryResult],
+                  metric: Sequence[OdometryResult]) -> Drive:
+    """Compare two runs over the same frames with true poses (N, 4, 4)."""
     found = np.array([result.pose for result in alone])
     unit = one_factor(found[:, :3, 3], truth[:, :3, 3])
     found[:, :3, 3] *= unit
-    told = drift(truth, found)
+    drifted = drift(truth, found)
     hidden = slice(_LEAD, _LEAD + chunk.hidden)
-    ways, true_ways = (np.linalg.norm(np.diff(way[:, :3, 3], axis=0), axis=1)[hidden]
-                       for way in (np.array([result.pose for result in metric]), truth))
-    stretches = [stretch_squares(truth, alone, metres) for metres in STRETCHES]
-    turns, poses = ([_median(squares[which], degrees) for squares in stretches]
-                    for which, degrees in ((0, 3), (1, 6)))
-    return Way(
+    steps, true_steps = (np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1)[hidden]
+                         for path in (np.array([result.pose for result in metric]), truth))
+    segments = [segment_squares(truth, alone, metres) for metres in SEGMENTS_M]
+    rotations, poses = ([_median(squares[which], degrees) for squares in segments]
+                        for which, degrees in ((0, 3), (1, 6)))
+    return Drive(
         chunk.scene, chunk.seed, len(truth), sum(one.status in TRACKED for one in alone),
         scale_change(found[:, :3, 3], truth[:, :3, 3]),
-        told.translation_percent if told else float('nan'),
-        told.rotation_deg_per_100m if told else float('nan'),
+        drifted.translation_percent if drifted else float('nan'),
+        drifted.rotation_deg_per_100m if drifted else float('nan'),
         _median(step_squares(truth, alone), 1),
-        turns[0], turns[1], turns[2], poses[0], poses[1], poses[2],
-        float(ways.sum() / true_ways.sum()) if chunk.hidden and true_ways.any() else float('nan'))
+        rotations[0], rotations[1], rotations[2], poses[0], poses[1], poses[2],
+        float(steps.sum() / true_steps.sum()) if chunk.hidden and true_steps.any()
+        else float('nan'))
 
 
 def step_squares(truth: Array, results: Sequence[OdometryResult]) -> Array:
     """
-    Squared errors of lengths over their variances, (M,), each against its neighbours.
+    Return the squared errors of lengths over their variances (M,), relative to neighbouring steps.
 
-    What the scale has drifted by before is no error of a step, so the factor between lengths and
-    the truth is that of the steps before and after. A part of a step's error is in all later
-    steps too: by that the scale wanders, as is told (see ``Common``), and where it is in
-    neighbours it cancels. With errors x_j, of which w_j stays, the logarithm of a length is off by
-    x_i + sum_(j<i) w_j, and what is weighed by c_i, one for the step and sharing out minus one
-    among its neighbours, by
+    Scale drift before a step is not its error, so lengths are compared with those of the steps
+    before and after. A part of each step's error persists in all later steps, as a random walk of
+    the scale (see ``Common``); it cancels as far as neighbours share it. With errors x_j, of which
+    w_j persists, the error of the logarithm of a length is x_i + sum_(j<i) w_j. The weighted sum,
+    with weights c_i of 1 for the step and in total -1 for its neighbours, then has the error
 
         sum_j (c_j x_j + (sum_(i>j) c_i) w_j) .
     """
@@ -159,25 +159,25 @@ def step_squares(truth: Array, results: Sequence[OdometryResult]) -> Array:
                      for index, _ in moved])
     ratios = np.log(np.array([_length(result) for _, result in moved]) / true)
     sigmas = np.array([_own_sigma(result) for _, result in moved])
-    wandered = np.array([_wandered(result) for _, result in moved])
+    wandered = np.array([_walk_variance(result) for _, result in moved])
     stay = np.sqrt(np.maximum(np.diff(wandered, prepend=0.0), 0.0))
     weights = np.full(2 * _NEIGHBOURS + 1, -1 / (2 * _NEIGHBOURS))
     weights[_NEIGHBOURS] = 1.0
     after = np.cumsum(weights[::-1])[::-1] - weights
     ratios, sigmas, stay = (sliding_window_view(values, len(weights))
                             for values in (ratios, sigmas, stay))
-    # An error and what stays of it are one and the same, so that they add up before the square.
+    # An error and its persistent part are fully correlated: add before squaring.
     variances = ((weights * sigmas + after * stay)**2).sum(1)
     return np.asarray((ratios @ weights)**2 / variances)
 
 
-def stretch_squares(truth: Array, results: Sequence[OdometryResult], metres: float
+def segment_squares(truth: Array, results: Sequence[OdometryResult], metres: float
                     ) -> tuple[Array, Array]:
     """
-    Squared errors of turns (M,) and poses (M,) over their covariances, after so many metres.
+    Return the NEES (M,) of rotations and (M,) of poses over segments of a length in metres.
 
-    From every tenth frame on, in the unit of the steps before it: what the scale has drifted by
-    before is no error of a stretch, and how sure that unit is belongs to it.
+    Segments start at every tenth frame. Their scale is that of the steps before the start, whose
+    variance is included: scale drift before a segment is not its error.
     """
     gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)))
     squares = []
@@ -191,20 +191,20 @@ def stretch_squares(truth: Array, results: Sequence[OdometryResult], metres: flo
                               rotation_log(true[:3, :3] @ pose[:3, :3].T)])
         squares.append([off[3:] @ np.linalg.solve(path.pose[3:, 3:], off[3:]),
                         off @ np.linalg.solve(path.pose, off)])
-    turns, poses = np.array(squares).reshape(-1, 2).T
-    return turns, poses
+    rotations, poses = np.array(squares).reshape(-1, 2).T
+    return rotations, poses
 
 
 def _unit_before(first: int, gone: Array, results: Sequence[OdometryResult]
                  ) -> tuple[float, float, float]:
-    """Give the unit of the steps to a frame, its variance, and how far it has wandered there."""
+    """Return (log scale, its variance, variance of the scale's walk) of the steps to a frame."""
     before = [index for index in range(first - _EVERY + 1, first + 1)
               if _length(results[index]) > 0 and gone[index] > gone[index - 1]]
     if not before:
         return 0.0, 0.0, 0.0
     logs = [np.log((gone[index] - gone[index - 1]) / _length(results[index])) for index in before]
-    wandered = np.array([_wandered(results[index]) for index in before])
-    here = _wandered(results[first])
+    wandered = np.array([_walk_variance(results[index]) for index in before])
+    here = _walk_variance(results[first])
     own = sum(_own_sigma(results[index])**2 for index in before) / len(before)**2
     # The variance of a mean of random walks is two thirds of the mean of their variances.
     return float(np.mean(logs)), own + 2 / 3 * float((here - wandered).mean()), here
@@ -213,9 +213,10 @@ def _unit_before(first: int, gone: Array, results: Sequence[OdometryResult]
 def _integrated(results: Sequence[OdometryResult], unit: float, variance: float, wandered: float
                 ) -> tuple[Array, PathCovariance]:
     """
-    Go on from the first of some results, as all were told, in a unit.
+    Integrate motions from the first result on; return the pose (4, 4) and its covariance.
 
-    It is given with its variance and how far the scale had wandered when it was told.
+    unit, variance: logarithm of the scale, and its variance; wandered: variance of the scale's
+    random walk at the start.
     """
     scaled = np.diag([np.exp(unit)] * 3 + [1.0] * 3)
     pose, path = np.eye(4), PathCovariance()
@@ -223,13 +224,13 @@ def _integrated(results: Sequence[OdometryResult], unit: float, variance: float,
         motion = np.linalg.inv(before.pose) @ result.pose
         motion[:3, 3] *= np.exp(unit)
         common = result.common and Common(np.array(
-            [variance + max(_wandered(result) - wandered, 0.0), 0.0]), np.ones(2))
+            [variance + max(_walk_variance(result) - wandered, 0.0), 0.0]), np.ones(2))
         path = path.moved(pose, motion, scaled @ result.motion_covariance @ scaled, common)
         pose = pose @ motion
     return pose, path
 
 
-def _wandered(result: OdometryResult) -> float:
+def _walk_variance(result: OdometryResult) -> float:
     return 0.0 if result.common is None else float(result.common.variances[0])
 
 
@@ -238,7 +239,7 @@ def _length(result: OdometryResult) -> float:
 
 
 def _own_sigma(result: OdometryResult) -> float:
-    """Give the standard deviation of a length, as a share of it."""
+    """Return the standard deviation of a length, as a share of it."""
     along = result.motion[:3, 3] / _length(result)
     return float(np.sqrt(along @ result.motion_covariance[:3, :3] @ along)) / _length(result)
 

@@ -1,4 +1,4 @@
-"""What a calibration leaves of distortion in the images of a recording."""
+"""Estimation of the residual radial distortion of a calibrated camera, from a recording."""
 
 from __future__ import annotations
 
@@ -27,37 +27,37 @@ from djet_ros.recordings.recording import Recording
 import numpy as np
 import yaml
 
-# Informative pairs that are needed, so that there are groups to compare; of more, every other one
-# is kept.
+# Fewest informative pairs, to have blocks for the jackknife, and most, beyond which every other
+# one is dropped.
 LEAST_PAIRS, MOST_PAIRS = 20, 2000
 
-# Standard errors, and pixels at the outermost matches, from which on a coefficient is worth
-# changing. By ten groups, errors are of a Student distribution of nine degrees of freedom, and 4.1
-# is there what three is of a normal one.
-_SURE, _VISIBLE = 4.1, 0.3
+# Standard errors, and pixels at the outermost matches, beyond which a correction is worthwhile.
+# With ten blocks the error has a Student distribution of nine degrees of freedom, for which 4.1
+# corresponds to 3 sigma of a normal distribution.
+_SIGNIFICANT_SIGMAS, _VISIBLE_PX = 4.1, 0.3
 
 # Standard errors by which more and less informative pairs may differ.
-_AGREE = 3.0
+_CONSISTENT_SIGMAS = 3.0
 
-# chosen: share by which a coefficient may change how far the camera turns; 0.07 was seen where
+# chosen: relative change of the total rotation that a coefficient may cause; 0.07 was seen where
 # 0.05 was right, and 0.44 where noise was taken for parallax.
-_SAME_TURN = 0.2
+_ROTATION_CHANGE = 0.2
 
-# rad; chosen: what a turn from one image to the next is good for.
-_HARDLY_TURNED = 1e-3
+# rad; chosen: accuracy of the rotation between consecutive images.
+_ROTATION_ACCURACY = 1e-3
 
-# Parts of the radius that the plot shows.
+# Number of rings of the radius in the plot.
 _RINGS = 8
 
 
 @dataclass(frozen=True)
 class LensReport:
     """
-    What was found of a camera's distortion.
+    Estimate of a camera's radial distortion.
 
-    info: its CameraInfo; rectified: whether its images come rectified, so that what distortion
-    they have is that of odometry.residual_k1 alone; pairs: how many were tracked in all; the fit
-    is that of the informative ones.
+    info: its CameraInfo; rectified: whether its images are rectified, so that their only
+    distortion model is odometry.residual_k1; pairs: number of tracked pairs; fit: estimate from
+    the informative ones.
     """
 
     camera: Camera
@@ -68,33 +68,33 @@ class LensReport:
 
     @property
     def coefficients(self) -> list[float]:
-        """Give the distortion as OpenCV has it, with the k1 that was found."""
+        """Return OpenCV's distortion coefficients, with the estimated k1."""
         return [self.fit.k1, *self.camera.distortion[1][1:].tolist()]
 
     @property
     def turned_deg(self) -> float:
-        """By how much the camera turns in the informative pairs, all in all."""
+        """Return the sum of the rotation angles of the informative pairs in degrees."""
         return float(np.degrees(sum(one.pair.angle for one in self.fit.linearised)))
 
     def moved_pixels(self, k1: float) -> float:
-        """By how many pixels a coefficient moves the outermost matches, at most."""
+        """Return the largest shift in pixels of the outermost matches by a coefficient."""
         places = outermost([one.pair for one in self.fit.linearised])
         moved = self.camera.pixels(places, k1)[0] - self.camera.pixels(places, self.camera.k1)[0]
         return float(np.linalg.norm(moved, axis=1).max())
 
     @property
     def worth_correcting(self) -> bool:
-        """Whether the calibration is wrong for certain, and by what can be seen."""
-        return (abs(self.fit.k1 - self.camera.k1) > _SURE * self.fit.sigma
-                and self.moved_pixels(self.fit.k1) > _VISIBLE)
+        """Return whether the error of the calibration is significant, and visible in pixels."""
+        return (abs(self.fit.k1 - self.camera.k1) > _SIGNIFICANT_SIGMAS * self.fit.sigma
+                and self.moved_pixels(self.fit.k1) > _VISIBLE_PX)
 
 
 def examine(recording: Recording, config: Config, advance: Callable[[], None]) -> LensReport:
     """
-    Run a recording through the odometry, and find the coefficient k1 that suits its pairs.
+    Run a recording through the odometry, and estimate the coefficient k1 from its pairs.
 
-    At most 2000 pairs of 300 matches are held, spread over all of it. DjetError where they do not
-    determine it.
+    At most 2000 pairs of 300 matches are kept, spread over the recording. Raises DjetError if they
+    do not determine k1.
     """
     informative, pairs, every = list[MatchedPair](), 0, 1
     for seen in _pairs(recording, config, advance):
@@ -113,37 +113,39 @@ def examine(recording: Recording, config: Config, advance: Callable[[], None]) -
 
 
 def _too_few(informative: int, pairs: int) -> str:
-    """Say what is missing: where most pairs are informative, there are just too few of them."""
-    said = (f'{informative} of {pairs} pairs are informative about the lens, and {LEAST_PAIRS} '
-            'are needed')
+    """Return the error message: too short, if most pairs are informative, or the wrong motion."""
+    text = (f'{informative} of {pairs} pairs are informative about the lens, at least '
+            f'{LEAST_PAIRS} are needed')
     if 2 * informative > pairs:
-        return f'{said}; record for longer'
-    return (f'{said}; record turns, or ways sideways, past what is near and far: straight ahead '
-            'tells nothing')
+        return f'{text}; record for longer'
+    return (f'{text}; record turns or sideways motion in a scene with depth: forward motion does '
+            'not determine k1')
 
 
 def trusted_fit(pairs: Sequence[MatchedPair], camera: Camera) -> LensFit:
-    """Find k1, and raise DjetError where something else seems to be wrong with the pairs."""
+    """Estimate k1; raise DjetError if the pairs contradict the model."""
     fit = fit_lens(pairs, camera)
     if fit is None:
-        raise DjetError(f'no k1 was found, from {camera.k1:.4g} on, that suits the pairs and does '
-                        'not fold the image: the camera matrix or other coefficients may be '
-                        'wrong; calibrate with a target first')
+        raise DjetError(f'no k1 was found, starting from {camera.k1:.4g}, that fits the pairs '
+                        'with an invertible distortion: the camera matrix or other coefficients '
+                        'may be wrong; calibrate with a target first')
     before, after = (sum(pair.angle for pair in some)
                      for some in (pairs, [one.pair for one in fit.linearised]))
-    if abs(after - before) > _SAME_TURN * before + _HARDLY_TURNED * len(pairs):
-        raise DjetError(f'with k1 = {fit.k1:.2g} the camera would turn by {np.degrees(after):.0f} '
-                        f'degrees, not {np.degrees(before):.0f}: turns pass for ways sideways '
-                        'here; record turns past what is near and far, without blur')
-    if fit.disagreement > _AGREE:
-        raise DjetError('the more informative pairs are at odds with the others, by '
-                        f'{fit.disagreement:.1f} standard errors: no k1 explains that, but '
-                        'rolling rows, blur or a wrong camera matrix may; record slower turns')
+    if abs(after - before) > _ROTATION_CHANGE * before + _ROTATION_ACCURACY * len(pairs):
+        raise DjetError(f'with k1 = {fit.k1:.2g} the total rotation would be '
+                        f'{np.degrees(after):.0f} degrees instead of {np.degrees(before):.0f}: '
+                        'rotation and sideways translation are confused; record turns in a scene '
+                        'with depth, without motion blur')
+    if fit.disagreement > _CONSISTENT_SIGMAS:
+        raise DjetError('the more informative pairs disagree with the others by '
+                        f'{fit.disagreement:.1f} standard errors: no k1 explains that, but a '
+                        'rolling shutter, motion blur or a wrong camera matrix may; record slower '
+                        'turns')
     return fit
 
 
 class _Pair(NamedTuple):
-    """A pair that was tracked, by a camera with a CameraInfo."""
+    """A tracked pair, its camera and CameraInfo."""
 
     camera: Camera
     info: Any
@@ -152,9 +154,9 @@ class _Pair(NamedTuple):
 
 def _tracker(recording: Recording, config: Config) -> Tracker:
     if config.odometry.mask:
-        raise DjetError('odometry.mask is true, and masks by stamp are not read here; give '
-                        'odometry.mask_file, or none')
-    # Lengths are of no use here, and what measures them is not read.
+        raise DjetError('odometry.mask is true, but this command does not read masks from a '
+                        'topic; set it to false, or use odometry.mask_file')
+    # The scale is irrelevant here, and its sources are not read.
     config = replace(config, odometry=replace(config.odometry, scale='none', imu=False,
                                               guess=False))
     return Tracker(config, message_type, image_topic=recording.image_topic,
@@ -162,7 +164,7 @@ def _tracker(recording: Recording, config: Config) -> Tracker:
 
 
 def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:
-    """Yield what the odometry makes of a recording; DjetError where another camera goes on."""
+    """Yield the pairs of a recording; raise DjetError if the camera changes."""
     tracker = _tracker(recording, config)
     camera: Camera | None = None
     info: Any = None
@@ -174,7 +176,7 @@ def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) ->
             if tracker.counts.rejected_infos and tracker.problem is not None:
                 raise tracker.problem
             if tracker.camera is not camera:
-                raise DjetError('another camera goes on in this recording; cut it there')
+                raise DjetError('the CameraInfo changes within this recording; split it there')
         elif topic == recording.image_topic:
             processed, last = tracker.counts.processed, None
             tracker.image(message)
@@ -213,7 +215,7 @@ def _matrix(values: Sequence[float], rows: int) -> dict[str, Any]:
 
 
 def plot_lens(path: Path, title: str, report: LensReport) -> None:
-    """Draw by how many pixels matches are off along the radius, and what k1 makes of that."""
+    """Plot the radial shift of matches in pixels by radius, and that of the estimated k1."""
     fit, camera = report.fit, report.camera
     radii = np.concatenate([np.linalg.norm(one.pair.y, axis=1) for one in fit.linearised])
     edges = np.linspace(0, float(np.quantile(radii, 0.999)), _RINGS + 1)
@@ -221,30 +223,30 @@ def plot_lens(path: Path, title: str, report: LensReport) -> None:
     k1, sigma = by_radius(fit, edges)
     with figure(path, 6.4, 4.2) as drawing:
         axes = drawing.subplots()
-        axes.axhline(0, color='black', lw=0.8, label='so far')
+        axes.axhline(0, color='black', lw=0.8, label='calibration')
         axes.plot(_radius(camera, fine), _outwards(camera, fine, fit.k1), color=COLOURS['rpe'],
                   label=f'k1 = {fit.k1:.4f} ± {fit.sigma:.4f}')
         off, width = (np.concatenate([_outwards(camera, at, one)
                                       for at, one in zip(middles[:, None], values)])
                       for values in (k1, camera.k1 + sigma))
         axes.errorbar(_radius(camera, middles), off, np.abs(width), fmt='o', ms=4,
-                      color=COLOURS['djet'], label='by matches in rings')
+                      color=COLOURS['djet'], label='matches, by ring')
         axes.set_xlabel('distance from the principal point, px')
-        axes.set_ylabel('seen too far out, px')
+        axes.set_ylabel('outward shift, px')
         axes.set_title(title)
         axes.legend()
 
 
 def _radius(camera: Camera, radii: Array) -> Array:
-    """Pixels (N,) from the middle at which points of radii X/Z (N,) are seen, as calibrated."""
+    """Return the image radii (N,) in pixels of points of radii X/Z (N,), as calibrated."""
     return np.asarray(_along(camera, radii, camera.k1) - _along(camera, np.zeros(1), camera.k1))
 
 
 def _outwards(camera: Camera, radii: Array, k1: float) -> Array:
-    """By how many pixels (N,) a coefficient moves points of radii X/Z (N,) outwards."""
+    """Return the outward shift (N,) in pixels of points of radii X/Z (N,) by a coefficient."""
     return np.asarray(_along(camera, radii, k1) - _along(camera, radii, camera.k1))
 
 
 def _along(camera: Camera, radii: Array, k1: float) -> Array:
-    """Columns (N,) in which points of X/Z (N,) and Y/Z = 0 are seen."""
+    """Return the image columns (N,) of points of X/Z (N,) and Y/Z = 0."""
     return camera.pixels(np.stack([radii, np.zeros_like(radii)], axis=-1), k1)[0][:, 0]

@@ -1,4 +1,4 @@
-"""Who takes part in an evaluation: our methods and their peers, each with its parameters."""
+"""Methods of an evaluation, ours and those of other libraries, with their parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from djet_ros.libraries import how_to_get
 PEERS = {'opencv_ransac': 'cv2', 'usac_magsac': 'cv2', 'poselib': 'poselib',
          'sift_poselib': 'poselib', 'klt_poselib': 'poselib'}
 
-# All methods in the order of tables, and what people call them.
+# All methods in the order of tables, with their printed names.
 TITLES = {'djet': 'D-JET', 'rpe': 'RP-E', 'pjet': 'P-JET', 'five_point': '5-P',
           'opencv_ransac': 'RANSAC', 'usac_magsac': 'MAGSAC++',
           'poselib': 'PoseLib', 'sift_poselib': 'SIFT+PL', 'klt_poselib': 'KLT+PL'}
@@ -26,12 +26,12 @@ class Method:
     """
     A method with all of its parameters.
 
-    name: one of TITLES; preset: where the parameters come from; change: what differs from it, in
-    words, empty if nothing does; good_start: whether the pose of RP-E, preset best, is given as
-    one more start, and only the matches that agree with it; on_places: whether matches begin where
-    D-JET's gray levels have them, seen through the warps of its pose; weighed: whether these count
-    as exact as gray levels say. Peers take their matches and their RANSAC threshold from config,
-    but for those that are whole chains (see chains), which take nothing.
+    name: one of TITLES; preset: source of the parameters; change: description of the difference
+    to the preset, '' if there is none; good_start: whether to add the pose of RP-E, preset best,
+    as an initial pose, and use only its inliers as matches; on_places: whether matches are first
+    refined by D-JET's gray-level alignment, with the warps of its pose; weighed: whether they are
+    then weighted by the covariances of that alignment. Methods of other libraries take matches and
+    RANSAC threshold from config, except for complete pipelines (see chains), which do not use it.
     """
 
     name: str
@@ -43,22 +43,22 @@ class Method:
     weighed: bool = False
 
     def settings(self) -> dict[str, Any]:
-        """Everything that decides the results, as plain values."""
+        """Return everything that decides the results, as plain values."""
         values = asdict(self)
         return {'method': values.pop('name'), **values}
 
 
 def default_methods() -> tuple[str, ...]:
-    """Give our methods and those of the peers that are installed."""
+    """Return our methods, and those of the installed other libraries."""
     return tuple(name for name in TITLES if name not in PEERS or find_spec(PEERS[name]))
 
 
 def make_methods(names: Sequence[str], presets: Sequence[str],
                  values: Mapping[str, Any]) -> list[Method]:
     """
-    Let every method start with every preset, with some values of both changed.
+    Return every method with every preset; values: parameters that override the presets.
 
-    Raises DjetError on unknown names and on peers that are not installed.
+    Raises DjetError on unknown names and on libraries that are not installed.
     """
     check_methods(names)
     check_names('preset', presets, PRESETS)
@@ -67,7 +67,7 @@ def make_methods(names: Sequence[str], presets: Sequence[str],
 
 
 def configured(method: str, preset_name: str, values: Mapping[str, Any]) -> EstimatorConfig:
-    """Parameters of a method; peers have those of the 5-point method. DjetError on bad values."""
+    """Return the parameters of a method (other libraries: of the 5-point). Raises DjetError."""
     own = method if method in METHODS else 'five_point'
     try:
         return preset(preset_name, **{**values, 'method': own})
@@ -76,7 +76,7 @@ def configured(method: str, preset_name: str, values: Mapping[str, Any]) -> Esti
 
 
 def check_methods(methods: Sequence[str]) -> None:
-    """Raise DjetError on unknown, repeated or missing methods."""
+    """Raise DjetError on unknown, repeated or uninstalled methods, or if there is none."""
     check_names('method', methods, TITLES)
     for method in methods:
         if method in PEERS and find_spec(PEERS[method]) is None:
@@ -85,7 +85,7 @@ def check_methods(methods: Sequence[str]) -> None:
 
 
 def check_names(what: str, given: Sequence[str], known: Iterable[str]) -> None:
-    """Raise DjetError on the first name that is not known or comes twice, or if none is given."""
+    """Raise DjetError on the first name that is unknown or repeated, or if none is given."""
     choices = list(known)
     for index, name in enumerate(given):
         if name not in choices:

@@ -1,4 +1,4 @@
-"""The unit of work: some consecutive pairs of one sequence, estimated by every method."""
+"""Evaluation of a chunk of consecutive pairs of one sequence by every method."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-# What an odometry could not live with, in degrees; FAILURE says it in words.
+# Errors in degrees beyond which a pair has failed; FAILURE describes them.
 GROSS_ROTATION = 1.0
 GROSS_TRANSLATION = 10.0
-FAILURE = (f'no pose, rotation off by more than {GROSS_ROTATION:g} deg, or direction of '
-           f'translation unknown or off by more than {GROSS_TRANSLATION:g} deg')
+FAILURE = (f'no pose, a rotation error above {GROSS_ROTATION:g} deg, or a translation direction '
+           f'that is undetermined or has an error above {GROSS_TRANSLATION:g} deg')
 
 
 @dataclass(frozen=True)
@@ -42,19 +42,19 @@ class PairChunk:
 
     @property
     def name(self) -> str:
-        """Name that is the same in every run."""
+        """Return a name that is the same in every run."""
         return f'{self.dataset.name}:{self.first}+{self.count}'
 
 
 @dataclass(frozen=True)
 class PairRecord:
     """
-    What one method made of one pair of frames.
+    Result of one method on one pair of frames.
 
-    previous, current: indices of the frames in their sequence; errors in degrees, NaN where the
-    estimate or the truth does not tell; failed: see FAILURE; hamming_mean: bits, over the
-    inliers; rotation (vector in rad) and translation (unit length): the current camera in the
-    previous one; milliseconds: features of one frame, matching and estimation together.
+    previous, current: indices of the frames in their sequence; errors in degrees, NaN if estimate
+    or truth is undetermined; failed: see FAILURE; hamming_mean: bits, over the inliers; rotation
+    (vector in rad) and translation (unit length): pose of the current camera in the previous one;
+    milliseconds: features of one frame, matching and estimation together.
     """
 
     sequence: str
@@ -78,12 +78,12 @@ class PairRecord:
 
 def evaluate_chunk(chunk: PairChunk, methods: Sequence[Method]) -> list[PairRecord]:
     """
-    Estimate the pairs of a chunk by every method; pairs without ground truth are left out.
+    Estimate the pairs of a chunk by every method; pairs without ground truth are omitted.
 
-    Each pair is estimated on its own, without the motion before it as a start, so that the
-    records do not depend on how pairs are spread over workers.
+    Each pair is estimated by itself, without a motion prior, so that the records do not depend on
+    the distribution of pairs over workers.
     """
-    # Workers are as many as cores: threads of their own would only be in each other's way.
+    # There is a worker per core: more threads would only compete.
     cv2.setNumThreads(1)
     sequence, frames = opened(chunk.dataset), chunk.dataset.frames
     assert sequence.poses is not None  # datasets without poses are refused at the start
@@ -102,12 +102,12 @@ def evaluate_chunk(chunk: PairChunk, methods: Sequence[Method]) -> list[PairReco
 
 
 @dataclass(frozen=True)
-class Given:
+class MethodInput:
     """
-    What a method is given: two views, matches x, y (N, 2) in pixels, perhaps a good start.
+    Input of a method: two views, matches x, y (N, 2) in pixels, and optionally an initial pose.
 
-    seconds: what the features of one view and the matches took; covariances: (N, 2, 2) of y, where
-    the method counts by them.
+    seconds: time for the features of one view and the matching; covariances: (N, 2, 2) of y, if
+    the method weights by them.
     """
 
     views: tuple[View, View]
@@ -118,8 +118,8 @@ class Given:
     covariances: Array | None = None
 
 
-def estimate(method: Method, given: Given) -> RelativePose:
-    """Estimate a pair by a method."""
+def estimate(method: Method, given: MethodInput) -> RelativePose:
+    """Estimate the relative pose of a pair by a method."""
     config = method.config
     if method.on_places:
         given = _with_places(method, given)
@@ -132,25 +132,25 @@ def estimate(method: Method, given: Given) -> RelativePose:
 
 class _Image:
     """
-    An image, its features, and its views.
+    An image with its features and views.
 
-    Each is made once for all methods whose settings decide the same about it.
+    Each is computed once for all methods with the same relevant settings.
     """
 
     def __init__(self, frame: Frame) -> None:
         self._gray, self.K, self._left_out = frame.gray, frame.K, frame.left_out
-        # The same for all methods: where none may have a feature.
+        # Excluded from detection, for all methods alike.
         self._mask = None if frame.left_out is None else blocked(frame.left_out)
         self._features: dict[Any, tuple[Features, float]] = {}
         self._views: dict[Any, tuple[View, float]] = {}
         self._points: dict[str, tuple[Points, float]] = {}
 
     def view(self, method: Method) -> tuple[View, float]:
-        """Give the view with its features, and the seconds that they took."""
+        """Return the view with its features, and the seconds that they took."""
         config = method.config
         detected = (config.detector, config.max_features, config.fast_threshold,
                     config.corner_contrast)
-        # A view holds, beside its features, the image as the tests of surfaces see it.
+        # A view also holds the image smoothed for the tests of the surfaces.
         key = (*detected, config.patch_scale, config.grading > 0)
         if key not in self._views:
             features, seconds = self._found(detected, TwoViewEstimator(config))
@@ -160,7 +160,7 @@ class _Image:
         return self._views[key]
 
     def _found(self, detected: Any, estimator: TwoViewEstimator) -> tuple[Features, float]:
-        """Give the features of these settings of the detector, and their seconds."""
+        """Return the features of these settings of the detector, and their seconds."""
         if detected not in self._features:
             start = perf_counter()
             features = estimator.features(self._gray, self._mask)
@@ -168,7 +168,7 @@ class _Image:
         return self._features[detected]
 
     def points(self, method: str) -> tuple[Points, float]:
-        """Give the points of a chain of that name, and the seconds that they took."""
+        """Return the points of a chain of that name, and the seconds that they took."""
         if method not in self._points:
             start = perf_counter()
             points = CHAINS[method].detect(self._gray, self._mask)
@@ -182,15 +182,15 @@ class _Image:
 
 
 class _SharedWork:
-    """What all methods with the same settings share in a pair: two views and their matches."""
+    """Views and matches of a pair, shared by all methods with the same settings."""
 
     def __init__(self, previous: _Image, current: _Image) -> None:
         self._images = previous, current
-        self._given: dict[Any, Given] = {}
+        self._given: dict[Any, MethodInput] = {}
         self._chained: dict[str, tuple[RelativePose, float]] = {}
 
     def result(self, method: Method) -> tuple[RelativePose, int, float]:
-        """Give what the method finds, of how many matches, and its seconds in all."""
+        """Return the pose by a method, the number of matches, and the total time in seconds."""
         if method.name in CHAINS:
             found, seconds = self._by_chain(method.name)
             return found, len(found.x), seconds
@@ -200,34 +200,34 @@ class _SharedWork:
         return found, len(given.x), given.seconds + perf_counter() - start
 
     def _by_chain(self, method: str) -> tuple[RelativePose, float]:
-        """Give what a chain finds: the same, whatever preset it stands beside."""
+        """Return the pose by a complete pipeline, which does not depend on the preset."""
         if method not in self._chained:
             (previous, _), (current, seconds) = (image.points(method) for image in self._images)
             start = perf_counter()
             found = CHAINS[method].estimate(previous, current, self._images[1].K)
             seconds += perf_counter() - start
             if found.status is Status.OK:
-                # What descriptors say of its matches is no part of it, and not of its time.
+                # Hamming distances are for comparison only: not part of the method, nor timed.
                 smoothed = [image.smoothed for image in self._images]
                 found = replace(found, hamming=match_distances(smoothed[0], found.x, smoothed[1],
                                                                found.y_opt))
             self._chained[method] = found, seconds
         return self._chained[method]
 
-    def given(self, method: Method) -> Given:
-        """Give what the method starts from."""
+    def given(self, method: Method) -> MethodInput:
+        """Return the input of a method."""
         (previous, _), (current, seconds) = (image.view(method) for image in self._images)
         key = (id(previous), method.config.search_radius, method.good_start)
         if key not in self._given:
             start = perf_counter()
             x, y = TwoViewEstimator(method.config).match(previous, current)
-            given = Given((previous, current), x, y, None, seconds + perf_counter() - start)
+            given = MethodInput((previous, current), x, y, None, seconds + perf_counter() - start)
             self._given[key] = _with_good_start(given) if method.good_start else given
         return self._given[key]
 
 
-def _with_good_start(given: Given) -> Given:
-    """Add the robust pose that RP-E finds, and keep the matches that agree with it."""
+def _with_good_start(given: MethodInput) -> MethodInput:
+    """Add the robust pose of RP-E as initial pose, and keep its inliers."""
     robust = TwoViewEstimator(preset('best', method='rpe')).estimate_matched(
         *given.views, given.x, given.y)
     if not robust.inliers.any():
@@ -235,8 +235,8 @@ def _with_good_start(given: Given) -> Given:
     return replace(given, x=robust.x[robust.inliers], y=robust.y[robust.inliers], start=robust)
 
 
-def _with_places(method: Method, given: Given) -> Given:
-    """Take the matches that voted in D-JET to where gray levels have them; as they are without."""
+def _with_places(method: Method, given: MethodInput) -> MethodInput:
+    """Return the matches refined by D-JET's gray-level alignment, or the input if none is."""
     config = replace(method.config, method='djet')
     found = TwoViewEstimator(config).estimate_matched(*given.views, given.x, given.y, given.start)
     voting = found.voting
@@ -267,8 +267,8 @@ def _record(dataset: Dataset, pair: int, method: Method, shared: _SharedWork,
 
 def has_failed(rotation_error_deg: float, translation_error_deg: float,
                true_motion: Array) -> bool:
-    """Tell whether errors against the true motion (4, 4) are what FAILURE says."""
-    # Comparisons with NaN are false, so that what is unknown fails as well.
+    """Return whether errors against the true motion (4, 4) are a failure, see FAILURE."""
+    # Comparisons with NaN are false, so that undetermined errors are failures too.
     return not (rotation_error_deg <= GROSS_ROTATION
                 and (translation_error_deg <= GROSS_TRANSLATION or not has_direction(true_motion)))
 

@@ -1,4 +1,4 @@
-"""Parts of the figures that show residual surfaces: patches, heat maps, paraboloids."""
+"""Building blocks of plots of Hamming surfaces: patches, heat maps, paraboloids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from matplotlib.patches import Rectangle
 import numpy as np
 from numpy.typing import NDArray
 
-# Warm is alike, as in the paper; half of all bits differ between descriptors of different places.
+# Warm colours are small distances, as in the paper. The scale ends at 128 of 256 bits, the
+# expectation for unrelated points.
 _COLOURS = 'inferno_r'
 _BITS = Normalize(0, 128)
 _MARK: dict[str, Any] = {'ls': 'none', 'markeredgecolor': 'black', 'zorder': 5}
@@ -22,7 +23,7 @@ _MARK: dict[str, Any] = {'ls': 'none', 'markeredgecolor': 'black', 'zorder': 5}
 
 def draw_patch(axes: Axes, gray: NDArray[np.uint8], centre: NDArray[np.int64],
                radius: int) -> None:
-    """Show the image (H, W) around a pixel with all its contrast, in pixels of the image."""
+    """Draw the image (H, W) around a pixel, with stretched contrast, in image coordinates."""
     x, y = centre.tolist()
     patch = gray[y - radius:y + radius + 1, x - radius:x + radius + 1]
     axes.imshow(patch, cmap='gray', extent=_extent(centre, radius))
@@ -33,13 +34,13 @@ def draw_patch(axes: Axes, gray: NDArray[np.uint8], centre: NDArray[np.int64],
 
 def draw_heat(axes: Axes, surface: NDArray[np.uint16], centre: NDArray[np.int64],
               opacity: float) -> None:
-    """Lay a Hamming surface (P, P) in bits, sampled around a pixel, over what is shown."""
+    """Overlay a Hamming surface (P, P) in bits, sampled around a pixel."""
     axes.imshow(surface, cmap=_COLOURS, norm=_BITS, alpha=opacity,
                 extent=_extent(centre, len(surface) // 2))
 
 
 def draw_paraboloid(axes: Axes, fits: Paraboloids, index: int, window: int) -> None:
-    """Draw the contours of a paraboloid in its window, and its minimum where it has one."""
+    """Draw the contours of a paraboloid in its window, and its minimum if it has one."""
     radius, centre = window / 2, fits.centres[index]
     axes.add_patch(Rectangle((centre[0] - radius, centre[1] - radius), window, window,
                              fill=False, edgecolor='white', lw=1.2, ls=(0, (3, 2))))
@@ -54,12 +55,12 @@ def draw_paraboloid(axes: Axes, fits: Paraboloids, index: int, window: int) -> N
 
 
 def draw_point(axes: Axes, place: Array, marker: str, colour: str, size: float = 8) -> None:
-    """Mark a place (2,) in pixels of the image."""
+    """Mark a point (2,) in pixels."""
     axes.plot(place[0], place[1], marker=marker, ms=size, color=colour, **_MARK)
 
 
 def paraboloid_values(fits: Paraboloids, index: int, places: Array) -> Array:
-    """Values (M,) of one of the paraboloids at places (M, 2)."""
+    """Return the values (M,) of one paraboloid at points (M, 2)."""
     times = np.full(len(places), index)
     one = Paraboloids(fits.centres[times], fits.A[times], fits.b[times], fits.c[times],
                       fits.usable[times])
@@ -67,13 +68,13 @@ def paraboloid_values(fits: Paraboloids, index: int, places: Array) -> Array:
 
 
 def limit(axes: Axes, centre: Array, radius: float) -> None:
-    """Show the square around a place, y downwards."""
+    """Limit the axes to the square around a point, y downwards."""
     axes.set_xlim(centre[0] - radius - 0.5, centre[0] + radius + 0.5)
     axes.set_ylim(centre[1] + radius + 0.5, centre[1] - radius - 0.5)
 
 
 def add_scale(drawing: Figure, panels: Any) -> None:
-    """Add the scale of the heat maps beside some panels."""
+    """Add the colour bar of the heat maps."""
     drawing.colorbar(ScalarMappable(_BITS, _COLOURS), ax=panels, extend='max', shrink=0.8,
                      label='Hamming distance, bits')
 

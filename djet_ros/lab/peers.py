@@ -1,7 +1,7 @@
 """
-Relative pose by other libraries, as their manuals show it, on the matches that ours get.
+Relative pose by other libraries, as documented by them, on the same matches as our methods.
 
-Where a default would hold one of them back, it is set, and stands here.
+Defaults that would put one of them at a disadvantage are changed here.
 """
 
 from __future__ import annotations
@@ -16,33 +16,34 @@ from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
-# R (3, 3), t (3,) and the inliers (N,) bool, or None where nothing was found.
+# R (3, 3), t (3,) and the inliers (N,) bool, or None if no pose was found.
 Found = tuple[Array, Array, NDArray[np.bool_]] | None
 
-# Of OpenCV's searches; that of all its examples.
+# Confidence of OpenCV's RANSAC, as in its examples.
 CONFIDENCE = 0.999
-# Baselines beyond which a point has no vote between the four poses of an essential matrix. By
-# default 50, beyond which all points are where a hand moves a camera a millimetre or two.
+# Depth in baselines beyond which points are ignored in the chirality check of recoverPose. Its
+# default of 50 excludes all points if a hand-held camera moves by a millimetre or two.
 FARTHEST = 1e6
-# Pixels where PoseLib's refinement bends its Cauchy loss, instead of its own 0.5: see ``chains``.
+# Scale in pixels of the Cauchy loss in PoseLib's refinement, instead of its default, half the
+# threshold: see ``chains``.
 LOSS_SCALE = 0.25
 
 
 def opencv_ransac(K: Array, x: Array, y: Array, threshold: float) -> Found:
-    """Find the pose by findEssentialMat with plain RANSAC, and recoverPose."""
+    """Estimate the pose by findEssentialMat with plain RANSAC, and recoverPose."""
     return _opencv(cv2.RANSAC, K, x, y, threshold)
 
 
 def usac_magsac(K: Array, x: Array, y: Array, threshold: float) -> Found:
-    """Find the pose by findEssentialMat with MAGSAC++, and recoverPose."""
+    """Estimate the pose by findEssentialMat with MAGSAC++, and recoverPose."""
     return _opencv(cv2.USAC_MAGSAC, K, x, y, threshold)
 
 
 def poselib(K: Array, x: Array, y: Array, threshold: float) -> Found:
-    """Find the pose by PoseLib's LO-RANSAC, refined; all but LOSS_SCALE is at its defaults."""
+    """Estimate the pose by PoseLib's LO-RANSAC, refined; all but LOSS_SCALE are defaults."""
     import poselib as library
 
-    # The image size is part of a camera there, but not of this estimate.
+    # PoseLib's cameras have an image size, which this estimate does not use.
     camera = {'model': 'PINHOLE', 'width': int(2 * K[0, 2]), 'height': int(2 * K[1, 2]),
               'params': [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
     pose, info = library.estimate_relative_pose(
@@ -57,9 +58,9 @@ ESTIMATORS: dict[str, Callable[[Array, Array, Array, float], Found]] = {
 def estimate(name: str, previous: View, current: View, x: Array, y: Array, threshold: float,
              min_matches: int) -> RelativePose:
     """
-    Estimate the pose of matches x, y (N, 2) in pixels by the peer of that name.
+    Estimate the pose of matches x, y (N, 2) in pixels by the named method.
 
-    Matches end on their epipolar line at the place nearest to y, as with re-projection error.
+    y_opt is the point of the epipolar line nearest to y, as with reprojection error.
     """
     if len(x) < min_matches:
         return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
@@ -71,7 +72,7 @@ def estimate(name: str, previous: View, current: View, x: Array, y: Array, thres
 
 
 def as_relative_pose(found: Found, K: Array, x: Array, y: Array) -> RelativePose:
-    """Say what was found for matches x, y (N, 2) in our words, without Hamming distances."""
+    """Convert a result for matches x, y (N, 2) to a RelativePose without Hamming distances."""
     if found is None or not (np.isfinite(found[0]).all() and found[1].any()):
         return RelativePose(Status.DEGENERATE, x=x, y=y)
     R, t, inliers = found[0], unit(found[1]), found[2]

@@ -15,7 +15,7 @@ import numpy as np
 
 _KINDS = (('rotation_error_deg', 'rotation error, deg', GROSS_ROTATION),
           ('translation_error_deg', 'translation error, deg', GROSS_TRANSLATION))
-# Where errors of zero are drawn, in degrees.
+# Value in degrees at which errors of zero are drawn on logarithmic axes.
 _NO_ERROR = 1e-6
 
 # Records of one sequence by preset and method.
@@ -23,7 +23,7 @@ Groups = dict[str, dict[str, list[PairRecord]]]
 
 
 def grouped(records: Sequence[PairRecord]) -> Groups:
-    """Sort the records of one sequence by preset and method."""
+    """Group the records of one sequence by preset and method."""
     groups: Groups = {}
     for record in records:
         groups.setdefault(record.preset, {}).setdefault(record.method, []).append(record)
@@ -31,7 +31,7 @@ def grouped(records: Sequence[PairRecord]) -> Groups:
 
 
 def plot_errors_by_frame(path: Path, title: str, groups: Groups) -> None:
-    """Draw the error of every pair along the sequence."""
+    """Plot the error of every pair along the sequence."""
     def draw(axes: Axes, methods: dict[str, list[PairRecord]], kind: str) -> None:
         for method, records in methods.items():
             axes.plot([record.current for record in records], _errors(records, kind),
@@ -43,7 +43,7 @@ def plot_errors_by_frame(path: Path, title: str, groups: Groups) -> None:
 
 
 def plot_cumulative(path: Path, title: str, groups: Groups) -> None:
-    """Draw which share of all pairs has an error below a limit; pairs without a pose have not."""
+    """Plot the cumulative distribution of errors over all pairs, also those without a pose."""
     def draw(axes: Axes, methods: dict[str, list[PairRecord]], kind: str) -> None:
         for method, records in methods.items():
             known = np.sort([e for e in _errors(records, kind) if np.isfinite(e)])
@@ -55,11 +55,11 @@ def plot_cumulative(path: Path, title: str, groups: Groups) -> None:
         axes.set_ylabel('share of pairs, %')
         axes.set_xlabel({name: label for name, label, _ in _KINDS}[kind])
 
-    _panels(path, f'{title}: share of pairs below an error', groups, draw, share_x=True)
+    _panels(path, f'{title}: cumulative distribution of errors', groups, draw, share_x=True)
 
 
 def plot_boxes(path: Path, title: str, groups: Groups) -> None:
-    """Draw the distribution of errors of each method: quartiles, and 5 % and 95 % whiskers."""
+    """Plot the errors of each method as boxes: quartiles, and 5 % and 95 % whiskers."""
     def draw(axes: Axes, methods: dict[str, list[PairRecord]], kind: str) -> None:
         values = [[e for e in _errors(records, kind) if np.isfinite(e)]
                   for records in methods.values()]
@@ -78,9 +78,9 @@ def plot_boxes(path: Path, title: str, groups: Groups) -> None:
 
 def plot_trajectories(path: Path, title: str, truth: StampedTrajectory,
                       estimates: dict[str, dict[str, StampedTrajectory]]) -> None:
-    """Draw trajectories from above, by preset and method; lengths are those of the truth."""
+    """Plot trajectories from above, by preset and method."""
     with figure(path, 5.2 * len(estimates), 5.2) as drawing:
-        drawing.suptitle(f'{title}: seen from above, lengths from the ground truth')
+        drawing.suptitle(f'{title}: seen from above, step lengths from ground truth')
         panels = drawing.subplots(1, len(estimates), squeeze=False)[0]
         for axes, (preset, methods) in zip(panels, estimates.items()):
             axes.plot(truth.poses[:, 0, 3], truth.poses[:, 2, 3], color='black', lw=2.5,
@@ -99,7 +99,7 @@ def _panels(path: Path, title: str, groups: Groups,
             draw: Callable[[Axes, dict[str, list[PairRecord]], str], None], *,
             share_x: bool = False, share_y: bool = False, legend: bool = True) -> None:
     with figure(path, 5.2 * len(groups), 6.4) as drawing:
-        drawing.suptitle(f'{title} (dashed: more is a failure)')
+        drawing.suptitle(f'{title} (dashed: threshold of failure)')
         panels = drawing.subplots(2, len(groups), squeeze=False,
                                   sharex='row' if share_x else False,
                                   sharey='row' if share_y else False)
@@ -123,5 +123,5 @@ def _legend(drawing: Any, axes: Axes) -> None:
 
 
 def _errors(records: Sequence[PairRecord], kind: str) -> list[float]:
-    # A logarithmic axis has no zero; the truth of rendered frames is exact, and errors are small.
+    # Logarithmic axes have no zero, and errors on rendered frames can be zero.
     return [error or _NO_ERROR for error in (getattr(record, kind) for record in records)]

@@ -1,4 +1,4 @@
-"""Which code and which libraries made results: what tells one run's figures from another's."""
+"""Provenance of results: a digest of the code, and the versions of libraries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import djet_ros
 
 
 def digest_of_the_code(more: Iterable[Path] = ()) -> str:
-    """Tell one state of the package, and of more files, from another."""
+    """Return a digest of the package's code, and of more files."""
     digest = hashlib.sha256(_package())
     for path in more:
         digest.update(path.read_bytes())
@@ -21,7 +21,7 @@ def digest_of_the_code(more: Iterable[Path] = ()) -> str:
 
 @cache
 def _package() -> bytes:
-    """Digest the package, as it is when the program first asks."""
+    """Return a digest of the package at the first call."""
     digest, folder = hashlib.sha256(), Path(djet_ros.__file__).parent
     for path in sorted(path for kind in ('*.py', '*.c', '*.h') for path in folder.rglob(kind)):
         digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
@@ -29,7 +29,7 @@ def _package() -> bytes:
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Give the installed versions of distributions by their names."""
+    """Return the installed versions of distributions by their names."""
     return {name: _version(name) for name in packages}
 
 

@@ -1,8 +1,8 @@
 """
-The figures that the paper prints, to stand beside ours.
+Results published in the paper, for comparison.
 
-Taken from its tables as they are: mean errors over all frames of a sequence, in what the tables
-call degrees, and mean Hamming distances in bits.
+Copied from its tables: mean errors over all frames of a sequence, in what the tables call
+degrees, and mean Hamming distances in bits.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One method's printed means; window: side of the sampling area where the table varies it."""
+    """Published means of one method; window: side of the sampling window, if varied."""
 
     method: str
     rotation_deg: float

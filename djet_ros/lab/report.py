@@ -40,11 +40,11 @@ from djet_ros.lab.tables import (
 )
 from djet_ros.recordings.outputs import write_whole
 
-CAPTION = ('Errors of relative poses against the ground truth in degrees, of rotation (rot.) and '
-           'of the direction of translation (tr.); Hamming distances in bits; milliseconds a '
-           f'pair. Failed are pairs with {FAILURE}. Means, medians and p95 are over the pairs '
-           'that a method told; bold is the least of them, if no other method told more pairs.')
-PUBLISHED_NOTE = ' What stands under "the paper" is printed there, for the whole sequence.'
+CAPTION = ('Errors of relative poses against ground truth in degrees, of rotation (rot.) and '
+           'translation direction (tr.); Hamming distances in bits; milliseconds per pair. '
+           f'Failed: {FAILURE}. Means, medians and p95 are over the pairs that a method '
+           'estimated (pairs); the smallest is bold, if no other method estimated more pairs.')
+PUBLISHED_NOTE = ' Rows of "the paper" are the published values, for the whole sequence.'
 
 _CSS = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem;
@@ -84,7 +84,7 @@ Estimates = dict[str, dict[str, StampedTrajectory]]
 
 @dataclass(frozen=True)
 class Picture:
-    """A plot of the page: where it is, and what it shows in words."""
+    """A plot of the page: its path and description."""
 
     path: Path
     text: str
@@ -93,9 +93,9 @@ class Picture:
 def write_report(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method],
                  records: Sequence[PairRecord], *, with_evo: bool = False) -> list[Table]:
     """
-    Write everything but the records' store into the folder; gives the readable tables.
+    Write everything but the record store into the folder; return the readable tables.
 
-    with_evo adds evo's metrics of the trajectories.
+    with_evo: whether to add evo's metrics of the trajectories.
     """
     rows = table_rows(records)
     printed = {dataset.name: TABLE_1[dataset.benchmark] for dataset in datasets
@@ -128,12 +128,12 @@ def write_report(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Me
 
 
 def trajectory_file(folder: Path, sequence: str, preset: str, method: str) -> Path:
-    """Where the trajectory of a method stands."""
+    """Return the path of the trajectory of a method."""
     return folder / 'trajectories' / sequence / f'{method}_{preset}.tum'
 
 
 def truth_file(folder: Path, sequence: str) -> Path:
-    """Where the ground truth beside the trajectories stands."""
+    """Return the path of the ground truth of the trajectories."""
     return folder / 'trajectories' / sequence / 'ground_truth.tum'
 
 
@@ -142,7 +142,7 @@ def _pictures(folder: Path, title: str, groups: plots.Groups, truth: StampedTraj
     place = folder / 'plots'
     for kind, draw, text in (
             ('errors', plots.plot_errors_by_frame, 'error of each pair along the sequence'),
-            ('cumulative', plots.plot_cumulative, 'share of pairs whose error is below a limit'),
+            ('cumulative', plots.plot_cumulative, 'cumulative distribution of the errors'),
             ('boxes', plots.plot_boxes, 'distribution of the errors by method')):
         path = place / f'{title}_{kind}.png'
         draw(path, title, groups)
@@ -154,7 +154,7 @@ def _pictures(folder: Path, title: str, groups: plots.Groups, truth: StampedTraj
 
 def _trajectories(folder: Path, dataset: Dataset, groups: plots.Groups
                   ) -> tuple[StampedTrajectory, Estimates]:
-    """Integrate the motions of every method, and write them beside the ground truth."""
+    """Integrate the motions of every method, and write trajectories and ground truth."""
     estimates: Estimates = {}
     for preset, methods in groups.items():
         for method, records in methods.items():
@@ -176,7 +176,7 @@ def _drifts(trajectories: dict[str, tuple[StampedTrajectory, Estimates]]) -> Ite
 
 
 def _evo_table(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Method]) -> Table:
-    """Let evo compare every trajectory with the ground truth, several at a time."""
+    """Compare every trajectory with the ground truth by evo, several in parallel."""
     keys = [(dataset.name, method.preset, method.name)
             for dataset in datasets for method in methods]
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -184,9 +184,8 @@ def _evo_table(folder: Path, datasets: Sequence[Dataset], methods: Sequence[Meth
             truth_file(folder, key[0]), trajectory_file(folder, *key)), keys))
     lines = [Line((*key[:2], TITLES[key[2]], *(number(value, 3) for value in astuple(found))))
              for key, found in zip(keys, metrics)]
-    return Table("evo's metrics of the trajectories (root mean squares, lengths from the ground "
-                 'truth): absolute error of position after alignment, and relative errors from '
-                 'frame to frame.',
+    return Table("evo's metrics of the trajectories (RMSE; step lengths from ground truth): APE "
+                 'of positions after alignment, and RPE from frame to frame.',
                  ('sequence', 'preset', 'method', 'APE, m', 'RPE, m', 'RPE, deg'),
                  tuple(lines), 2, 3)
 
@@ -217,7 +216,7 @@ def _image(picture: Picture, folder: Path, section: str) -> str:
 
 
 def _parameters(methods: Sequence[Method]) -> str:
-    """Parameters of each preset and change, folded away; methods share them."""
+    """Return the parameters of each preset and change as collapsed HTML blocks."""
     blocks = {}
     for method in methods:
         head = f'{method.preset}, {method.change}' if method.change else method.preset

@@ -1,4 +1,4 @@
-"""Chunks of pairs on workers, of this machine or of a Dask cluster, and their results."""
+"""Distribution of chunks of pairs over workers, on this machine or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from djet_ros.lab.pairs import PairChunk
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import in_order, RecordStore
 
-# Few enough that a broken run loses little, enough that features of the first frame don't count.
+# Few enough that an interrupted run loses little; enough to amortise the features of the first
+# frame.
 PAIRS_PER_CHUNK = 5
 
-# For which Ctrl-C may go unheard.
-_SECONDS_UNHEARD = 1.0
+# Longest delay in seconds of the reaction to Ctrl-C.
+_SIGNAL_DELAY_S = 1.0
 
 
 class Chunk(Protocol):
-    """Some pairs that are worked on together."""
+    """Some pairs that are processed together."""
 
     @property
     def name(self) -> str:
-        """Name that is the same in every run."""
+        """Return a name that is the same in every run."""
 
     @property
     def count(self) -> int:
-        """How many pairs there are."""
+        """Return the number of pairs."""
 
 
 C = TypeVar('C', bound=Chunk)
@@ -49,7 +50,7 @@ R = TypeVar('R')
 
 
 def chunks_of(datasets: Sequence[Dataset], most: int = PAIRS_PER_CHUNK) -> list[PairChunk]:
-    """Cut the pairs of all datasets into chunks of at most so many."""
+    """Split the pairs of all datasets into chunks of at most ``most`` pairs."""
     return [PairChunk(dataset, first, min(most, dataset.pairs - first))
             for dataset in datasets for first in range(0, dataset.pairs, most)]
 
@@ -57,10 +58,10 @@ def chunks_of(datasets: Sequence[Dataset], most: int = PAIRS_PER_CHUNK) -> list[
 def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
         store: RecordStore[R], progress: Callable[[int, int], None]) -> list[R]:
     """
-    Do the work of all chunks that the store does not have; gives all records in a fixed order.
+    Process all chunks that the store does not have, and return all records in a fixed order.
 
-    progress is called with (pairs done, pairs in all). Raises DjetError where a worker died;
-    what was done until then is in the store.
+    progress is called with (pairs done, total). Raises DjetError if a worker died; finished chunks
+    are in the store.
     """
     total = sum(chunk.count for chunk in chunks)
     missing = [chunk for chunk in chunks if chunk.name not in store.chunks]
@@ -68,29 +69,29 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
     progress(done, total)
     futures = {executor.submit(work, chunk): chunk for chunk in missing}
     try:
-        for future in _as_they_end(futures):
+        for future in _as_completed(futures):
             chunk = futures[future]
             store.add(chunk.name, future.result())
             done += chunk.count
             progress(done, total)
     except BrokenExecutor as error:
-        raise DjetError('a worker died (killed, or out of memory); run the same command again: '
-                        f'{store.path} keeps what was done') from error
+        raise DjetError('a worker died (killed, or out of memory); run the same command again to '
+                        f'resume: finished pairs are in {store.path}') from error
     finally:
         _keep_finished(futures, store)
     return in_order(store, (chunk.name for chunk in chunks))
 
 
-def _as_they_end(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
+def _as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
     """
-    Give futures as they end.
+    Yield futures as they complete.
 
-    The system may hand Ctrl-C to any thread, and does not wake the first one for it: it has to
-    wake by itself to hear of it.
+    The system may deliver Ctrl-C to any thread without waking the main one, which therefore wakes
+    regularly to handle it.
     """
     left = set(futures)
     while left:
-        ended, left = wait(left, _SECONDS_UNHEARD, FIRST_COMPLETED)
+        ended, left = wait(left, _SIGNAL_DELAY_S, FIRST_COMPLETED)
         yield from ended
 
 
@@ -104,20 +105,20 @@ def _keep_finished(futures: dict[Future[list[R]], C], store: RecordStore[R]) -> 
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[Executor]:
     """
-    Give an executor of processes on this machine, by default one per core, one thread each.
+    Yield an executor of processes on this machine, by default one per core, one thread each.
 
-    Ctrl-C ends them, in the middle of their chunks; after another error no new chunk begins.
+    Ctrl-C terminates them immediately; after another error no new chunk starts.
     """
-    # Set before the workers import NumPy; equal thread counts also keep its sums equal.
+    # Set before the workers import NumPy; a fixed thread count also makes its sums reproducible.
     os.environ.update(dict.fromkeys(threads.VARIABLES, '1'))
-    # Starting it lets SIGINT through, which is not to be while a worker starts.
+    # Started now, because its start unblocks SIGINT, which must stay blocked while workers start.
     resource_tracker.ensure_running()
     others = set(active_children())
     with _Pool(count, _Workers(), _follow_parent) as executor:
         try:
             yield executor
         except KeyboardInterrupt:
-            # Before its futures are cancelled: it cannot tell a cancelled one that workers died.
+            # Before the futures are cancelled: the pool can't set an exception on cancelled ones.
             for worker in set(active_children()) - others:
                 worker.terminate()
             raise
@@ -126,7 +127,7 @@ def local_workers(count: int | None = None) -> Iterator[Executor]:
 
 
 class _Pool(ProcessPoolExecutor):
-    """Processes of which none is left half started by Ctrl-C."""
+    """Pool that defers Ctrl-C while a worker starts."""
 
     def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
         with _interrupt_after():
@@ -135,9 +136,9 @@ class _Pool(ProcessPoolExecutor):
 
 @contextmanager
 def _interrupt_after() -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP wait for the end of this block."""
+    """Defer Ctrl-C, SIGTERM and SIGHUP to the end of this block."""
     if current_thread() is not main_thread():
-        # Python interrupts no other.
+        # Python handles signals in the main thread only.
         yield
         return
     seen: list[int] = []
@@ -153,10 +154,10 @@ def _interrupt_after() -> Iterator[None]:
 
 
 class _Worker(SpawnProcess):
-    """A process that leaves Ctrl-C to its parent, from its first instruction on."""
+    """Process that ignores Ctrl-C, which its parent handles."""
 
     def start(self) -> None:
-        # It inherits what is blocked.
+        # The process inherits the signal mask.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             super().start()
@@ -171,10 +172,10 @@ class _Workers(SpawnContext):
 @contextmanager
 def dask_workers(address: str) -> Iterator[Executor]:
     """
-    Give an executor that hands work to a Dask cluster by the address of its scheduler.
+    Yield an executor on a Dask cluster, by the address of its scheduler.
 
-    Its workers need this package and must see the datasets under the same paths. DjetError where
-    no scheduler answers.
+    Its workers need this package, and the datasets under the same paths. Raises DjetError if no
+    scheduler answers.
     """
     from distributed import Client
 
@@ -187,7 +188,7 @@ def dask_workers(address: str) -> Iterator[Executor]:
 
 
 def _follow_parent() -> None:
-    """End with the parent, even where it was killed."""
+    """End this process with its parent, even if the parent was killed."""
     Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -195,5 +196,5 @@ def _end_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         parent.join()
-        # A pool's worker would wait for its next chunk for ever.
+        # The worker of a pool would wait for its next chunk forever.
         os._exit(1)

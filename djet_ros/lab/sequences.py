@@ -1,4 +1,4 @@
-"""What an evaluation runs on: sequences with ground truth, of any layout that can be opened."""
+"""Sequences with ground truth for an evaluation, in any supported layout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Selection:
-    """Frames start, start + stride, … of a sequence, below end; each two in a row are a pair."""
+    """Frames start, start + stride, … < end of a sequence; consecutive ones are pairs."""
 
     start: int = 0
     end: int | None = None
@@ -34,11 +34,11 @@ class Selection:
 @dataclass(frozen=True)
 class Dataset:
     """
-    A sequence that takes part.
+    A sequence of an evaluation.
 
-    name: what tables call it, unique in a run; benchmark: what it is publicly known as, or
-    empty; folder: where every worker can open its frames; frames: indices of those that are used;
-    content: a digest of camera, truth and some pixels.
+    name: printed name, unique in a run; benchmark: public name, or ''; folder: of the frames,
+    readable by every worker; frames: indices of the frames used; content: digest of camera, truth
+    and some pixels.
     """
 
     name: str
@@ -49,21 +49,21 @@ class Dataset:
 
     @property
     def pairs(self) -> int:
-        """Count the pairs of frames that follow one another."""
+        """Return the number of pairs of consecutive frames."""
         return len(self.frames) - 1
 
     def settings(self) -> dict[str, Any]:
-        """Everything that decides the results, as plain values."""
+        """Return everything that decides the results, as plain values."""
         frames = [self.frames.start, self.frames.stop, self.frames.step]
         return {'name': self.name, 'frames': frames, 'content': self.content}
 
 
 def open_datasets(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Dataset]:
     """
-    Open datasets, those in a folder of KITTI sequences one by one, and check that all can be used.
+    Open datasets, each sequence of a KITTI folder separately, and check that all are usable.
 
-    The frames of bags are written into the workspace, because pairs must be had in any order.
-    Raises DjetError on what is no dataset, has no ground truth, or has not enough frames.
+    The frames of bags are extracted to the workspace, for random access. Raises DjetError on paths
+    that are no dataset, or have no ground truth or too few frames.
     """
     datasets: list[Dataset] = []
     for path in chain.from_iterable(map(_sequences, paths)):
@@ -74,7 +74,7 @@ def open_datasets(paths: Iterable[Path], selection: Selection, workspace: Path) 
 
 @lru_cache(maxsize=2)
 def opened(dataset: Dataset) -> FrameSequence:
-    """Open the frames of a dataset, once in each process as long as its chunks follow another."""
+    """Open the frames of a dataset; cached, for consecutive chunks of the same one."""
     return _frames_in(dataset.folder)
 
 
@@ -86,20 +86,20 @@ def _frames_in(folder: Path) -> FrameSequence:
 
 def pair_of_frames(path: Path, index: int, workspace: Path
                    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
-    """Images (H, W) of frames index and index + 1 of any dataset, and their camera matrix."""
+    """Return the images (H, W) of frames index and index + 1 of any dataset, and K (3, 3)."""
     sequence = readable_frames(path, workspace)
     if not 0 <= index < len(sequence) - 1:
-        raise DjetError(f'pair {index} was asked for, {path} has pairs 0 to {len(sequence) - 2}')
+        raise DjetError(f'--pair is {index}; {path} has pairs 0 to {len(sequence) - 2}')
     return sequence.image(index), sequence.image(index + 1), sequence.K
 
 
 def readable_frames(path: Path, workspace: Path) -> FrameSequence:
-    """Open any dataset so that its frames can be had in any order, a bag's in the workspace."""
+    """Open any dataset for random access; frames of a bag are extracted to the workspace."""
     return _frames_in(_readable(path, workspace / 'frames'))
 
 
 def _readable(path: Path, place: Path) -> Path:
-    """Folder in which frames can be had in any order: a bag's are written to a place for it."""
+    """Return a folder with random access to the frames; those of a bag are extracted there."""
     if not is_bag(path):
         return path.resolve()
     with BagRecording(path) as recording:
@@ -111,22 +111,22 @@ def _dataset(path: Path, name: str, selection: Selection, workspace: Path) -> Da
     sequence = _frames_in(folder)
     frames = _selected(path, sequence, selection)
     if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):
-        raise DjetError(f'{path} has no ground truth for two frames in a row; errors need it '
-                        '(KITTI: ../../poses/NN.txt, TUM: groundtruth.txt, bags: a pose topic '
-                        'with ground_truth in its name)')
-    # Rendered sequences have KITTI's layout and numbers, but nothing was published about them.
+        raise DjetError(f'{path} has no ground truth for two consecutive frames; it is needed for '
+                        'errors (KITTI: ../../poses/NN.txt, TUM: groundtruth.txt, bags: a pose '
+                        'topic with ground_truth in its name)')
+    # Rendered sequences have KITTI's layout and numbers, but no published results.
     benchmark = '' if rendered_scene(folder) else sequence.name
     return Dataset(name, benchmark, folder, frames, _digest(sequence, frames))
 
 
 def _sequences(path: Path) -> Iterator[Path]:
-    """Sequences of a whole benchmark folder, or the path itself."""
+    """Yield the sequences of a benchmark folder, or the path itself."""
     inner = sorted(image_folder.parent for image_folder in path.glob('sequences/*/image_0'))
     yield from inner or [path]
 
 
 def plain_name(path: Path) -> str:
-    """Name that tables call a dataset by: a rendered one by its scene, others by their folder."""
+    """Return the printed name of a dataset: the scene of a rendered one, or the folder."""
     resolved = path.resolve()
     return rendered_scene(resolved) or (resolved.stem if resolved.is_file() else resolved.name)
 
@@ -139,12 +139,12 @@ def _unused(name: str, used: set[str]) -> str:
 def _selected(path: Path, sequence: FrameSequence, selection: Selection) -> range:
     end = len(sequence) if selection.end is None else min(selection.end, len(sequence))
     if selection.start < 0 or selection.stride < 1:
-        raise DjetError(f'start is {selection.start} and stride {selection.stride}; start must '
-                        'be 0 or more, stride 1 or more')
+        raise DjetError(f'--start is {selection.start} and --stride {selection.stride}; start '
+                        'must be at least 0, stride at least 1')
     frames = range(selection.start, end, selection.stride)
     if len(frames) < 2:
-        raise DjetError(f'{path} has {len(sequence)} frames, of which {len(frames)} are chosen '
-                        'by start, end and stride; two are needed')
+        raise DjetError(f'{path} has {len(sequence)} frames, of which --start, --end and --stride '
+                        f'select {len(frames)}; at least two are needed')
     return frames
 
 
@@ -154,7 +154,7 @@ def _has_true_pair(poses: Array) -> bool:
 
 
 def _digest(sequence: FrameSequence, frames: range) -> str:
-    """Tell one recording from another of the same name."""
+    """Return a digest that distinguishes recordings of the same name."""
     digest = hashlib.sha256()
     for values in (sequence.K, sequence.poses, sequence.stamps_ns, sequence.image(frames[0]),
                    sequence.image(frames[-1])):

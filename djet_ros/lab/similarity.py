@@ -1,4 +1,4 @@
-"""The paper's Figure 1: how alike the descriptor of a keypoint is to those around it."""
+"""The paper's Figure 1: Hamming distances of a keypoint's descriptor to those around it."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from numpy.typing import NDArray
 Pixels = NDArray[np.int64]
 Gray = NDArray[np.uint8]
 
-# A chosen point may be this far from the nearest keypoint that has a match, in pixels.
+# Largest distance of a chosen point from the nearest keypoint with a match, in pixels.
 _REACH = 20.0
 
 
 @dataclass(frozen=True)
 class Similarity:
     """
-    Hamming surfaces of some keypoints, and the paraboloids fitted to their middle.
+    Hamming surfaces of some keypoints, and the paraboloids fitted to their centres.
 
-    x: (N, 2) whole pixels of the keypoints in the first image; y: (N, 2) those in the middle of
-    the surfaces, in the second image (equal to x for self-similarity); surfaces: (P, P, N) bits;
-    window: side of the fit.
+    x: (N, 2) integer pixels of the keypoints in the first image; y: (N, 2) centres of the surfaces
+    in the second image (equal to x for self-similarity); surfaces: (P, P, N) in bits; window:
+    side of the fitted window.
     """
 
     x: Pixels
@@ -43,7 +43,7 @@ class Similarity:
 
 
 def read_image(path: Path) -> Gray:
-    """Read a PNG or JPEG file as gray image (H, W); DjetError where it is none."""
+    """Read a PNG or JPEG file as gray image (H, W). Raises DjetError."""
     try:
         return narrowed(decoded(np.fromfile(path, np.uint8)))
     except OSError as error:
@@ -57,8 +57,8 @@ def self_similarity(gray: Gray, points: Array | None, count: int, radius: int,
     """
     Compare the descriptors of points with those around them in the same image (H, W).
 
-    points: (N, 2) pixels, or None for the `count` strongest keypoints that are apart from one
-    another. DjetError where a point is too close to the border, or no keypoint is found.
+    points: (N, 2) pixels, or None for the ``count`` strongest keypoints with a distance of more
+    than ``radius``. Raises DjetError if a point is too close to the border, or none is found.
     """
     if points is None:
         features = TwoViewEstimator(config).features(gray)
@@ -74,8 +74,9 @@ def cross_similarity(gray: Gray, other: Gray, points: Array | None, count: int, 
     """
     Compare the descriptors of keypoints with those around their matches in another image.
 
-    points: (N, 2) pixels near keypoints, or None for the `count` strongest that are apart from
-    one another. DjetError where no match is near a point, or one is too close to the border.
+    points: (N, 2) pixels near keypoints, or None for the ``count`` strongest with a distance of
+    more than ``radius``. Raises DjetError if no match is near a point, or one is too close to the
+    border.
     """
     from_x, to_y = _matches(gray, other, config)
     if points is None:
@@ -88,7 +89,7 @@ def cross_similarity(gray: Gray, other: Gray, points: Array | None, count: int, 
 
 
 def draw_similarity(path: Path, gray: Gray, other: Gray, similarity: Similarity) -> None:
-    """Draw patches of the first image, and below them heat maps over those of the second."""
+    """Draw patches of the first image, and below them heat maps over the second image."""
     count, radius = len(similarity.x), len(similarity.surfaces) // 2
     with figure(path, 2.1 * count + 1.4, 5.3) as drawing:
         grid = drawing.subplots(2, count, squeeze=False)
@@ -104,7 +105,7 @@ def draw_similarity(path: Path, gray: Gray, other: Gray, similarity: Similarity)
             panels.draw_paraboloid(lower, similarity.fits, index, similarity.window)
             lower.set_title(f'y = {y[0]}, {y[1]}')
         panels.add_scale(drawing, grid)
-        drawing.suptitle(f'Descriptor similarity within {radius} px\n(contours: fit in '
+        drawing.suptitle(f'Hamming distances within {radius} px\n(contours: paraboloid fitted to '
                          f'{similarity.window}×{similarity.window}, +: its minimum)')
 
 
@@ -118,15 +119,15 @@ def _similarity(gray: Gray, other: Gray, x: Pixels, y: Pixels, radius: int,
 
 
 def _matches(gray: Gray, other: Gray, config: EstimatorConfig) -> tuple[Array, Array]:
-    """Match the images: x, y (N, 2) in pixels, those of the strongest keypoints first."""
+    """Return matches x, y (N, 2) in pixels of two images, strongest keypoints first."""
     estimator = TwoViewEstimator(config)
-    # Matching asks the camera only how a turn moves the image; any of ordinary width will do.
+    # Matching uses the camera only to predict rotations; any ordinary field of view will do.
     height, width = gray.shape
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
     views: Sequence[View] = [estimator.view(image, K) for image in (gray, other)]
     x, y = estimator.match(views[0], views[1])
     if not len(x):
-        raise DjetError('the two images have no match; do they show the same place?')
+        raise DjetError('the two images have no matches; choose images of the same scene')
     strength = {tuple(point): response for point, response
                 in zip(views[0].features.points.tolist(), views[0].features.responses.tolist())}
     order = np.argsort([-strength[tuple(point)] for point in x.tolist()], kind='stable')
@@ -134,7 +135,7 @@ def _matches(gray: Gray, other: Gray, config: EstimatorConfig) -> tuple[Array, A
 
 
 def _apart(x: Array, y: Array, gray: Gray, other: Gray, radius: int, count: int) -> Array:
-    """Take the first points x that have room around themselves and y, and are not close by."""
+    """Return the first points x that have room around x and y, and are not close to another."""
     room = (describable(np.rint(x).astype(np.int64), gray.shape)
             & describable(np.rint(y).astype(np.int64), other.shape, radius))
     taken: list[Array] = []
@@ -155,7 +156,7 @@ def _nearest(x: Array, point: Array) -> int:
     if distances[nearest] > _REACH:
         raise DjetError(f'no keypoint with a match is within {_REACH:g} pixels of '
                         f'{point[0]:g},{point[1]:g}; the nearest is at '
-                        f'{x[nearest][0]:.0f},{x[nearest][1]:.0f}')
+                        f'{x[nearest][0]:.0f},{x[nearest][1]:.0f}; choose that one')
     return nearest
 
 
@@ -167,6 +168,6 @@ def _require_room(points: Pixels, gray: Gray, radius: int) -> None:
 
 
 def _visible(point: Pixels, gray: Gray, radius: int) -> int:
-    """Radius up to which the patch around a point lies in the image."""
+    """Return the radius up to which the patch around a point is inside the image."""
     room = [*point.tolist(), gray.shape[1] - 1 - int(point[0]), gray.shape[0] - 1 - int(point[1])]
     return int(min(radius, *room))

@@ -1,4 +1,4 @@
-"""What is written about a run of the offline SLAM."""
+"""Output files of the offline SLAM: trajectories, graph, plot and summary."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _LINES: dict[str, Any] = {'before': {'color': COLOURS['rpe'], 'ls': '--'},
 def write_report(folder: Path, slam: Slam, truth: Array, name: str,
                  config: Config) -> dict[str, Any]:
     """
-    Write trajectories, graph, plot and summary into a folder, and give the summary.
+    Write trajectories, graph, plot and summary into a folder, and return the summary.
 
-    truth: (N, 4, 4) of the frames, NaN where it is not known; name: of the recording. The
-    optimised graph holds all edges; those that the kernel does not trust are in the csv too.
+    truth: (N, 4, 4) of the frames, NaN where unknown; name: of the recording. The optimised graph
+    holds all edges, including those that the robust kernel rejected.
     """
     frames, graph = slam.frames, slam.optimised.graph
     ways = {'before': slam.before(), 'after': slam.after()}
@@ -66,7 +66,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
             for which, errors in summary['errors'].items():
                 errors.update(_evo(folder, which, slam.metric))
         except DjetError as error:
-            # It is not installed, or refuses a way that is straight.
+            # evo is not installed, or fails on a straight trajectory.
             summary['evo'] = str(error)
     _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, one_line(Path(name).name))
     write_whole(folder / SUMMARY, json.dumps(summary, indent=2) + '\n')
@@ -79,13 +79,13 @@ def _error(poses: Array, truth: Array, scaled: bool) -> dict[str, float]:
 
 
 def _evo(folder: Path, which: str, scaled: bool) -> dict[str, float]:
-    """Metrics of a trajectory file by evo's own commands."""
+    """Return the metrics of a trajectory file by evo."""
     metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{which}_tum.txt', scaled)
     return {f'evo_{name}': value for name, value in asdict(metrics).items()}
 
 
 def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
-    """Draw the way from above, before and after, and both errors along it."""
+    """Plot the trajectory from above, before and after, and both errors over time."""
     ways = {'before': slam.before()[:, :3, 3], 'after': slam.after()[:, :3, 3]}
     if truth is not None:
         ways = {which: aligned(way, truth[:, :3, 3], slam.metric)
@@ -107,12 +107,12 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
             for which, way in ways.items():
                 errors.plot(seconds, np.linalg.norm(way - truth[:, :3, 3], axis=1), label=which,
                             **_LINES[which])
-            errors.set(xlabel='time (s)', ylabel='distance from the truth, aligned (m)')
+            errors.set(xlabel='time (s)', ylabel='position error after alignment (m)')
             errors.legend()
 
 
 def _closed(slam: Slam, way: Array) -> Array:
-    """Positions (L, 3), among those of all frames (N, 3), from which a trusted loop was closed."""
+    """Return the positions (L, 3), among those of all frames (N, 3), of accepted loop edges."""
     _, first = np.unique([offset.keyframe for offset in slam.offsets], return_index=True)
     closing = [edge.source for edge, trust in zip(slam.optimised.graph.edges, slam.optimised.trust)
                if edge.kind == 'loop' and trust >= 0.5]

@@ -1,8 +1,8 @@
 """
-How memory and latency hold over many frames, with everything that may go wrong on the way.
+Memory and latency of the odometry over many frames, with faults.
 
-A rendered drive is driven to and fro without end; now and then a frame is black, comes after a
-gap, or comes with a stamp of the past, so that every way through the odometry is soaked.
+A rendered drive is repeated forwards and backwards; occasionally frames are black, come after a
+gap, or have an earlier stamp, so that all paths through the odometry are exercised.
 """
 
 from __future__ import annotations
@@ -27,31 +27,33 @@ import numpy as np
 SIZE = (416, 128)
 FEATURES = 500
 
-# Frames of the drive, which are rendered once; short soaks need fewer.
+# Frames of the drive, rendered once; a short run uses fewer.
 _DRIVE, _SHORT = 60, 8
 _PERIOD_NS = 100_000_000
 
-# Every so many frames: black ones (enough of them to lose the reference), gaps, steps back.
+# Periods in frames of black images (enough in sequence to lose the keyframe), gaps, and steps back
+# in time.
 _BLACK, _GAP, _BACK = 97, 211, 487
 _BLACK_ONES = 4
 
-# Stretches of the run that are compared with one another. The first fills caches and pools.
+# Segments of the run that are compared. The first ones fill caches and pools.
 _STRETCHES = 20
 
 
 def soak(frames: int, most_growth_mb: float,
          progress: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
     """
-    Process so many frames, and give the figures.
+    Process a number of frames, and return the results.
 
-    Memory is resident memory in MB. ``growth_mb`` is that at the end of the run over the highest
-    at the ends of its stretches up to a fifth of it; ``held`` tells whether it stayed below
-    most_growth_mb. ``python_blocks`` are the interpreter's small pieces of memory, which may grow
-    unseen within what is resident. Latencies are in ms, of a whole frame from pixels to pose.
-    Raises DjetError where there are too few frames to tell, or no /proc to read memory from.
+    Memory is resident memory in MB. ``growth_mb`` is that at the end of the run minus the maximum
+    at the segment ends of its first fifth; ``held``: whether it is at most most_growth_mb.
+    ``python_blocks`` is the number of blocks allocated by the interpreter, which may grow without
+    changing resident memory. Latencies are in ms, from pixels to pose. Raises DjetError if there
+    are too few frames, or no /proc to read the memory from.
     """
     if frames < 5 * _STRETCHES:
-        raise DjetError(f'{frames} frames are too few to tell growth; give {5 * _STRETCHES}')
+        raise DjetError(f'--frames is {frames}; it must be at least {5 * _STRETCHES} to measure '
+                        'growth')
     odometry = VisualOdometry(EstimatorConfig(max_features=FEATURES), OdometryConfig())
     bounds = np.linspace(0, frames, _STRETCHES + 1).astype(int)[1:].tolist()
     latency = np.empty(frames)
@@ -64,8 +66,8 @@ def soak(frames: int, most_growth_mb: float,
         latency[number - 1] = 1e3 * (perf_counter() - before)
         status[result.status.value] += 1
         if number == bounds[len(stretches)]:
-            # This empties the interpreter's free lists too: up to 2000 tuples of each length
-            # that nobody uses any more, but that are counted, and fill up over hundreds of frames.
+            # Also empties the interpreter's free lists, which count as allocated: up to 2000
+            # unused tuples of each length, filled over hundreds of frames.
             gc.collect()
             stretches.append({'frames': number, 'memory_mb': resident_mb(),
                               'python_blocks': sys.getallocatedblocks(),
@@ -83,7 +85,7 @@ def soak(frames: int, most_growth_mb: float,
 
 
 def resident_mb() -> float:
-    """Resident memory of this process; DjetError where the system does not tell it."""
+    """Return the resident memory of this process in MB; raise DjetError without /proc."""
     try:
         pages = int(Path('/proc/self/statm').read_text('ascii').split()[1])
     except OSError as error:
@@ -93,7 +95,7 @@ def resident_mb() -> float:
 
 
 def _drive(frames: int) -> Iterator[Frame]:
-    """Frames of a drive to and fro, with what goes wrong now and then."""
+    """Yield frames of a drive forwards and backwards, with occasional faults."""
     scene = make_scene('road', size=SIZE)
     poses = scene.trajectory(_SHORT if frames < 10 * _DRIVE else _DRIVE)
     there = [scene.render(pose, i) for i, pose in enumerate(poses)]
@@ -107,7 +109,7 @@ def _drive(frames: int) -> Iterator[Frame]:
         if number % _BACK == 0:
             stamp -= 60 * 10**9
         image = black if number % _BLACK < _BLACK_ONES else images[number % len(images)]
-        # A copy, as each frame of a camera has memory of its own.
+        # A copy, because each frame of a camera has its own memory.
         yield Frame(image.copy(), scene.K, stamp)
 
 

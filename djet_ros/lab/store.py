@@ -1,8 +1,8 @@
 """
-Records on disk while they come in, so that a broken run loses only what was under way.
+Incremental store of records, so that an interrupted run can be resumed.
 
-One JSON object a line: first what decides the results, then one chunk of pairs each, in the order
-in which they were done.
+One JSON object per line: first the settings, then one chunk of pairs each, in the order of
+completion.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ R = TypeVar('R')
 
 class RecordStore(Closing, Generic[R]):
     """
-    The records of a run in ``folder/records.jsonl``: those of an earlier run, and new ones.
+    The records of a run in ``folder/records.jsonl``, including those of an interrupted run.
 
-    kind: the dataclass of a record; settings: what decides the results beside the code of this
-    package and the versions of its libraries. Raises DjetError where the file is of a run with
-    other settings or code, unless overwrite is set.
+    kind: dataclass of a record; settings: everything that decides the results, except for the code
+    of this package and the versions of its libraries, which are added. Raises DjetError if the
+    file has other settings, code or versions, unless overwrite is set.
     """
 
     def __init__(self, folder: Path, kind: Callable[..., R], settings: Mapping[str, Any], *,
@@ -44,7 +44,7 @@ class RecordStore(Closing, Generic[R]):
         self._kind = kind
         settings = _with_code(settings)
         if self.path.exists() and not overwrite:
-            # What is cut off is the last line that a killed run has left unfinished.
+            # Cuts off an incomplete last line of a killed run.
             os.truncate(self.path, self._read(settings))
             self._file = self.path.open('a', encoding='ascii')
         else:
@@ -52,7 +52,7 @@ class RecordStore(Closing, Generic[R]):
             self._write(settings)
 
     def add(self, chunk: str, records: list[R]) -> None:
-        """Keep the records of a chunk; they are on disk when this returns."""
+        """Store the records of a chunk; they are flushed when this returns."""
         self.chunks[chunk] = records
         self._write({'chunk': chunk, 'records': [_plain(record) for record in records]})
 
@@ -65,7 +65,7 @@ class RecordStore(Closing, Generic[R]):
         self._file.flush()
 
     def _read(self, settings: dict[str, Any]) -> int:
-        """Take the chunks of an earlier run, and give how many bytes of its file are good."""
+        """Read the chunks of an earlier run; return the length of its complete lines in bytes."""
         content = self.path.read_bytes()
         length = content.rfind(b'\n') + 1
         whole = content[:length].decode('ascii', 'replace').splitlines()
@@ -73,21 +73,22 @@ class RecordStore(Closing, Generic[R]):
         if before != settings:
             other = [name for name in settings if settings[name] != before.get(name)]
             raise DjetError(f'{self.path.parent} holds results of other settings '
-                            f'({", ".join(other)}); choose another folder, or --overwrite')
+                            f'({", ".join(other)}); choose another --output, or pass --overwrite')
         for number, line in enumerate(whole[1:], 2):
             chunk = _parsed(self.path, number, line)
             self.chunks[chunk['chunk']] = [self._record(values) for values in chunk['records']]
         return length
 
     def _record(self, values: dict[str, Any]) -> R:
-        told = {name: float('nan') if value is None else value for name, value in values.items()}
+        numbers = {name: float('nan') if value is None else value
+                   for name, value in values.items()}
         return self._kind(**{name: tuple(value) if isinstance(value, list) else value
-                             for name, value in told.items()})
+                             for name, value in numbers.items()})
 
 
 def _with_code(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {'djet_ros': __version__, 'code': digest_of_the_code(),
-            # OpenCV and NumPy as they are loaded: several packages bring the former.
+            # OpenCV and NumPy as loaded: several distributions provide OpenCV.
             'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__,
                           **versions(('scipy', 'poselib'))}, **settings}
 
@@ -108,5 +109,5 @@ def _plain(record: Any) -> dict[str, Any]:
 
 
 def in_order(store: RecordStore[R], chunk_names: Iterable[str]) -> list[R]:
-    """Give the records of all chunks, in the order of the names."""
+    """Return the records of all chunks, in the order of the names."""
     return [record for name in chunk_names for record in store.chunks[name]]

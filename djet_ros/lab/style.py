@@ -1,4 +1,4 @@
-"""What all figures share: colours that colour-blind readers can tell apart, and saving."""
+"""Style of all plots: a colour-blind safe palette, dashes, and saving."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Look = TypeVar('Look')
 
 
 class ByMethod(dict[str, Look]):
-    """How methods are drawn; those that have nothing of their own here are drawn like others."""
+    """Styles by method, with a default for other methods."""
 
     def __init__(self, entries: dict[str, Look], others: Look) -> None:
         super().__init__(entries)
@@ -39,15 +39,15 @@ STYLE: dict[Any, Any] = {
     'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
     'grid.color': '#dddddd', 'grid.linewidth': 0.6, 'lines.linewidth': 1.3,
     'legend.frameon': False, 'axes.axisbelow': True,
-    # Titles have names of folders, and a $ in these begins no formula.
+    # A $ in the name of a folder starts no formula.
     'text.parse_math': False,
 }
 
 
 @contextmanager
 def figure(path: Path, width: float, height: float) -> Iterator[Figure]:
-    """Give an empty figure of some inches, saved as PNG at the end; the folder is made."""
-    # A Figure of its own needs no window system and leaves pyplot's state alone.
+    """Yield an empty figure of a size in inches, and save it as PNG at the end."""
+    # A Figure without pyplot needs no display and has no global state.
     with rc_context(STYLE):
         empty = Figure(figsize=(width, height), layout='constrained')
         yield empty

@@ -1,4 +1,4 @@
-"""Rows of a results table from the records of pairs."""
+"""Summary of the records of pairs to rows of a table."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ import numpy as np
 @dataclass(frozen=True)
 class TableRow:
     """
-    One method on one sequence: errors in degrees, Hamming distances in bits.
+    Summary of one method on one sequence: errors in degrees, Hamming distances in bits.
 
-    Means, medians and 95th percentiles are over the pairs whose error is known, which `told`
-    counts; failures (see pairs.FAILURE) are counted over all pairs. NaN where nothing is known.
+    Means, medians and 95th percentiles are over the pairs with an estimate and ground truth, whose
+    number is in the ``told`` fields; failures (see pairs.FAILURE) are counted over all pairs. NaN
+    if there is no such pair.
     """
 
     sequence: str
@@ -44,9 +45,10 @@ class TableRow:
 @dataclass(frozen=True)
 class DriftRow:
     """
-    Drift of the trajectory that the pairs of one method make; see ``replay.drift.Drift``.
+    Drift of the trajectory integrated from the pairs of one method; see ``replay.drift.Drift``.
 
-    Its lengths are the truth's: translation_percent tells of directions and rotations alone.
+    Step lengths are those of the ground truth: translation_percent depends on directions and
+    rotations only.
     """
 
     sequence: str
@@ -76,22 +78,22 @@ def _row(records: Sequence[PairRecord]) -> TableRow:
     return TableRow(
         first.sequence, first.method, first.preset, first.change, len(records),
         sum(record.failed for record in records),
-        _told(records, 'rotation_error_deg'),
+        _count_finite(records, 'rotation_error_deg'),
         rotation['mean'], rotation['median'], rotation['p95'],
-        _told(records, 'translation_error_deg'),
+        _count_finite(records, 'translation_error_deg'),
         translation['mean'], translation['median'], translation['p95'],
         hamming['mean'], ms['mean'])
 
 
-def _told(records: Iterable[PairRecord], name: str) -> int:
+def _count_finite(records: Iterable[PairRecord], name: str) -> int:
     return sum(math.isfinite(getattr(record, name)) for record in records)
 
 
 def common_errors(records: Sequence[PairRecord], others: Sequence[PairRecord]) -> dict[str, Array]:
     """
-    Give the errors (N, 2) of records and others, in degrees, on the pairs that both told.
+    Return the errors (N, 2) of records and others, in degrees, on the pairs that both estimated.
 
-    Of 'rotation' and 'direction', each in the order of records.
+    By 'rotation' and 'direction', each in the order of records.
     """
     at = {(other.sequence, other.pair): other for other in others}
     paired = [(record, at[record.sequence, record.pair]) for record in records
@@ -106,11 +108,11 @@ def common_errors(records: Sequence[PairRecord], others: Sequence[PairRecord]) -
 
 def drift_row(sequence: str, method: str, preset: str, truth: StampedTrajectory,
               estimate: StampedTrajectory) -> DriftRow | None:
-    """Compare a trajectory with the true one; None where that is not over 100 m long."""
+    """Return the drift of a trajectory, or None if the true one is not over 100 m long."""
     found = drift(truth.poses, estimate.poses)
     return DriftRow(sequence, method, preset, **asdict(found)) if found else None
 
 
 def spread_of(values: Sequence[float]) -> dict[str, float]:
-    """Statistics of those values that are known, by their names; NaN where none is."""
+    """Return statistics of the finite values, NaN if there are none."""
     return statistics(np.array(values)) or dict.fromkeys(('mean', 'median', 'p95'), float('nan'))

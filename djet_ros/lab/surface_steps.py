@@ -1,4 +1,4 @@
-"""One correspondence on its Hamming surface, round by round of the paper's Algorithm 1."""
+"""One match on its Hamming surface, by iteration of the paper's Algorithm 1."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ import numpy as np
 # Pixels shown around the first keypoint.
 RADIUS = 9
 
-# Rounds that one picture shows; of more, some in between are left out.
+# Maximum number of iterations in one plot; of more, some in between are omitted.
 _PANELS = 7
 
 _LINE, _KEYPOINT, _OPTIMUM = '#56B4E9', '#E69F00', '#009E73'
@@ -34,7 +34,7 @@ _LINE, _KEYPOINT, _OPTIMUM = '#56B4E9', '#E69F00', '#009E73'
 
 @dataclass(frozen=True)
 class Trace:
-    """The rounds of Algorithm 1 on two views, and their result, whose x, y are the matches."""
+    """Iterations of Algorithm 1 on two views, and the result."""
 
     previous: View
     current: View
@@ -44,50 +44,52 @@ class Trace:
 
     @property
     def x(self) -> Array:
-        """Pixels (N, 2) in the previous view."""
+        """Return the matches' pixels (N, 2) in the previous view."""
         return self.result.x
 
     @property
     def y(self) -> Array:
-        """Pixels (N, 2) in the current view, as they went in."""
+        """Return the matches' initial pixels (N, 2) in the current view."""
         return self.result.y
 
 
-def follow(previous: View, current: View, x: Array, y: Array, config: EstimatorConfig) -> Trace:
+def trace_rounds(previous: View, current: View, x: Array, y: Array, config: EstimatorConfig
+                 ) -> Trace:
     """
-    Run D-JET on matches x, y (N, 2) in pixels, and keep every round.
+    Run D-JET on matches x, y (N, 2) in pixels, and record every iteration.
 
-    Raises DjetError where no pose is found.
+    Raises DjetError if no pose is found.
     """
     rounds: list[Round] = []
     result = TwoViewEstimator(config).estimate_matched(previous, current, x, y,
                                                        observe=rounds.append)
     if not rounds or result.status is Status.TOO_FEW_MATCHES:
-        raise DjetError(f'no pose is found on the {len(x)} matches of this pair '
+        raise DjetError(f'no pose was found from the {len(x)} matches of this pair '
                         f'({result.status.value}); choose another --pair')
     return Trace(previous, current, config, rounds, result)
 
 
-def telling_match(trace: Trace) -> int:
+def illustrative_match(trace: Trace) -> int:
     """
-    Choose a match whose surface tells where it belongs, and of these the one that moves farthest.
+    Return the match that moves farthest, of the inliers with a minimum in every iteration.
 
-    Its fits have their minimum in the window, in every round, and it agrees with the pose.
+    The minima of their paraboloids are inside the window. Raises DjetError if there is none.
     """
-    telling = trace.result.inliers & describable(np.rint(trace.y).astype(np.int64),
-                                                 trace.current.smoothed.shape, RADIUS)
+    candidates = trace.result.inliers & describable(np.rint(trace.y).astype(np.int64),
+                                                    trace.current.smoothed.shape, RADIUS)
     for step in trace.rounds:
         reach = np.abs(step.fits.minima() - step.fits.centres).max(1)
-        telling &= step.fits.usable & ~indefinite(step.fits) & (reach <= trace.config.window // 2)
-    if not telling.any():
-        raise DjetError('no match of this pair has a surface with a minimum in every round; '
+        candidates &= (step.fits.usable & ~indefinite(step.fits)
+                       & (reach <= trace.config.window // 2))
+    if not candidates.any():
+        raise DjetError('no match of this pair has a surface with a minimum in every iteration; '
                         'choose one with --match')
-    way = np.linalg.norm(trace.rounds[-1].optimum - trace.y, axis=1)
-    return int(np.argmax(np.where(telling, way, -1.0)))
+    distance = np.linalg.norm(trace.rounds[-1].optimum - trace.y, axis=1)
+    return int(np.argmax(np.where(candidates, distance, -1.0)))
 
 
 def draw_trace(path: Path, trace: Trace, match: int) -> None:
-    """Draw the reference patch and the rounds of a match side by side (PNG)."""
+    """Draw the reference patch and the iterations of a match side by side (PNG)."""
     _require_room(trace, match)
     shown = _some(len(trace.rounds))
     count = len(shown) + 1
@@ -104,7 +106,7 @@ def draw_trace(path: Path, trace: Trace, match: int) -> None:
 
 
 def animate_trace(path: Path, trace: Trace, match: int) -> None:
-    """Show the rounds of a match one after another (GIF)."""
+    """Animate the iterations of a match (GIF)."""
     _require_room(trace, match)
     with rc_context(STYLE):
         drawing = Figure(figsize=(7.6, 4.4), layout='constrained')
@@ -122,7 +124,7 @@ def animate_trace(path: Path, trace: Trace, match: int) -> None:
 
 
 def _some(count: int) -> Sequence[int]:
-    """Give all rounds, or some of them with the first and the last."""
+    """Return the iterations to draw: all, or an even selection with the first and the last."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, _PANELS)).tolist()})
 
 
@@ -139,7 +141,7 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     if step.warp is None:
         reference = distances.reference(trace.previous.tested, np.rint(x)[None])
     else:
-        # As the round saw it, in relation to whole pixels.
+        # The reference of this iteration, shifted to integer pixels.
         ahead = step.keypoints[match] - np.rint(step.keypoints[match])
         reference = distances.reference(
             trace.previous.tested, (x - np.linalg.solve(step.warp[match, :2], ahead))[None],
@@ -154,14 +156,14 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     along = np.array([-normal[1], normal[0]]) / np.linalg.norm(normal)
     ends = optimum + np.outer([-3 * RADIUS, 3 * RADIUS], along)
     axes.plot(ends[:, 0], ends[:, 1], color=_LINE, lw=1.8)
-    way = np.array([earlier.keypoints[match] for earlier in trace.rounds[:index + 1]])
-    axes.plot(way[:, 0], way[:, 1], color=_KEYPOINT, lw=1.5)
-    panels.draw_point(axes, way[-1], 'o', _KEYPOINT)
+    path = np.array([earlier.keypoints[match] for earlier in trace.rounds[:index + 1]])
+    axes.plot(path[:, 0], path[:, 1], color=_KEYPOINT, lw=1.5)
+    panels.draw_point(axes, path[-1], 'o', _KEYPOINT)
     panels.draw_point(axes, optimum, '*', _OPTIMUM, 13)
     distance = abs(line_distances(line, y[None])[0])
     loss = panels.paraboloid_values(step.fits, match, optimum[None])[0]
-    axes.set_title(f'round {index + 1}: Q(v_opt) = {loss:.1f} bits,\n'
-                   f'line {distance:.2f} px off y')
+    axes.set_title(f'iteration {index + 1}: Q(v_opt) = {loss:.1f} bits,\n'
+                   f'y {distance:.2f} px from the line')
     panels.limit(axes, centre.astype(float), RADIUS)
 
 
@@ -179,4 +181,4 @@ def _require_room(trace: Trace, match: int) -> None:
     if not (describable(at_x, trace.previous.smoothed.shape)[0]
             and describable(at_y, trace.current.smoothed.shape, RADIUS)[0]):
         raise DjetError(f'match {match} at {at_y[0][0]},{at_y[0][1]} is too close to the border; '
-                        'choose another one')
+                        'choose another --match')

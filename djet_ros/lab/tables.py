@@ -1,4 +1,4 @@
-"""Results as tables: exact ones for programs (CSV), and readable ones in several markups."""
+"""Tables of results: exact as CSV, and readable as Markdown, LaTeX and HTML."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PUBLISHED = 'the paper'
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a table; bold: columns to stress; foreign: its figures are not ours."""
+    """One line of a table; bold: columns to emphasise; foreign: published, not measured here."""
 
     cells: tuple[str, ...]
     bold: frozenset[int] = frozenset()
@@ -32,8 +32,8 @@ class Table:
     """
     A readable table.
 
-    sections: how many of the first columns say which section a line belongs to; numeric: from
-    which column on cells are numbers, to be set to the right.
+    sections: number of leading columns that define the section of a line; numeric: index of the
+    first column of numbers, which are right-aligned.
     """
 
     caption: str
@@ -43,37 +43,37 @@ class Table:
     numeric: int
 
 
-# Columns of figures: their titles, their fields, and the decimals that mean something.
+# Columns of numbers: titles, fields, and decimals.
 _FIGURES = (
-    ('rot. told', 'rotation_told', 0), ('rot. mean', 'rotation_mean_deg', 3),
+    ('rot. pairs', 'rotation_told', 0), ('rot. mean', 'rotation_mean_deg', 3),
     ('rot. median', 'rotation_median_deg', 3), ('rot. p95', 'rotation_p95_deg', 3),
-    ('tr. told', 'translation_told', 0), ('tr. mean', 'translation_mean_deg', 2),
+    ('tr. pairs', 'translation_told', 0), ('tr. mean', 'translation_mean_deg', 2),
     ('tr. median', 'translation_median_deg', 2), ('tr. p95', 'translation_p95_deg', 2),
     ('Hamming', 'hamming_mean', 2), ('failed', 'failures', 0), ('ms', 'ms_per_pair', 0))
 _TITLES = tuple(title for title, _, _ in _FIGURES)
 _DRIFT = (
     ('tr., %', 'translation_percent', 3), ('rot., deg per 100 m', 'rotation_deg_per_100m', 3),
     ('segments', 'segments', 0), ('longest, m', 'longest', 0))
-# Of these the least in a section is stressed, if no other method told more pairs (what says how
-# many): who gives up what is hard has a smaller mean for it.
-_STRESSED: dict[str, str | None] = {
+# Fields whose minimum in a section is emphasised, and the field that counts the pairs they are
+# over: no other method may have more pairs, because giving up hard pairs lowers the mean.
+_EMPHASISED: dict[str, str | None] = {
     'hamming_mean': 'rotation_told', **dict.fromkeys(name for _, name, _ in _DRIFT[:2])} | {
     f'{what}_{kind}_deg': f'{what}_told' for what in ('rotation', 'translation')
     for kind in ('mean', 'median', 'p95')}
 _DRIFT_CAPTION = (
-    'Drift of the trajectories as the KITTI benchmark has it (t_rel, r_rel): mean error at the '
-    'end of segments of 100 to 800 m, for each metre of them. Lengths are those of the ground '
-    'truth, so that t_rel tells of directions and rotations alone. Sequences that are not over '
-    '100 m long have none.')
+    'Drift of the trajectories by the metrics of the KITTI benchmark (t_rel, r_rel): mean error '
+    'over segments of 100 to 800 m, relative to their length. Step lengths are those of the '
+    'ground truth, so that t_rel depends on directions and rotations only. Sequences of at most '
+    '100 m have none.')
 
 
 def results_table(caption: str, rows: Sequence[TableRow],
                   published: dict[str, list[PublishedRow]]) -> Table:
     """
-    Lay out rows by sequence and preset, the best figures stressed, printed ones below them.
+    Return the table of rows by sequence and preset, best values in bold, published ones below.
 
-    Best is the least, if it is over as many pairs as any other of its section. published: rows of
-    the paper by the name of the sequence.
+    Best is the smallest value, if it is over at least as many pairs as all others of its section.
+    published: rows of the paper by name of the sequence.
     """
     lines: list[Line] = []
     for sequence in dict.fromkeys(row.sequence for row in rows):
@@ -87,7 +87,7 @@ def results_table(caption: str, rows: Sequence[TableRow],
 
 
 def drift_table(rows: Sequence[DriftRow]) -> Table:
-    """Lay out drifts by sequence and preset, the least stressed."""
+    """Return the table of drifts by sequence and preset, the smallest in bold."""
     lines = [_line(row, (row.sequence, row.preset, TITLES[row.method]),
                    [one for one in rows
                     if (one.sequence, one.preset) == (row.sequence, row.preset)], _DRIFT)
@@ -97,15 +97,15 @@ def drift_table(rows: Sequence[DriftRow]) -> Table:
 
 
 def ablation_table(caption: str, rows: Sequence[TableRow]) -> Table:
-    """Lay out rows by sequence and preset, with what was changed; the first row is the base."""
+    """Return the table of rows by sequence, preset and change; the first row is the base."""
     lines = [_line(row, (row.sequence, row.preset, TITLES[row.method], row.change or '–'), ())
              for row in rows]
     return Table(caption, ('sequence', 'preset', 'method', 'change', *_TITLES), tuple(lines), 2, 4)
 
 
 def published_table(caption: str, rows: Iterable[PublishedRow]) -> Table:
-    """Lay out rows of the paper's Table 2."""
-    header = ('sequence', 'method', 'sampling area', 'rotation', 'translation', 'Hamming')
+    """Return the table of the paper's Table 2."""
+    header = ('sequence', 'method', 'window', 'rotation', 'translation', 'Hamming')
     lines = [Line(('VAROS', TITLES[row.method], f'{row.window}×{row.window}' if row.window else
                    '–', number(row.rotation_deg, 3), number(row.translation_deg, 3),
                    number(row.hamming, 2)), foreign=True) for row in rows]
@@ -113,7 +113,7 @@ def published_table(caption: str, rows: Iterable[PublishedRow]) -> Table:
 
 
 def _printed_line(head: tuple[str, ...], row: PublishedRow) -> Line:
-    """Lay out a row of the paper, which prints means only."""
+    """Return the line of a row of the paper, which has means only."""
     printed = {'rotation_mean_deg': row.rotation_deg, 'translation_mean_deg': row.translation_deg,
                'hamming_mean': row.hamming}
     return Line((*head, *(number(printed[name], digits) if name in printed else ''
@@ -125,7 +125,7 @@ def _line(row: TableRow | DriftRow, head: tuple[str, ...], group: Sequence[Table
     cells, bold = list(head), set()
     for _, name, digits in figures:
         value = getattr(row, name)
-        if name in _STRESSED and len(group) > 1 and _is_best(row, group, name):
+        if name in _EMPHASISED and len(group) > 1 and _is_best(row, group, name):
             bold.add(len(cells))
         cells.append(_share(row) if isinstance(row, TableRow) and name == 'failures'
                      else number(value, digits))
@@ -137,36 +137,36 @@ def _share(row: TableRow) -> str:
 
 
 def _is_best(row: TableRow | DriftRow, group: Sequence[TableRow | DriftRow], name: str) -> bool:
-    """Tell whether a row has the least of a figure, over as many pairs as any other row."""
-    told = _STRESSED[name]
+    """Return whether a row has the smallest value, over as many pairs as any other row."""
+    count = _EMPHASISED[name]
     least = min((getattr(one, name) for one in group if math.isfinite(getattr(one, name))),
                 default=math.nan)
     return bool(getattr(row, name) == least) and (
-        told is None or getattr(row, told) == max(getattr(one, told) for one in group))
+        count is None or getattr(row, count) == max(getattr(one, count) for one in group))
 
 
 def number(value: float, digits: int) -> str:
-    """Text of a number with so many decimals; a dash where it is not known."""
+    """Return a number as text with a number of decimals, or a dash if it is NaN."""
     return f'{value:.{digits}f}' if math.isfinite(value) else '–'
 
 
 def rows_csv(rows: Sequence[TableRow], *, with_change: bool) -> str:
-    """Rows as CSV; the column ``change`` only where asked for."""
+    """Return rows as CSV, with or without the column ``change``."""
     return _csv([field.name for field in fields(TableRow)], map(asdict, rows), with_change)
 
 
 def drift_csv(rows: Sequence[DriftRow]) -> str:
-    """Give drifts as CSV."""
+    """Return drifts as CSV."""
     return _csv([field.name for field in fields(DriftRow)], map(asdict, rows))
 
 
-# Columns of pairs.csv; times stand in a file of their own, because they alone differ from run
-# to run.
+# Key columns of pairs.csv and timings.csv. Times have their own file: only they differ from run to
+# run.
 _PAIR_KEY = ('sequence', 'pair', 'previous', 'current', 'method', 'preset', 'change')
 
 
 def pairs_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
-    """Give the records of all pairs as CSV, without their times."""
+    """Return the records of all pairs as CSV, without their times."""
     vectors = {'rotation': ('rx', 'ry', 'rz'), 'translation': ('tx', 'ty', 'tz')}
     names = [column for field in fields(PairRecord)
              for column in vectors.get(field.name, (field.name,)) if column != 'milliseconds']
@@ -177,12 +177,12 @@ def pairs_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
 
 
 def timings_csv(records: Sequence[PairRecord], *, with_change: bool) -> str:
-    """Give the times of all pairs as CSV."""
+    """Return the times of all pairs as CSV."""
     return _csv((*_PAIR_KEY, 'milliseconds'), map(asdict, records), with_change)
 
 
 def table_csv(table: Table) -> str:
-    """Give a readable table as CSV."""
+    """Return a readable table as CSV."""
     return _csv(table.header, (dict(zip(table.header, line.cells)) for line in table.lines))
 
 
@@ -202,7 +202,7 @@ def _value(value: Any) -> Any:
 
 
 def markdown(table: Table) -> str:
-    """Give the table in Markdown, its caption as a paragraph before it."""
+    """Return the table in Markdown, its caption as a paragraph before it."""
     rule = ['--:' if column >= table.numeric else '---' for column in range(len(table.header))]
     rows = [table.header, tuple(rule), *(_marked(line, '**', '**', '*', '*')
                                          for line in table.lines)]
@@ -210,7 +210,7 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """Give the table as a LaTeX table that needs no package."""
+    """Return the table as a LaTeX table that needs no packages."""
     escaped = replace(table, lines=tuple(
         replace(line, cells=tuple(_latex_text(cell) for cell in line.cells))
         for line in table.lines))
@@ -224,7 +224,7 @@ def latex(table: Table) -> str:
 
 
 def html_table(table: Table) -> str:
-    """Give the table in HTML."""
+    """Return the table in HTML."""
     kinds = [' class="number"' if column >= table.numeric else ''
              for column in range(len(table.header))]
     head = ''.join(f'<th{kind}>{html.escape(title)}</th>'

@@ -1,4 +1,4 @@
-"""What a recording shows of turns by its images alone, and what its gyro felt."""
+"""Rotations of a recording from its images alone, and the rates of its gyro."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array, TRACKED
-from djet_ros.lab.imu_offset import VisualTurns
+from djet_ros.lab.imu_offset import VisualRotations
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def listen(recording: Recording, config: Config, advance: Callable[[], None]
-           ) -> tuple[VisualTurns, NDArray[np.int64], Array]:
-    """Give the turns of the images, and stamps (M,) and rates (M, 3) of the gyro."""
+def rotations_and_rates(recording: Recording, config: Config, advance: Callable[[], None]
+                        ) -> tuple[VisualRotations, NDArray[np.int64], Array]:
+    """Return the rotations between images, and stamps (M,) in ns and rates (M, 3) of the gyro."""
     tracker = Tracker(config, message_type, image_topic=recording.image_topic)
     ends: list[tuple[int, int]] = []
     rotations, stamps, rates = [], [], []
@@ -38,5 +38,5 @@ def listen(recording: Recording, config: Config, advance: Callable[[], None]
                 ends.append((last.since_ns, last.stamp_ns))
                 rotations.append(last.motion[:3, :3].T)
     start, end = np.array(ends, np.int64).reshape(-1, 2).T
-    return (VisualTurns(start, end, np.array(rotations).reshape(-1, 3, 3)),
+    return (VisualRotations(start, end, np.array(rotations).reshape(-1, 3, 3)),
             np.array(stamps, np.int64), np.array(rates, np.float64).reshape(-1, 3))

@@ -1,8 +1,8 @@
 """
-Writing bags: image sequences as rosbag2, and the results of a replay as they come.
+Writers of bags: image sequences as rosbag2, and the results of a running replay.
 
-Bags are written as ROS 2 Jazzy writes them (rosbag2 metadata version 9, chunked and indexed MCAP
-or sqlite3). The same input gives the same bytes.
+Bags have the format of ROS 2 Jazzy (rosbag2 metadata version 9, chunked and indexed MCAP or
+sqlite3). The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from djet_ros.odometry.messages import OPTICAL_TO_BODY
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, MAKE
 from djet_ros.recordings.frame_sequence import FrameSequence
-from djet_ros.recordings.outputs import appearing
+from djet_ros.recordings.outputs import created_whole
 from djet_ros.recordings.recording import SequenceRecording, WORLD_FRAME
 import numpy as np
 from rosbags.interfaces import (
@@ -33,14 +33,14 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-# Of the one file that each storage writes, named after its folder.
+# Suffixes of the one storage file, which is named after its folder.
 SUFFIXES = ('.mcap', '.db3')
 
 FOREVER = QosTime(9223372036, 854775807)
 
 
 def qos(depth: int, durability: QosDurability) -> Qos:
-    """Offer reliable delivery, which subscribers of either reliability accept."""
+    """Return a reliable QoS profile, compatible with reliable and best-effort subscribers."""
     return Qos(QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
                QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
 
@@ -55,19 +55,19 @@ def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
     """
     Write a sequence as a rosbag2 folder.
 
-    Topics: /camera/image_rect (mono8; image_raw where it is distorted), /camera/camera_info,
-    /ground_truth/pose (camera in the first camera, where the sequence knows it), /imu/data_raw
-    (where it has one) and /tf_static (map to camera_first, REP 103; camera to imu).
-    ``progress`` is called with the number of frames written so far. The bag appears under its
-    name when it is complete; a failure or an interrupt leaves nothing (a kill a hidden folder
-    beside it), and with ``overwrite`` leaves the old bag. Raises DjetError where ``out`` exists
-    (with ``overwrite``: and holds anything but such a bag) or can't be written.
+    Topics: /camera/image_rect (mono8; image_raw if distorted), /camera/camera_info,
+    /ground_truth/pose (camera in the frame of the first camera, if known), /imu/data_raw (if the
+    sequence has one) and /tf_static (map to camera_first, REP 103; camera to imu).
+    ``progress`` is called with the number of frames written so far. The bag gets its name when it
+    is complete; a failure or an interrupt leaves nothing behind (a kill leaves a hidden folder
+    next to it), and with ``overwrite`` keeps the old bag. Raises DjetError if ``out`` exists
+    (with ``overwrite``: if it holds anything but such a bag) or can't be written.
     """
     if storage not in STORAGES:
         raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
     recording = SequenceRecording(sequence, imu=True)
-    with _left_whole(out), appearing(out, overwrite, _is_written_here,
-                                     'bag folder as this command writes it') as folder:
+    with _naming_errors(out), created_whole(out, overwrite, _is_written_here,
+                                            'bag folder as this command writes it') as folder:
         writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
         with writer:
             _write_map_frame(writer, int(sequence.stamps_ns[0]))
@@ -83,22 +83,22 @@ class ResultBag(Closing):
     """
     An MCAP bag that grows message by message and stays readable if the process is killed.
 
-    Each new stamp closes the chunk before it and hands it to the operating system, so that a
-    kill loses the messages of the last stamp at most. Leaving the ``with`` statement completes
-    the bag, after an error too. DjetError where the folder exists or can't be written.
+    Each new stamp closes the chunk before it and flushes it to the operating system, so that a
+    kill loses at most the messages of the last stamp. Leaving the ``with`` statement completes
+    the bag, even after an error. Raises DjetError if the folder exists or can't be written.
     """
 
     def __init__(self, path: Path) -> None:
         """Create the folder and the file in it."""
         self.path = path
         self._stamp: int | None = None
-        with self._blaming():
+        with self._naming_errors():
             self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer.open()
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
-        """Append a message object of Jazzy; the topic is made known on its first message."""
-        with self._blaming():
+        """Append a message object of Jazzy; a topic is registered with its first message."""
+        with self._naming_errors():
             if stamp_ns != self._stamp:
                 self._flush()
                 self._stamp = stamp_ns
@@ -106,7 +106,7 @@ class ResultBag(Closing):
 
     def close(self) -> None:
         """Write the index and the metadata."""
-        with self._blaming():
+        with self._naming_errors():
             self._writer.close()
 
     def _flush(self) -> None:
@@ -117,18 +117,18 @@ class ResultBag(Closing):
             storage.bio.flush()
 
     @contextmanager
-    def _blaming(self) -> Iterator[None]:
+    def _naming_errors(self) -> Iterator[None]:
         try:
             yield
         except WriterError as error:
             raise DjetError(f'{self.path} exists; choose another name or remove it') from error
         except OSError as error:
-            raise DjetError(f'{self.path} could not be written: {error.strerror}; what was '
-                            'written before is readable') from error
+            raise DjetError(f'{self.path} could not be written: {error.strerror}; the messages '
+                            'written so far are readable') from error
 
 
 def _is_written_here(folder: Path) -> bool:
-    """Tell whether a folder holds a bag as ``write_kitti_bag`` leaves it, and nothing else."""
+    """Return whether a folder holds a bag of ``write_kitti_bag`` and nothing else."""
     held = {path.name for path in folder.iterdir() if path.is_file() and not path.is_symlink()}
     return len(held) == len(list(folder.iterdir())) and held in (
         {'metadata.yaml', f'{folder.name}{suffix}'} for suffix in SUFFIXES)
@@ -142,7 +142,7 @@ def _write(writer: Writer, topic: str, message: Any, stamp_ns: int) -> None:
 
 
 def _write_map_frame(writer: Writer, stamp_ns: int) -> None:
-    """Write where the first camera is in the map (x forward, y left, z up)."""
+    """Write the pose of the first camera in the map (x forward, y left, z up)."""
     pose = np.eye(4)
     pose[:3, :3] = OPTICAL_TO_BODY
     _write(writer, '/tf_static', MAKE.frame(stamp_ns, 'map', WORLD_FRAME, pose), stamp_ns)
@@ -155,8 +155,8 @@ def _connect(writer: Writer, topic: str, msgtype: str) -> Connection:
 
 
 @contextmanager
-def _left_whole(out: Path) -> Iterator[None]:
-    """Name the bag in what the user is told."""
+def _naming_errors(out: Path) -> Iterator[None]:
+    """Convert errors to DjetError that names the bag."""
     try:
         yield
     except (OSError, WriterError, sqlite3.Error) as error:

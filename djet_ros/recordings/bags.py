@@ -38,21 +38,21 @@ class BagMessage(NamedTuple):
 
 class Bag(Closing):
     """
-    A recording, read as a stream: only a few messages are in memory at any time.
+    A bag, read as a stream: only a few messages are in memory at any time.
 
-    Takes a rosbag2 folder (with or without metadata.yaml), one of its files (.mcap, .db3, also
-    .zstd), or a ROS 1 bag. Raises DjetError where that is not what the path holds. Close it, or
-    use it in a ``with`` statement: of a bag compressed file by file, one file is unpacked for as
-    long.
+    Opens a rosbag2 folder (with or without metadata.yaml), one of its files (.mcap, .db3, also
+    .zstd), or a ROS 1 bag; raises DjetError if the path is none of these. Close it, or use it in
+    a ``with`` statement: of a bag with file compression, one file at a time is unpacked to a
+    temporary folder.
     """
 
     def __init__(self, path: Path) -> None:
-        """Find out the topics."""
+        """Open the files and list the topics."""
         self.path = path
         self._stack = ExitStack()
         self._scratch: Path | None = None
         try:
-            with _blaming(path):
+            with _naming_errors(path):
                 files = _files(path)
             self._storages = [(file, self._opened(file)) for file in files]
         except BaseException:
@@ -66,28 +66,28 @@ class Bag(Closing):
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """
-        Yield the messages of some topics (by default of all) in the order of recording.
+        Yield the messages of some topics (default: all) in recorded order.
 
-        Where the bag is damaged, everything before the damage comes first, then DjetError.
+        If the bag is damaged, yields everything before the damage, then raises DjetError.
         """
         for file, storage in self._storages:
             chosen = {connection.number: connection for connection in storage.connections
                       if topics is None or connection.topic in topics}
-            with _blaming(file):
-                # Its place may have been needed for another.
+            with _naming_errors(file):
+                # Another file may have replaced it since.
                 self._unpacked(file)
                 yield from _decoded(storage, chosen)
 
     def close(self) -> None:
-        """Remove what was unpacked."""
+        """Remove the unpacked file."""
         self._stack.close()
 
     def _opened(self, file: Path) -> Storage:
-        with _blaming(file):
+        with _naming_errors(file):
             return open_storage(self._unpacked(file))
 
     def _unpacked(self, file: Path) -> Path:
-        """Give a file, or what it holds unpacked, which takes the place of what was unpacked."""
+        """Return the file or, if it is compressed, an unpacked copy, which replaces the last."""
         with file.open('rb') as stream:
             if stream.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
                 return file
@@ -101,14 +101,14 @@ class Bag(Closing):
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path can only be a bag: any file, or a folder that holds what a bag does."""
+    """Return whether a path is taken for a bag: any file, or a folder with files of a bag."""
     return path.is_file() or (path.is_dir() and (
         (path / 'metadata.yaml').exists() or bool(_storage_files(path))))
 
 
 @contextmanager
-def _blaming(path: Path) -> Iterator[None]:
-    """Name the file in what the user is told."""
+def _naming_errors(path: Path) -> Iterator[None]:
+    """Convert errors to DjetError that names the file."""
     try:
         yield
     except BrokenFile as error:
@@ -131,17 +131,17 @@ def _decoded(storage: Storage, chosen: dict[int, Connection]) -> Iterator[BagMes
 
 
 def _files(path: Path) -> list[Path]:
-    """Storage files of a bag in the order of recording."""
+    """Return the storage files of a bag in recorded order."""
     if path.is_dir():
         return _listed(path)
     if not path.is_file():
         state = 'is no regular file' if path.exists() else 'does not exist'
-        raise DjetError(f'{path} {state}; give a bag, or a folder of images')
+        raise DjetError(f'{path} {state}; name a bag or a folder of images')
     return [path]
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """Storage files of a folder in the order of recording: name_2 comes before name_10."""
+    """Return the storage files of a folder in recorded order: name_2 comes before name_10."""
     files = [path for path in folder.iterdir() if STORAGE_NAMES.fullmatch(path.name)]
     return sorted(files, key=lambda path: [
         (int(word), '') if word.isdecimal() else (0, word)
@@ -149,11 +149,11 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _listed(folder: Path) -> list[Path]:
-    """Storage files of a rosbag2 folder as its metadata.yaml lists them."""
+    """Return the storage files of a rosbag2 folder in the order of its metadata.yaml."""
     metadata = folder / 'metadata.yaml'
     if not metadata.exists() or not metadata.stat().st_size:
-        # It is written last: a recorder that was killed, or found the disk full, leaves the
-        # storage files only.
+        # metadata.yaml is written last: a recorder that was killed, or ran out of disk space,
+        # leaves only the storage files.
         if files := _storage_files(folder):
             return files
         raise DjetError(f'{folder} is no bag: it has neither metadata.yaml nor .mcap or .db3 '
@@ -167,13 +167,13 @@ def _listed(folder: Path) -> list[Path]:
     for path in paths:
         listed = f"{metadata} lists '{one_line(path)}'"
         if path.is_absolute() or '..' in path.parts:
-            raise DjetError(f'{listed}, which lies outside the bag; correct the list or get the '
-                            'bag from somebody you trust')
-        # Before version 4 the folder's own name came first.
+            raise DjetError(f'{listed}, which lies outside the bag; correct the list, or do not '
+                            'trust this bag')
+        # Before version 4 paths began with the name of the folder.
         if not (folder / path.name).is_file():
             raise DjetError(f'{listed}, which does not exist; copy it there')
     if not paths:
-        raise DjetError(f'{metadata} lists no file; remove it to read the storage files')
+        raise DjetError(f'{metadata} lists no files; remove it to read the storage files')
     name, count = Counter(path.name for path in paths).most_common(1)[0]
     if count > 1:
         raise DjetError(f"{metadata} lists '{one_line(name)}' {count} times; correct the list")

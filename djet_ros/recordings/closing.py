@@ -1,4 +1,4 @@
-"""What everything shares that holds files open."""
+"""Base class of everything that holds files open."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Self
 
 
 class Closing(ABC):
-    """Closed by leaving its ``with`` statement, after an error too."""
+    """Base of context managers that close themselves on exit, even after an error."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
 
     def __enter__(self) -> Self:
-        """Give the object itself."""
+        """Return self."""
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -1,4 +1,4 @@
-"""TUM RGB-D, EuRoC, TUM-VI and 7-Scenes as FrameSequence; and which layout a folder has."""
+"""Readers of TUM RGB-D, EuRoC, TUM-VI and 7-Scenes, and detection of a folder's layout."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from djet_ros.recordings.varos import varos_camera, VarosSequence
 import numpy as np
 from numpy.typing import NDArray
 
-# A gap in the ground truth wider than this is not bridged by interpolation.
+# Longest gap in the ground truth, in ns, that is interpolated.
 LONGEST_GAP_NS = 100_000_000
 
 # Published calibrations of the benchmark's cameras (fx fy cx cy, then k1 k2 p1 p2 k3), by the
@@ -40,24 +40,24 @@ TUM_CAMERAS = {
     '3': (535.4, 539.2, 320.1, 247.6),
 }
 
-# The camera that 7-Scenes tells, and the pace at which a Kinect records.
+# The camera published with 7-Scenes (fx fy cx cy), and the frame period of a Kinect.
 SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
 SEVEN_SCENES_PERIOD_NS = 33_333_333
 
-# What ASL and Kalibr call OpenCV's two models, and how many numbers these have.
+# Names of OpenCV's two distortion models in ASL and Kalibr files, and numbers of coefficients.
 ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_bob', (4,)),
               'none': ('plumb_bob', (0,)), 'equidistant': ('equidistant', (4,))}
 
 
 def tum_rgbd(folder: Path) -> FrameSequence:
     """
-    Open a TUM RGB-D folder: rgb.txt, the images that it lists and perhaps groundtruth.txt.
+    Open a TUM RGB-D folder: rgb.txt, the images that it lists, and optionally groundtruth.txt.
 
     The camera is taken from ``calibration.txt`` ("fx fy cx cy [k1 k2 p1 p2 k3]"), or from
-    the folder's name (freiburg1 to 3). Ground truth is the camera's optical frame.
+    the folder's name (freiburg1 to 3). Ground truth is the pose of the camera's optical frame.
     """
     stamps, paths = _listed_images(folder / 'rgb.txt', folder, nanoseconds)
-    K, distortion = _camera_beside(folder, _tum_camera(folder))
+    K, distortion = _calibrated_camera(folder, _tum_camera(folder))
     poses = None
     if (truth := folder / 'groundtruth.txt').exists():
         known, known_poses = read_tum(truth)
@@ -69,11 +69,11 @@ def seven_scenes(folder: Path) -> FrameSequence:
     """
     Open a sequence of 7-Scenes: frame-*.color.png (or .jpg), each with its frame-*.pose.txt.
 
-    It tells no stamps: the images follow one another at 30 Hz. ``calibration.txt`` goes before
-    the camera that the data set tells.
+    The data set has no stamps; the images are taken to be at 30 Hz. ``calibration.txt`` overrides
+    the published camera.
     """
     paths = _seven_scenes_images(folder)
-    K, distortion = _camera_beside(folder, SEVEN_SCENES_CAMERA)
+    K, distortion = _calibrated_camera(folder, SEVEN_SCENES_CAMERA)
     stamps = STAMP_OFFSET_NS + np.arange(len(paths), dtype=np.int64) * SEVEN_SCENES_PERIOD_NS
     poses = np.full((len(paths), 4, 4), np.nan)
     for index, path in enumerate(paths):
@@ -81,7 +81,7 @@ def seven_scenes(folder: Path) -> FrameSequence:
         if truth.exists():
             rows = number_rows(truth, 4)
             if len(rows) != 4:
-                raise DjetError(f'{truth} has {len(rows)} rows, a pose has 4')
+                raise DjetError(f'{truth} has {len(rows)} rows; a pose must have 4')
             check_rigid(rows[None], truth)
             poses[index] = rows
     return FrameSequence(folder.resolve().name, ImageFiles(paths), K, stamps, from_first(poses),
@@ -90,11 +90,11 @@ def seven_scenes(folder: Path) -> FrameSequence:
 
 def euroc(folder: Path) -> FrameSequence:
     """
-    Open an EuRoC or TUM-VI (ASL) folder: mav0/cam0, perhaps with ground truth and an IMU.
+    Open an EuRoC or TUM-VI (ASL) folder: mav0/cam0, optionally with ground truth and an IMU.
 
-    The camera is that of cam0/sensor.yaml or, as TUM-VI has it, of dso/camchain.yaml. Ground
-    truth (state_groundtruth_estimate0, or mocap0) is moved from the body, which is the IMU, to
-    the camera.
+    The camera is that of cam0/sensor.yaml or, in TUM-VI, of dso/camchain.yaml. Ground truth
+    (state_groundtruth_estimate0, or mocap0) is transformed from the body frame, which is that of
+    the IMU, to the camera.
     """
     mav = folder / 'mav0' if (folder / 'mav0').is_dir() else folder
     camera = mav / 'cam0'
@@ -120,7 +120,7 @@ def open_sequence(path: Path, own_poses: bool = True) -> FrameSequence:
     """
     Open a folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, EuRoC, TUM-VI or VAROS.
 
-    own_poses: whether the file of poses beside a KITTI sequence is its, which may be of others.
+    own_poses: whether to read ../../poses/NN.txt of a KITTI sequence as its ground truth.
     """
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
@@ -147,22 +147,22 @@ def _seven_scenes_images(folder: Path) -> list[Path]:
 
 def _listed_images(path: Path, folder: Path, stamp: Callable[[str], int]
                    ) -> tuple[NDArray[np.int64], list[Path]]:
-    """Stamps and image paths of a list "stamp name"; the names are relative to a folder."""
+    """Return stamps and image paths of a list "stamp name" with names relative to a folder."""
     stamps, paths = [], []
     for number, text in lines(path):
         words = text.replace(',', ' ').split()
         if len(words) != 2:
-            raise DjetError(f"{path} line {number} has {len(words)} words; 'stamp file' belongs "
-                            'there')
+            raise DjetError(f"{path} line {number} has {len(words)} words; 'stamp file' is "
+                            'expected')
         name = PurePosixPath(words[1])
         if name.is_absolute() or '..' in name.parts:
             raise DjetError(f"{path} line {number}: '{name}' lies outside the folder")
         if '\0' in words[1]:
-            raise DjetError(f"{path} line {number}: '{name}' is no name of a file")
+            raise DjetError(f"{path} line {number}: '{name}' is not a file name")
         stamps.append(stamped(path, number, words[0], stamp))
         paths.append(folder / name)
     if not stamps:
-        raise DjetError(f'{path} lists no image')
+        raise DjetError(f'{path} lists no images')
     return increasing(np.array(stamps, dtype=np.int64), path), paths
 
 
@@ -171,8 +171,9 @@ def _tum_camera(folder: Path) -> Sequence[float]:
     return TUM_CAMERAS[named[1]] if named else ()
 
 
-def _camera_beside(folder: Path, published: Sequence[float]) -> tuple[Array, Sequence[float]]:
-    """Give the camera of calibration.txt, or else the one that a data set has published."""
+def _calibrated_camera(folder: Path, published: Sequence[float]
+                       ) -> tuple[Array, Sequence[float]]:
+    """Return (K, distortion) of calibration.txt, or else those published with the data set."""
     file, values = folder / 'calibration.txt', tuple(published)
     if file.exists():
         _, text = next(lines(file), (0, ''))
@@ -187,11 +188,11 @@ def _camera_beside(folder: Path, published: Sequence[float]) -> tuple[Array, Seq
 
 
 def _asl_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
-    """Camera matrix, distortion and its model, and the camera in the body (4, 4)."""
+    """Return camera matrix, distortion, its model, and the pose of the camera in the body."""
     sensor = read_yaml(path)
     if not isinstance(sensor, dict):
-        raise DjetError(f'{path} is no ASL camera description: no intrinsics and no T_BS are in '
-                        'it; replace the file, which may have been cut')
+        raise DjetError(f'{path} is no ASL camera description: it has neither intrinsics nor '
+                        'T_BS; replace the file, which may be truncated')
     try:
         named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
@@ -206,7 +207,7 @@ def _asl_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
 
 
 def _kalibr_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
-    """Give the same from the first camera of Kalibr's chain, in which T_cam_imu is the inverse."""
+    """Do the same for cam0 of a Kalibr camera chain, whose T_cam_imu is the inverse pose."""
     chain = read_yaml(path)
     try:
         camera = chain['cam0']
@@ -215,7 +216,7 @@ def _kalibr_camera(path: Path) -> tuple[Array, Sequence[float], str, Array]:
         distortion = [float(value) for value in camera['distortion_coeffs']]
         body_in_camera = _rigid(camera['T_cam_imu'])
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise DjetError(f'{path} is no camera chain of Kalibr (cam0: intrinsics, T_cam_imu): '
+        raise DjetError(f'{path} is no Kalibr camera chain (cam0: intrinsics, T_cam_imu): '
                         f'{one_line(error)}') from error
     check_rigid(body_in_camera[None], path)
     model = _model(path, named, intrinsics, distortion)
@@ -231,13 +232,13 @@ def _model(path: Path, named: object, intrinsics: Sequence[float], distortion: S
     model, counts = ASL_MODELS.get(str(named), ('', ()))
     if len(intrinsics) != 4 or len(distortion) not in counts:
         raise DjetError(f"{path}: distortion model '{one_line(named, 40)}' with "
-                        f'{len(intrinsics)} and {len(distortion)} numbers; radial-tangential and '
-                        'equidistant with 4 and 4 are known')
+                        f'{len(intrinsics)} intrinsics and {len(distortion)} coefficients; '
+                        'supported are radial-tangential and equidistant, with 4 and 4')
     return model
 
 
 def _asl_imu(folder: Path, camera_in_body: Array) -> ImuTrack | None:
-    """Give what the IMU felt; its axes are those of its sensor.yaml, or the body's."""
+    """Return the IMU samples, if any; the axes are those of its sensor.yaml, or the body's."""
     if not (folder / 'data.csv').exists():
         return None
     imu_in_body = np.eye(4)
@@ -256,7 +257,8 @@ def _camera(intrinsics: Sequence[float], distortion: Sequence[float], path: Path
             ) -> tuple[Array, Sequence[float]]:
     fx, fy, cx, cy = intrinsics
     if not (fx > 0 and fy > 0 and np.isfinite([*intrinsics, *distortion]).all()):
-        raise DjetError(f'{path}: fx fy cx cy = {fx:g} {fy:g} {cx:g} {cy:g} is no camera')
+        raise DjetError(f'{path}: fx fy cx cy = {fx:g} {fy:g} {cx:g} {cy:g} is no valid camera; '
+                        'focal lengths must be positive')
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), distortion
 
 

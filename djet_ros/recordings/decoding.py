@@ -1,9 +1,9 @@
 """
-Serialised messages of any ROS 1 or ROS 2 bag to message objects of ROS 2 Jazzy.
+Deserialisation of messages of any ROS 1 or ROS 2 bag to message objects of ROS 2 Jazzy.
 
-A recording carries the definitions of its types. Where they are Jazzy's, or where it has none,
-Jazzy's own classes read it. Otherwise the recorded definition reads the bytes, and fields go by
-name into Jazzy's class: ROS 1's ``K`` becomes ``k``, its ``header.seq`` is left out.
+A bag carries the definitions of its types. If they equal Jazzy's, or if it has none, Jazzy's own
+classes deserialise the messages. Otherwise the recorded definition does, and fields are copied by
+name into Jazzy's class: ROS 1's ``K`` becomes ``k``, its ``header.seq`` is dropped.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from rosbags.typesys.store import Typestore
 Decoder: TypeAlias = Callable[[memoryview], Any]
 
 # rosbags compiles a definition to code, with lines for each element of a fixed array of messages
-# or strings. Real definitions have a few kB with their comments, and hardly such arrays.
+# or strings. Limits in characters and elements; real definitions have a few kB with comments, and
+# rarely such arrays.
 LONGEST_DEFINITION = 32 << 10
 MOST_FIXED_ELEMENTS = 256
 
-# Each element of a sequence of messages or strings becomes an object of a hundred bytes or more,
-# and may have taken a single byte, or none, of the message.
+# Limit of the elements of sequences of messages or strings: each becomes an object of a hundred
+# bytes or more in memory, from as little as one byte, or none, of the message.
 MOST_ELEMENTS = 1 << 22
 
-# Least bytes of the basic types; all others have one.
+# Minimum serialised size of basic types in bytes; all others have 1.
 BYTES = {'int16': 2, 'uint16': 2, 'int32': 4, 'uint32': 4, 'float32': 4, 'string': 4, 'int64': 8,
          'uint64': 8, 'float64': 8}
 
-# What rosbags adds to a type without fields, and reads from no byte of a ROS 1 message.
+# Field that rosbags adds to an empty type; it takes no bytes of a ROS 1 message.
 NO_FIELD = 'structure_needs_at_least_one_member'
 
 FAMILIES = {'bool': 'bool', 'string': 'text', 'float32': 'float', 'float64': 'float'}
@@ -44,28 +45,28 @@ FAMILIES = {'bool': 'bool', 'string': 'text', 'float32': 'float', 'float64': 'fl
 
 @cache
 def jazzy() -> Typestore:
-    """Message types of ROS 2 Jazzy."""
+    """Return the message types of ROS 2 Jazzy."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def message_type(name: str) -> type:
-    """Class of a message type of Jazzy, such as 'sensor_msgs/msg/Image'."""
+    """Return the class of a message type of Jazzy, such as 'sensor_msgs/msg/Image'."""
     return jazzy().types[name]
 
 
-# Messages of Jazzy's own classes.
+# Factory of messages in Jazzy's classes.
 MAKE = MessageFactory(message_type)
 
 
 def decoder(connection: Connection) -> Decoder:
-    """Make the function from bytes to a message for one connection, else BrokenFile."""
+    """Return the function from bytes to message of a connection; raise BrokenFile if none can."""
     if connection.encoding not in ('cdr', 'ros1'):
         raise BrokenFile(f"encoding '{connection.encoding[:40]}' is neither cdr nor ros1")
-    # The definition becomes generated code in rosbags, which fails on hostile text in any way.
+    # rosbags generates code from the definition; with malformed text it can raise any exception.
     try:
         store = _store(connection)
         if connection.msgtype not in store.types:
-            raise ValueError('it is unknown, and the bag holds no definition of it')
+            raise ValueError('it is not in ROS 2 Jazzy, and the bag holds no definition of it')
         store.get_msgdef(connection.msgtype)
         largest = _largest_message(store, connection.msgtype)
     except Exception as error:
@@ -84,9 +85,9 @@ def _decode(connection: Connection, store: Typestore, convert: Callable[[Any], A
         data = decompress_message(data)
     if len(data) > largest:
         raise BrokenFile(f'it has {len(data)} bytes; a {connection.msgtype} of more than '
-                         f'{largest} may unfold to more than memory holds')
+                         f'{largest} could exceed the memory when deserialised')
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-    # As above: the code that reads the bytes was generated from what the file says.
+    # As above: the code was generated from the file, and can raise any exception.
     try:
         return convert(deserialize(data, connection.msgtype))
     except Exception as error:
@@ -94,7 +95,7 @@ def _decode(connection: Connection, store: Typestore, convert: Callable[[Any], A
 
 
 def _store(connection: Connection) -> Typestore:
-    """Types to read a connection with: Jazzy's own if they are the same."""
+    """Return the types that deserialise a connection: Jazzy's own if they are the same."""
     if not connection.definition:
         return get_typestore(Stores.ROS1_NOETIC) if connection.encoding == 'ros1' else jazzy()
     if len(connection.definition) > LONGEST_DEFINITION:
@@ -112,7 +113,7 @@ def _store(connection: Connection) -> Typestore:
 
 
 def _largest_message(store: Typestore, msgtype: str) -> int:
-    """Bytes of a message beyond which it might have more than MOST_ELEMENTS elements."""
+    """Return the bytes beyond which a message could have more than MOST_ELEMENTS elements."""
     least = min(_elements(store, (Nodetype.NAME, msgtype)), default=LARGEST_PIECE)
     if least == 0:
         raise ValueError('it has sequences of elements that take no bytes')
@@ -120,7 +121,7 @@ def _largest_message(store: Typestore, msgtype: str) -> int:
 
 
 def _elements(store: Typestore, kind: Any) -> Iterator[int]:
-    """Least bytes of the elements of all sequences in a kind of field that become objects."""
+    """Yield the minimum element sizes of all sequences of messages or strings in a field type."""
     node, detail = kind
     if node == Nodetype.NAME:
         for _, inner in store.fielddefs[detail][1]:
@@ -133,14 +134,14 @@ def _elements(store: Typestore, kind: Any) -> Iterator[int]:
 
 
 def _least_bytes(store: Typestore, kind: Any) -> int:
-    """Bytes that a kind of field takes at least."""
+    """Return the minimum serialised size of a field type in bytes."""
     node, detail = kind
     if node == Nodetype.NAME:
         return sum(_least_bytes(store, inner) for name, inner in store.fielddefs[detail][1]
                    if name != NO_FIELD)
     if node == Nodetype.BASE:
         return BYTES.get(detail[0], 1)
-    # A sequence may be empty, but has its length.
+    # A sequence may be empty, but its length is stored.
     return 4 if node == Nodetype.SEQUENCE else detail[1] * _least_bytes(store, detail[0])
 
 
@@ -155,21 +156,21 @@ def _identity(message: Any) -> Any:
 
 
 def _converter(source: Typestore, name: str) -> Callable[[Any], Any]:
-    """Make the function that copies a message of another store into Jazzy's class."""
+    """Return the function that copies a message of another store into Jazzy's class."""
     recorded = {field.lower(): (field, kind) for field, kind in source.fielddefs[name][1]}
     steps = []
     for field, kind in jazzy().fielddefs[name][1]:
         attribute, have = recorded.get(field.lower(), (field, None))
-        if have is None or not _alike(have, kind):
-            raise BrokenFile(f"type '{name}' was recorded without a field '{field}' as ROS 2 "
-                             'Jazzy has it')
+        if have is None or not _compatible(have, kind):
+            raise BrokenFile(f"type '{name}' was recorded without a field '{field}' of the type "
+                             'that it has in ROS 2 Jazzy')
         steps.append((attribute, _copier(source, kind)))
     cls = message_type(name)
     return lambda message: cls(*(copy(getattr(message, attribute)) for attribute, copy in steps))
 
 
 def _copier(source: Typestore, kind: Any) -> Callable[[Any], Any]:
-    """Make the function that copies one field of a kind."""
+    """Return the function that copies a field of a type."""
     if kind[0] == Nodetype.NAME:
         return _converter(source, kind[1])
     if kind[0] == Nodetype.BASE:
@@ -185,8 +186,8 @@ def _copier(source: Typestore, kind: Any) -> Callable[[Any], Any]:
     return lambda items: np.asarray(items, dtype=dtype)
 
 
-def _alike(have: Any, want: Any) -> bool:
-    """Tell whether values of one kind of field fit into another."""
+def _compatible(have: Any, want: Any) -> bool:
+    """Return whether values of one field type can be assigned to another."""
     if have[0] != want[0]:
         return False
     if have[0] == Nodetype.NAME:
@@ -194,4 +195,4 @@ def _alike(have: Any, want: Any) -> bool:
     if have[0] == Nodetype.BASE:
         return FAMILIES.get(have[1][0], 'int') == FAMILIES.get(want[1][0], 'int')
     fixed = have[0] == Nodetype.ARRAY
-    return _alike(have[1][0], want[1][0]) and (not fixed or have[1][1] == want[1][1])
+    return _compatible(have[1][0], want[1][0]) and (not fixed or have[1][1] == want[1][1])

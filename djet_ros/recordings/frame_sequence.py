@@ -1,4 +1,4 @@
-"""Recorded image sequences, and the image files beneath them."""
+"""Sequences of image files with calibration, stamps and ground truth."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from djet_ros.recordings.imu import ImuTrack
 import numpy as np
 from numpy.typing import NDArray
 
-# A JPEG file may show a thumbnail and a colour profile before it tells its size.
+# Bytes searched for the size of a JPEG: a thumbnail and a colour profile may precede it.
 _LONGEST_JPEG_HEADER = 1 << 20
 
 _JPEG_START = b'\xff\xd8'
 
 
 class DamagedImage(DjetError):
-    """A file that began like an image, and can't be decoded; path: of the file."""
+    """A file with the header of an image that can't be decoded; path: of the file."""
 
     def __init__(self, path: Path, why: BadMessage) -> None:
-        """Keep the path beside the text."""
-        super().__init__(f'{path} is a damaged image ({why}); replace it, or leave its frame out')
+        """Keep the path, and make the message."""
+        super().__init__(f'{path} is a damaged image ({why}); replace it, or exclude its frame')
         self.path = path
 
 
 class FrameSequence:
     """
-    Images of one moving camera in files, with stamps and perhaps ground truth.
+    Image files of one moving camera, with stamps and optionally ground truth and an IMU.
 
-    name: for people; K: (3, 3) camera matrix in pixels, pixel centres at integers; distortion:
-    as OpenCV has it for the model ('plumb_bob': k1, k2, p1, p2 and k3, zeros where the images
+    name: for display; K: (3, 3) camera matrix in pixels, pixel centres at integers; distortion:
+    OpenCV's coefficients of the model ('plumb_bob': k1, k2, p1, p2 and k3, zeros if the images
     are rectified; or 'equidistant': k1 to k4); size: (width, height); frame_paths: the files;
-    stamps_ns: (N,) int64, strictly increasing, never 0; poses: (N, 4, 4), camera in the first
-    known one's frame, rows of NaN where the ground truth does not reach, or None where there is
-    none; imu: what an IMU beside the camera felt, or None.
+    stamps_ns: (N,) int64, strictly increasing, never 0; poses: (N, 4, 4), camera in the frame of
+    the first known pose, NaN for frames without ground truth, or None without any; imu: samples
+    of an IMU on the camera, or None.
     """
 
     def __init__(self, name: str, images: ImageFiles, K: Array, stamps_ns: NDArray[np.int64],
@@ -69,32 +69,32 @@ class FrameSequence:
 
     @property
     def distorted(self) -> bool:
-        """Whether the files show what a pinhole would not."""
+        """Return whether the images in the files are distorted."""
         return distorts(self.model, self.distortion)
 
     def raw(self, index: int) -> NDArray[Any]:
-        """Gray pixels (H, W) of a frame as its file has them, uint8 or uint16; DamagedImage."""
+        """Return the gray image (H, W) of a frame as stored, uint8 or uint16."""
         return self._images.pixels(index)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Gray pixels (H, W) of a frame without its distortion."""
+        """Return the undistorted gray pixels (H, W) of a frame."""
         return self._camera.undistort(self._images.gray(index))
 
     def frame(self, index: int) -> Frame:
-        """Give a frame as an odometry takes it, from which is left out what no image shows."""
+        """Return a frame for the odometry; pixels that the file does not show are excluded."""
         return Frame(self.image(index), self.K, int(self.stamps_ns[index]),
                      left_out=self._unseen())
 
     def _unseen(self) -> NDArray[np.bool_] | None:
-        """(H, W) bool, pixels without distortion that the files do not show, or None."""
+        """Return the undistorted pixels (H, W) that the files do not show, or None."""
         return self._camera.unseen(self.size[::-1])
 
 
 def from_first(poses: Array) -> Array | None:
     """
-    Express poses (N, 4, 4) in the frame of the first that is known, the others being NaN.
+    Express poses (N, 4, 4) in the frame of the first known one; unknown poses are NaN.
 
-    An identity there changes no bit. None where none is known.
+    Returns None if none is known. If the first is the identity, no bit changes.
     """
     known = np.isfinite(poses).all(axis=(1, 2))
     if not known.any():
@@ -107,25 +107,25 @@ class ImageFiles:
     """
     PNG or JPEG files of one size, decoded one at a time.
 
-    The headers of all files are checked at once, so that a wrong file is found before the work
-    begins and no declared size is believed before it was compared.
+    The headers of all files are checked first, so that a wrong file is found before the work
+    begins.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Check that all are images of one size; DjetError names the first that isn't."""
+        """Check that all are images of one size; raise DjetError for the first that is not."""
         self.paths = tuple(paths)
         self.size = image_size(self.paths[0])
         for path in self.paths[1:]:
             if (size := image_size(path)) != self.size:
                 raise DjetError(f'{path} is {size[0]}x{size[1]}, the images before it are '
-                                f'{self.size[0]}x{self.size[1]}; one size is needed')
+                                f'{self.size[0]}x{self.size[1]}; all must have the same size')
 
     def gray(self, index: int) -> NDArray[np.uint8]:
-        """Image (H, W) uint8 of a file; of 16 bits the upper 8."""
+        """Return one image (H, W) uint8, the upper 8 bits of a 16-bit one."""
         return narrowed(self.pixels(index))
 
     def pixels(self, index: int) -> NDArray[Any]:
-        """Image (H, W), uint8 or uint16, of a file; colours become gray."""
+        """Return the image (H, W), uint8 or uint16, of a file; colours become gray."""
         path = self.paths[index]
         try:
             image = decoded(np.frombuffer(path.read_bytes(), np.uint8))
@@ -134,12 +134,12 @@ class ImageFiles:
         except BadMessage as error:
             raise DamagedImage(path, error) from error
         if image.shape != self.size[::-1]:
-            raise DjetError(f'{path} has changed its size since the work began')
+            raise DjetError(f'{path} has changed its size during the run')
         return image
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Give (width, height) from the header of a PNG or JPEG file, else DjetError."""
+    """Return (width, height) from the header of a PNG or JPEG file; raise DjetError if neither."""
     try:
         with path.open('rb') as file:
             header = file.read(24)

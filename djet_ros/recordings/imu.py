@@ -1,4 +1,4 @@
-"""What an IMU beside a camera felt, as files tell it."""
+"""Samples of an IMU, read from files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 class ImuTrack(NamedTuple):
     """
-    Samples of an IMU, as they were recorded: nobody says that their stamps increase.
+    Samples of an IMU as recorded; stamps may be out of order.
 
-    stamps_ns: (M,); rates: (M, 3) in rad/s and accelerations: (M, 3) in m/s², along the IMU's
-    axes; to_camera: (3, 3) rotation of these axes to those of the camera.
+    stamps_ns: (M,); rates: (M, 3) in rad/s and accelerations: (M, 3) in m/s², in the IMU's axes;
+    to_camera: (3, 3) rotation from these axes to those of the camera.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -26,7 +26,7 @@ class ImuTrack(NamedTuple):
     to_camera: Array
 
     def until(self, start: int, stamp_ns: int) -> Iterator[int]:
-        """Give the samples from one on, up to the first that is not before a stamp."""
+        """Yield sample indices from ``start`` to the first that is not before the stamp."""
         for index in range(start, len(self.stamps_ns)):
             yield index
             if self.stamps_ns[index] >= stamp_ns:
@@ -35,7 +35,7 @@ class ImuTrack(NamedTuple):
 
 def read_asl_imu(path: Path, to_camera: Array, offset_ns: int = 0) -> ImuTrack:
     """
-    Read a csv of EuRoC or TUM-VI: stamp in ns, three rates in rad/s, three accelerations in m/s².
+    Read a CSV of EuRoC or TUM-VI: stamp in ns, three rates in rad/s, three accelerations in m/s².
 
     offset_ns is added to the stamps. Raises DjetError.
     """

@@ -20,9 +20,9 @@ from djet_ros.recordings.text import (
 import numpy as np
 from numpy.typing import NDArray
 
-# times.txt counts from 0, but in ROS a stamp of 0 means "no time" and a look back by some
-# seconds must not fall below it. A round offset is easily taken off again, and still leaves
-# sub-nanosecond resolution in a double.
+# Offset of stamps in ns. times.txt begins at 0, but in ROS a stamp of 0 means "no time", and tf
+# lookups some seconds back must not become negative. A round number is easy to subtract, and
+# 1000 s leave sub-nanosecond resolution in a double.
 STAMP_OFFSET_NS = 1000 * 10**9
 
 
@@ -30,17 +30,17 @@ class KittiSequence(FrameSequence):
     """
     A folder ``.../sequences/NN`` with ``image_0/*.png``, ``calib.txt`` and ``times.txt``.
 
-    The left gray camera, already rectified; what that left of distortion may stand in calib.txt,
-    in a row ``D: k1 k2 p1 p2 k3`` as OpenCV has them. Stamps are those of times.txt
-    plus STAMP_OFFSET_NS. Rendered sequences may have an ``imu.csv`` as EuRoC has it, and a row
-    ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, where it exists and
+    The left gray camera, already rectified; calib.txt may give its residual distortion in a row
+    ``D: k1 k2 p1 p2 k3`` (OpenCV's coefficients). Stamps are those of times.txt plus
+    STAMP_OFFSET_NS. Rendered sequences may have an ``imu.csv`` in the format of EuRoC, and a row
+    ``Tr_imu_to_cam`` in calib.txt. Ground truth is taken from ``poses`` or, if it exists and
     own_poses is true, from ``../../poses/NN.txt``, and expressed in the first camera of the range
-    start <= i < end. Raises DjetError where the folder does not keep to the layout.
+    start <= i < end. Raises DjetError if the folder does not have this layout.
     """
 
     def __init__(self, folder: Path, poses: Path | None = None, start: int = 0,
                  end: int | None = None, own_poses: bool = True) -> None:
-        """Read everything but the images, and check that it belongs together."""
+        """Read everything but the images, and check its consistency."""
         self.folder = folder.resolve()
         paths = _image_paths(self.folder)
         chosen = _frame_range(len(paths), start, end, self.folder)
@@ -58,7 +58,7 @@ class KittiSequence(FrameSequence):
 
 
 def read_camera(path: Path) -> Array:
-    """Camera matrix K (3, 3) from the row P0 of a calib.txt; DjetError where it makes none."""
+    """Return K (3, 3) from the row P0 of a calib.txt; raise DjetError if P0 is invalid."""
     number, P = _calibration(path, 'P0', 'it must give the 3x4 projection of camera 0')
     if min(P[0, 0], P[1, 1]) <= 0 or P[2].tolist() != [0, 0, 1, 0] or P[1, 0] != 0:
         raise DjetError(f'{path} line {number}: P0 is no projection of a rectified camera '
@@ -68,7 +68,7 @@ def read_camera(path: Path) -> Array:
 
 
 def _calibration(path: Path, name: str, meaning: str) -> tuple[int, Array]:
-    """Line and matrix (3, 4) of a row of a calib.txt; DjetError where there is none."""
+    """Return line and matrix (3, 4) of a row of a calib.txt; raise DjetError if it is missing."""
     row = _row(path, name, 12)
     if row is None:
         raise DjetError(f"{path} has no line '{name}:'; {meaning}")
@@ -76,13 +76,13 @@ def _calibration(path: Path, name: str, meaning: str) -> tuple[int, Array]:
 
 
 def _distortion(path: Path) -> list[float]:
-    """Coefficients of distortion from the row D of a calib.txt; none where there is no row."""
+    """Return the distortion coefficients of the row D of a calib.txt; none without the row."""
     row = _row(path, 'D', 5)
     return [] if row is None else row[1]
 
 
 def _row(path: Path, name: str, count: int) -> tuple[int, list[float]] | None:
-    """Line and numbers of the first row of a name, if there is one; DjetError if it is wrong."""
+    """Return line and numbers of the first row of a name, or None; raise DjetError if wrong."""
     rows = [(number, text.partition(':')[2]) for number, text in lines(path)
             if text.partition(':')[0].strip() == name]
     if not rows:
@@ -91,10 +91,10 @@ def _row(path: Path, name: str, count: int) -> tuple[int, list[float]] | None:
     try:
         values = numbers(row)
     except ValueError as error:
-        raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
+        raise DjetError(f'{path} line {number}: {error}; correct or replace the file') from error
     if len(values) != count:
-        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers, {count} belong '
-                        'there')
+        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers; it must have '
+                        f'{count}')
     return number, values
 
 
@@ -108,7 +108,7 @@ def _imu(folder: Path) -> ImuTrack | None:
 
 
 def read_poses(path: Path) -> Array:
-    """Poses (N, 4, 4) of a KITTI pose file; DjetError names the first line that is no pose."""
+    """Return the poses (N, 4, 4) of a KITTI file; raise DjetError for the first invalid line."""
     rows = number_rows(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
@@ -117,28 +117,28 @@ def read_poses(path: Path) -> Array:
 
 
 def check_rigid(poses: Array, path: Path) -> None:
-    """Raise DjetError that names the file and the first of poses (N, 4, 4) that is no motion."""
+    """Raise DjetError for the first of poses (N, 4, 4) that is no rigid transformation."""
     check_positions(poses[:, :3, 3], path)
-    # Squares of anything larger would not be finite, and compare as nothing does.
+    # Clipped, because squares of larger numbers could overflow to inf, and inf - inf is NaN.
     R = np.clip(np.nan_to_num(poses[:, :3, :3], nan=9.0), -9.0, 9.0)
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     wrong = np.flatnonzero((error > 1e-3) | (np.linalg.det(R) < 0)
                            | (poses[:, 3] != (0, 0, 0, 1)).any(axis=1))
     if wrong.size:
-        raise DjetError(f'{path}: pose {wrong[0]} is no rigid motion (its rotation part is off '
-                        f'by {error[wrong[0]]:.2g}); is it a file of poses?')
+        raise DjetError(f'{path}: pose {wrong[0]} is no rigid transformation (R R^T differs from '
+                        f'the identity by {error[wrong[0]]:.2g}); is it a file of poses?')
 
 
 def _image_paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         state = 'is a file' if folder.exists() else 'does not exist'
-        raise DjetError(f'{folder} {state}; give a KITTI sequence folder such as sequences/00')
+        raise DjetError(f'{folder} {state}; name a KITTI sequence folder such as sequences/00')
     paths = sorted((folder / 'image_0').glob('*.png'))
     if not paths:
         inner = sorted(path.parent.relative_to(folder) for depth in ('*', 'sequences/*')
                        for path in folder.glob(f'{depth}/image_0'))
-        hint = (f'it holds {", ".join(map(str, inner[:8]))}: give one of these' if inner else
-                'give a KITTI sequence folder such as sequences/00')
+        hint = (f'it holds {", ".join(map(str, inner[:8]))}: name one of these' if inner else
+                'name a KITTI sequence folder such as sequences/00')
         raise DjetError(f'{folder} has no images image_0/*.png; {hint}')
     return paths
 
@@ -146,8 +146,8 @@ def _image_paths(folder: Path) -> list[Path]:
 def _frame_range(count: int, start: int, end: int | None, folder: Path) -> slice:
     stop = count if end is None else end
     if not 0 <= start < stop <= count:
-        raise DjetError(f'frames {start} to {stop} were asked for, {folder} has 0 to {count}; '
-                        'start must lie below end (end itself is left out)')
+        raise DjetError(f'--start {start} --end {stop} is outside of the {count} frames of '
+                        f'{folder}, or empty; it must hold that 0 <= start < end <= {count}')
     return slice(start, stop)
 
 
@@ -170,5 +170,5 @@ def _poses(path: Path, count: int) -> Array:
 
 def _check_length(path: Path, have: int, count: int) -> None:
     if have != count:
-        raise DjetError(f'{path} has {have} lines for {count} images in image_0; '
-                        'there must be one for each')
+        raise DjetError(f'{path} has {have} lines for {count} images in image_0; it must have '
+                        'one per image')

@@ -1,9 +1,9 @@
 """
-Drives of KITTI's raw data (Geiger et al., IJRR 2013), as they are downloaded.
+Drives of KITTI's raw data (Geiger et al., IJRR 2013), in the layout of the download.
 
-A drive holds image_00/data/*.png and image_00/timestamps.txt; the folder above it, or the drive,
-the calibration: calib_cam_to_cam.txt and, where the GPS/IMU is to be of use (oxts),
-calib_velo_to_cam.txt and calib_imu_to_velo.txt.
+A drive holds image_00/data/*.png and image_00/timestamps.txt. The calibration is in the drive or
+in the folder above it: calib_cam_to_cam.txt and, to use the GPS/IMU (oxts), calib_velo_to_cam.txt
+and calib_imu_to_velo.txt.
 """
 
 from __future__ import annotations
@@ -32,37 +32,38 @@ from scipy.spatial.transform import Rotation
 
 _EARTH_RADIUS = 6378137.0
 
-# A gap in the GPS/IMU wider than this is not bridged; the synchronised one has a sample an image.
+# Longest gap in the GPS/IMU, in ns, that is interpolated; synchronised drives have one per image.
 _LONGEST_GAP_NS = 250_000_000
 
-# Columns of a file of oxts: place, attitude, accelerations and rates along the unit's own axes.
+# Columns of a file of oxts, and those of accelerations and angular rates in the unit's axes.
 _COLUMNS, _ACCELERATIONS, _RATES = 30, slice(11, 14), slice(17, 20)
 
 _IMAGES = Path('image_00') / 'data'
 
 
 def is_kitti_raw(folder: Path) -> bool:
-    """Tell whether a folder is a drive of the raw data."""
+    """Return whether a folder is a drive of the raw data."""
     return (folder / _IMAGES).is_dir()
 
 
 def kitti_raw(folder: Path) -> FrameSequence:
     """
-    Open a drive: the left gray camera, rectified (…_sync) or as it was recorded (…_extract).
+    Open a drive: the left gray camera, rectified (…_sync) or raw (…_extract).
 
-    Ground truth and IMU are those of oxts, where it and its calibration are there. Stamps are
-    taken for UTC. Raises DjetError.
+    Ground truth and IMU are those of oxts, if it and its calibration are present. Stamps are
+    taken as UTC. Raises DjetError.
     """
     paths = sorted((folder / _IMAGES).glob('*.png'))
     if not paths:
-        raise DjetError(f'{folder / _IMAGES} holds no *.png; give a drive of the raw data')
+        raise DjetError(f'{folder / _IMAGES} holds no *.png; name a drive of the raw data')
     images = ImageFiles(paths)
     stamps = _stamps(folder / 'image_00' / 'timestamps.txt')
     if len(stamps) != len(paths):
         raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} '
-                        'images; there must be one for each')
+                        'images; there must be one per image')
     increasing(stamps, folder / 'image_00' / 'timestamps.txt')
-    K, distortion, rectifying = _camera(_beside(folder, 'calib_cam_to_cam.txt'), images.size)
+    K, distortion, rectifying = _camera(_calibration_file(folder, 'calib_cam_to_cam.txt'),
+                                        images.size)
     poses = imu = None
     if (unit_in_camera := _unit_in_camera(folder, rectifying)) is not None:
         known, rows = _oxts(folder / 'oxts')
@@ -75,12 +76,12 @@ def kitti_raw(folder: Path) -> FrameSequence:
                          distortion.tolist(), imu=imu)
 
 
-def _beside(folder: Path, name: str) -> Path:
-    """Find a file of the calibration in the drive, or in the day's folder above it."""
+def _calibration_file(folder: Path, name: str) -> Path:
+    """Return a calibration file, in the drive or in the day's folder above it."""
     places = (folder / name, folder.resolve().parent / name)
     found = next((path for path in places if path.exists()), None)
     if found is None:
-        raise DjetError(f'{places[1]} is missing; copy it there, from the calibration of the day')
+        raise DjetError(f'{places[1]} is missing; download the calibration of that day')
     return found
 
 
@@ -90,7 +91,7 @@ def _stamps(path: Path) -> NDArray[np.int64]:
 
 
 def clock_nanoseconds(text: str) -> int:
-    """Nanoseconds since 1970 of a UTC clock such as '2011-09-26 13:02:25.964389445'."""
+    """Return the ns since 1970 of a UTC time such as '2011-09-26 13:02:25.964389445'."""
     whole, _, rest = text.partition('.')
     if len(rest) > 9 or (rest and not (rest.isascii() and rest.isdecimal())):
         raise ValueError(f"'{text[:40]}' is no stamp of the form 2011-09-26 13:02:25.964389445")
@@ -105,24 +106,24 @@ def clock_nanoseconds(text: str) -> int:
 
 
 def _calibration(path: Path, *counts: tuple[str, int]) -> list[Array]:
-    """Numbers of some rows 'name: …' of a calibration file, and how many each must have."""
+    """Return the numbers of rows 'name: …' of a calibration file; counts: (name, length)."""
     rows = {text.partition(':')[0].strip(): text.partition(':')[2] for _, text in lines(path)}
     found = []
     for name, count in counts:
         try:
             values = numbers(rows[name])
         except KeyError:
-            raise DjetError(f"{path} has no line '{name}:'; is it whole?") from None
+            raise DjetError(f"{path} has no line '{name}:'; it may be truncated") from None
         except ValueError as error:
-            raise DjetError(f'{path}: {name}: {error}; mend or replace the file') from error
+            raise DjetError(f'{path}: {name}: {error}; correct or replace the file') from error
         if len(values) != count:
-            raise DjetError(f'{path}: {name} has {len(values)} numbers, {count} belong there')
+            raise DjetError(f'{path}: {name} has {len(values)} numbers; it must have {count}')
         found.append(np.array(values))
     return found
 
 
 def _camera(path: Path, size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Camera matrix, distortion, and rotation to the images' axes, of images of a size."""
+    """Return K, distortion and rectifying rotation for images of a size (rectified or raw)."""
     rectified, raw = _calibration(path, ('S_rect_00', 2), ('S_00', 2))
     if tuple(rectified) == size:
         P, R = _calibration(path, ('P_rect_00', 12), ('R_rect_00', 9))
@@ -135,10 +136,10 @@ def _camera(path: Path, size: tuple[int, int]) -> tuple[Array, Array, Array]:
         K, turn = K.reshape(3, 3), np.eye(3)
     else:
         raise DjetError(f'{path} is for images of {_size(rectified)} or {_size(raw)}, these are '
-                        f'{_size(np.array(size))}; give the calibration of the same day')
+                        f'{_size(np.array(size))}; use the calibration of the same day')
     if min(K[0, 0], K[1, 1]) <= 0 or K[2].tolist() != [0, 0, 1]:
         raise DjetError(f'{path}: fx fy cx cy = {K[0, 0]:g} {K[1, 1]:g} {K[0, 2]:g} {K[1, 2]:g} '
-                        'is no camera')
+                        'is no valid camera; focal lengths must be positive')
     return K.copy(), distortion, turn
 
 
@@ -147,7 +148,7 @@ def _size(size: Array) -> str:
 
 
 def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
-    """GPS/IMU in the camera (4, 4); None where there is none, or nobody knows where it is."""
+    """Return the pose of the GPS/IMU in the camera (4, 4), None if it or its calibration lacks."""
     day = folder.resolve().parent
     names = ('calib_imu_to_velo.txt', 'calib_velo_to_cam.txt')
     if not (folder / 'oxts' / 'timestamps.txt').exists() or not all(
@@ -155,7 +156,7 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
         return None
     pose = np.eye(4)
     for name in names:
-        path = _beside(folder, name)
+        path = _calibration_file(folder, name)
         R, T = _calibration(path, ('R', 9), ('T', 3))
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = R.reshape(3, 3), T
@@ -163,28 +164,28 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
         pose = step @ pose
     turn = np.eye(4)
     turn[:3, :3] = rectifying
-    # The files have too few digits for a rotation.
+    # The files have too few digits for an exact rotation.
     pose = turn @ pose
     pose[:3, :3] = nearest_rotation(pose[:3, :3])
     return pose
 
 
 def _oxts(folder: Path) -> tuple[NDArray[np.int64], Array]:
-    """Stamps (M,) and rows (M, 30) of the GPS/IMU."""
+    """Return stamps (M,) and rows (M, 30) of the GPS/IMU."""
     stamps = _stamps(folder / 'timestamps.txt')
     paths = sorted((folder / 'data').glob('*.txt'))
     if len(stamps) != len(paths):
         raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} files '
-                        'data/*.txt; there must be one for each')
+                        'data/*.txt; there must be one per image')
     rows = [number_rows(path, _COLUMNS) for path in paths]
     wrong = next((path for path, row in zip(paths, rows, strict=True) if len(row) != 1), None)
     if wrong is not None:
-        raise DjetError(f'{wrong} has no single line of {_COLUMNS} numbers')
+        raise DjetError(f'{wrong} must have exactly one line of {_COLUMNS} numbers')
     return stamps, np.concatenate(rows) if rows else np.empty((0, _COLUMNS))
 
 
 def _unit_poses(rows: Array, folder: Path) -> Array:
-    """Poses (M, 4, 4) of the unit over a Mercator map, as the data's own tools have them."""
+    """Return the poses (M, 4, 4) of the unit in Mercator coordinates, as KITTI's devkit does."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if not len(rows):
         return poses

@@ -1,4 +1,4 @@
-"""Still masks from files."""
+"""Static masks, read from image files."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ from numpy.typing import NDArray
 
 
 def still_mask(path: str) -> NDArray[np.bool_] | None:
-    """(H, W) bool, what a mask file leaves out; None for no file. Raises DjetError."""
+    """Return the excluded pixels (H, W) of a mask file, None for no file. Raises DjetError."""
     return left_out(ImageFiles([Path(path)]).gray(0)) if path else None

@@ -1,8 +1,7 @@
 """
-A place for output: what may lie there already, and how it appears there whole or not at all.
+Output files and folders: what may be overwritten, and atomic writes.
 
-Nothing is replaced unless that was asked for, and nothing that this package did not write is ever
-removed.
+Nothing is replaced without ``overwrite``, and nothing that this package did not write is removed.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from djet_ros.errors import DjetError
 
 
 def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
-    """Raise DjetError where something is in the way, or the name has none of the suffixes."""
+    """Raise DjetError if a file can't be written there, or its name has none of the suffixes."""
     if path.is_dir():
-        raise DjetError(f'{path} is a folder; give the name of a file')
+        raise DjetError(f'{path} is a folder; name a file')
     if suffixes and path.suffix.lower() not in suffixes:
         raise DjetError(f"--output is '{path}'; its name must end in {' or '.join(suffixes)}")
     _check_unused(path, overwrite)
@@ -29,12 +28,12 @@ def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
 def make_room(folder: Path, ours: Collection[str], overwrite: bool,
               marks: Collection[str] = ()) -> None:
     """
-    Make a folder for output; of what an earlier run left there, remove only what is ours.
+    Make a folder for output, and remove what an earlier run wrote there, but no other files.
 
-    ours: names of the files and folders that a run writes; marks: files by which a folder that is
-    not empty is known to be an earlier run's (without any, others' files may lie beside ours).
-    Raises DjetError where the folder is somebody else's, or ours and not to be overwritten, or
-    can't be made; OSError where what is there can't be removed.
+    ours: names of the files and folders that a run writes; marks: files that identify a non-empty
+    folder as that of an earlier run (none: foreign files next to ours are accepted). Raises
+    DjetError if the folder is a foreign one, or ours without ``overwrite``, or can't be made;
+    raises OSError if earlier files can't be removed.
     """
     for path in check_room(folder, ours, overwrite, marks):
         if path.is_dir() and not path.is_symlink():
@@ -46,8 +45,8 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
 
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,
                marks: Collection[str] = ()) -> list[Path]:
-    """Raise DjetError as ``make_room`` does; give what it would remove, and touch nothing."""
-    _check_bars(folder)
+    """Return what ``make_room`` would remove, without removing it; raise DjetError as it does."""
+    _check_obstacles(folder)
     if marks and folder.is_dir() and any(folder.iterdir()) \
             and not all((folder / mark).is_file() for mark in marks):
         raise DjetError(f'{folder} is not empty and holds no earlier results; choose another '
@@ -60,53 +59,52 @@ def check_room(folder: Path, ours: Collection[str], overwrite: bool,
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those that it stands in; DjetError where it can't be, and what bars it."""
-    _check_bars(folder)
+    """Make a folder with its parents; raise DjetError with the reason if it can't be made."""
+    _check_obstacles(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DjetError(f'{folder} could not be made: {error.strerror or error}; choose another '
-                        '--output') from error
+        raise DjetError(f'{folder} could not be created: {error.strerror or error}; choose '
+                        'another --output') from error
 
 
-def _check_bars(folder: Path) -> None:
+def _check_obstacles(folder: Path) -> None:
     for place in (*reversed(folder.parents), folder):
         if place.is_symlink() and not place.exists():
             raise DjetError(f'{place} is a link to {os.readlink(place)}, which does not exist; '
                             'choose another --output')
         if place.exists() and not place.is_dir():
-            raise DjetError(f'{place} exists and is no folder; choose another --output')
+            raise DjetError(f'{place} exists and is not a folder; choose another --output')
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Put a text into a file, in the place of what it held: all or nothing. Raises OSError."""
+    """Write or replace a text file atomically. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A file in a folder that nobody else has: its mode is that of any new file, not of a
-    # temporary one.
-    with TemporaryDirectory(prefix='.djet-', dir=path.parent) as beside:
-        new = Path(beside) / 'new'
+    # A new file in a temporary folder, not a temporary file: its mode follows the umask.
+    with TemporaryDirectory(prefix='.djet-', dir=path.parent) as scratch:
+        new = Path(scratch) / 'new'
         new.write_text(text, 'utf-8')
         os.replace(new, path)
 
 
 @contextmanager
-def appearing(out: Path, overwrite: bool, is_ours: Callable[[Path], bool], what: str
-              ) -> Iterator[Path]:
+def created_whole(out: Path, overwrite: bool, is_ours: Callable[[Path], bool], what: str
+                  ) -> Iterator[Path]:
     """
-    Give a place beside ``out`` to write a folder to; it takes the name on success, else it goes.
+    Yield a temporary folder next to ``out``, renamed to ``out`` on success and removed on failure.
 
-    What has the name already stays until then, and must be ours to be replaced; ``what`` it should
-    be is for the user. Raises DjetError, and OSError where there is no room.
+    An existing ``out`` is kept until then, and replaced only if ``is_ours`` accepts it; what: its
+    description for the error message. Raises DjetError, and OSError if the disk is full.
     """
     _check_unused(out, overwrite)
     if out.exists() and not (out.is_dir() and is_ours(out)):
         raise DjetError(f'{out} exists and is no {what}; it is not overwritten')
     make_folder(out.parent)
-    with TemporaryDirectory(prefix=f'.{out.name}.', dir=out.parent) as beside:
-        # What lies in the folder may be named after it, so it has the final name already.
-        folder = Path(beside) / out.name
+    with TemporaryDirectory(prefix=f'.{out.name}.', dir=out.parent) as scratch:
+        # Files in the folder may be named after it, so it has its final name from the start.
+        folder = Path(scratch) / out.name
         yield folder
-        _exchange(folder, out, Path(beside) / 'replaced')
+        _exchange(folder, out, Path(scratch) / 'replaced')
 
 
 def _check_unused(path: Path, overwrite: bool) -> None:
@@ -115,7 +113,7 @@ def _check_unused(path: Path, overwrite: bool) -> None:
 
 
 def _exchange(new: Path, out: Path, aside: Path) -> None:
-    """Give a folder its final name; what has that name goes aside, and comes back on failure."""
+    """Rename a folder to ``out``; an existing one moves to ``aside``, and back on failure."""
     replaced = out.exists()
     if replaced:
         out.rename(aside)

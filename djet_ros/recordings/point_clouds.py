@@ -1,4 +1,4 @@
-"""Clouds of points as PLY, which CloudCompare, MeshLab and Open3D read."""
+"""Point clouds as PLY files, for CloudCompare, MeshLab and Open3D."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 
-# Digits of the number of points, so that it can be written over as the cloud grows.
+# Fixed width of the number of points, so that it can be overwritten as the cloud grows.
 _DIGITS = 12
 
 
@@ -14,12 +14,12 @@ class PointFile:
     """
     A new binary PLY file that points are added to.
 
-    The number of points follows each addition, so that the file is whole at any time: a kill
-    loses nothing. Creating, writing and closing raise OSError.
+    The header is updated after each addition, so that the file is valid at any time, even if the
+    process is killed. Creating, writing and closing raise OSError.
     """
 
     def __init__(self, path: Path, comment: str) -> None:
-        """Create the file, which must not exist; comment: a line about the points."""
+        """Create the file, which must not exist; comment: a line for its header."""
         self._file = path.open('xb', buffering=0)
         self._count = 0
         before = f'ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex '
@@ -40,5 +40,5 @@ class PointFile:
         self._file.write(f'{self._count:0{_DIGITS}d}'.encode('ascii'))
 
     def close(self) -> None:
-        """Close the file; all has been written already."""
+        """Close the file."""
         self._file.close()

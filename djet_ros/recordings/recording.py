@@ -1,8 +1,8 @@
 """
-Anything that can be replayed, as one stream of messages: bags and folders of image files.
+Recordings as one stream of messages: bags and folders of image files.
 
-A folder becomes the messages that its bag would hold, and a ground-truth file becomes messages
-too, so that all of them pass through the same tracker.
+A folder of images, and a ground-truth file, are converted to the messages that an equivalent bag
+would hold, so that all sources pass through the same tracker.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ CAMERA_INFO_TYPES = ('sensor_msgs/msg/CameraInfo',)
 POSE_TYPES = ('geometry_msgs/msg/PoseStamped', 'nav_msgs/msg/Odometry',
               'geometry_msgs/msg/TransformStamped')
 
-# What may be recorded beside a camera, by the name of its topic in a live node: its types.
-BESIDE = {
+# Message types of the auxiliary inputs besides images and CameraInfo, by name of the input.
+AUXILIARY = {
     'speed': ('geometry_msgs/msg/TwistStamped', 'nav_msgs/msg/Odometry'),
     'imu': ('sensor_msgs/msg/Imu',),
     'guess': ('nav_msgs/msg/Odometry',),
@@ -53,18 +53,18 @@ BESIDE = {
     'tf': ('tf2_msgs/msg/TFMessage',),
 }
 
-# Words by which those are known of which others have the type as well.
-_KNOWN_BY = {'mask': re.compile('mask'), 'tf': re.compile('^/tf$')}
+# Patterns of the topic name for inputs whose type other topics have too.
+_TOPIC_PATTERNS = {'mask': re.compile('mask'), 'tf': re.compile('^/tf$')}
 
 
 class Recording(Closing):
     """
-    Images, CameraInfo, perhaps ground truth and what else was recorded, as messages in order.
+    Images, CameraInfo and optionally ground truth and auxiliary inputs, as messages in order.
 
-    ``len()`` is the number of images, as far as it is known beforehand. ground_truth_topic is
-    None where there is none; ground_truth_file: where it comes from instead of the recording.
-    beside: topics of what else is wanted, by names in BESIDE, and under 'frames' that of the
-    static frames, which tell how an IMU is mounted.
+    ``len()`` is the number of images, as far as it is known in advance. ground_truth_topic: None
+    if there is no ground truth; ground_truth_file: the file that replaces the recording's own, or
+    None; beside: topics of the auxiliary inputs by their names in AUXILIARY, and under 'frames'
+    the topic of the static frames, which hold the mounting of an IMU.
     """
 
     image_topic: str
@@ -79,27 +79,27 @@ class Recording(Closing):
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """Yield the messages, or only those of some topics; DjetError where there is damage."""
+        """Yield the messages, of all or some topics; raise DjetError if the file is damaged."""
 
     def static_frames(self) -> Iterator[Any]:
-        """Yield the TFMessages of /tf_static; DjetError where there is damage."""
+        """Yield the TFMessages of /tf_static; raise DjetError if the file is damaged."""
         yield from ()
 
 
 class SequenceRecording(Recording):
-    """A sequence of image files as the messages of the bag that would be made of it."""
+    """A sequence of image files, as the messages of an equivalent bag."""
 
     def __init__(self, sequence: FrameSequence, imu: bool = False, poses: Path | None = None,
                  damaged: bool = False) -> None:
         """
-        Take a sequence; DjetError where a file of poses is none.
+        Wrap a sequence; raise DjetError if the file of poses is invalid.
 
-        imu: whether what its IMU felt is wanted too, where it has one; poses: ground truth instead
-        of its own, and damaged: whether damaged images are handed on, see ``open_recording``.
+        imu: whether to include its IMU samples, if it has any; poses, damaged: see
+        ``open_recording``.
         """
         self._sequence = sequence
         self._damaged = damaged
-        # Poses with stamps of their own, and a pose for each image or None.
+        # Ground truth: poses with stamps of their own, or one pose per image (or None).
         self._stamped: tuple[NDArray[np.int64], Array] | None = None
         self._poses = sequence.poses
         if poses is not None:
@@ -108,7 +108,7 @@ class SequenceRecording(Recording):
             self._poses = truth if stamps is None else None
         self.ground_truth_file = poses
         self._imu = sequence.imu if imu else None
-        # By the name everybody knows whether images are rectified.
+        # By ROS convention the topic's name tells whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
         known = self._poses is not None or self._stamped is not None
@@ -124,19 +124,19 @@ class SequenceRecording(Recording):
         """
         Yield ground truth, CameraInfo and image of each frame in turn.
 
-        The image comes last: whoever acts on it then has everything up to its stamp, and the
-        first sample of the IMU beyond it.
+        The image comes last, after everything up to its stamp and the first IMU sample not before
+        it, so that a consumer can process it at once.
         """
-        sequence, felt = self._sequence, 0
+        sequence, next_sample = self._sequence, 0
         yield from _stamped_poses(self._stamped)
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
             if self._imu is not None and (
                     topics is None or not set(topics).isdisjoint(self.beside.values())):
                 if index == 0:
                     yield _imu_frame(stamp, self._imu)
-                for sample in self._imu.until(felt, stamp):
+                for sample in self._imu.until(next_sample, stamp):
                     yield _imu_message(self._imu, sample)
-                    felt = sample + 1
+                    next_sample = sample + 1
             if self._poses is not None and np.isfinite(self._poses[index]).all():
                 yield _ground_truth(stamp, self._poses[index])
             if topics is None or self.image_topic in topics:
@@ -154,7 +154,7 @@ class SequenceRecording(Recording):
             return MAKE.compressed(stamp, CAMERA_FRAME, damaged.path.read_bytes())
 
     def static_frames(self) -> Iterator[Any]:
-        """Yield how the IMU is turned against the camera, where it is wanted."""
+        """Yield the rotation between IMU and camera, if the IMU is included."""
         if self._imu is not None:
             yield _imu_frame(int(self._sequence.stamps_ns[0]), self._imu).message
 
@@ -164,9 +164,10 @@ class SequenceRecording(Recording):
 
 class BagRecording(Recording):
     """
-    The camera in a bag, with its ground truth and what else is wanted.
+    The images of one camera in a bag, with ground truth and auxiliary inputs.
 
-    Topics that aren't named are found; DjetError lists the choices where that is not possible.
+    Topics that are not named are found by type and name; raises DjetError with the candidates if
+    they are ambiguous.
     """
 
     def __init__(self, path: Path, image_topic: str | None = None, info_topic: str | None = None,
@@ -177,15 +178,15 @@ class BagRecording(Recording):
         try:
             self._topics = [topic for topic in self.bag.topics if topic.message_count]
             if not self._topics:
-                # If a break is the reason, this tells it.
+                # If the file is damaged, this raises with the reason.
                 next(self.bag.messages(), None)
-                raise DjetError(f'{path} holds no message; record it again')
+                raise DjetError(f'{path} holds no messages; record it again')
             image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
             self.image_topic, self._count = image.name, image.message_count
             self.info_topic = self._info_topic(info_topic)
             self.ground_truth_topic = (self._ground_truth_topic() if poses is None
                                        else GROUND_TRUTH_TOPIC)
-            self.beside = dict(self._beside(beside or {}, strict))
+            self.beside = dict(self._auxiliary_topics(beside or {}, strict))
             self._require_one_type()
             self.ground_truth_file = poses
             self._poses = None if poses is None else _read_truth(poses, self._count)
@@ -198,7 +199,7 @@ class BagRecording(Recording):
         return self._count
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """Yield the messages in the order of recording, and what the file of poses adds."""
+        """Yield the messages in recorded order, with the poses of a ground-truth file."""
         wanted = {topic for topic in (self.image_topic, self.info_topic, self.ground_truth_topic,
                                       *self.beside.values())
                   if topic and (topics is None or topic in topics)}
@@ -208,13 +209,13 @@ class BagRecording(Recording):
         wanted.discard(GROUND_TRUTH_TOPIC)
         stamps, poses = self._poses
         if stamps is None:
-            yield from self._each_with_its_pose(wanted, poses)
+            yield from self._with_poses(wanted, poses)
             return
         yield from _stamped_poses((stamps, poses))
         yield from self.bag.messages(wanted)
 
-    def _each_with_its_pose(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
-        """Poses without stamps belong to the images, one to each."""
+    def _with_poses(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
+        """Yield the messages, with a pose of a file without stamps before each image."""
         rows = iter(poses)
         for message in self.bag.messages(wanted | {self.image_topic}):
             if message.topic == self.image_topic and (pose := next(rows, None)) is not None:
@@ -223,7 +224,7 @@ class BagRecording(Recording):
                 yield message
 
     def static_frames(self) -> Iterator[Any]:
-        """Yield the TFMessages of /tf_static; DjetError where there is damage."""
+        """Yield the TFMessages of /tf_static; raise DjetError if the file is damaged."""
         if static_frames.TOPIC in {topic.name for topic in self._fitting((static_frames.TYPE,))}:
             for one in self.bag.messages({static_frames.TOPIC}):
                 yield one.message
@@ -232,20 +233,21 @@ class BagRecording(Recording):
         """Close the bag."""
         self.bag.close()
 
-    def _beside(self, wanted: Mapping[str, str | None], strict: bool
-                ) -> Iterator[tuple[str, str]]:
-        """Find the topics of what is wanted by name; where that is not strict, those there are."""
+    def _auxiliary_topics(self, wanted: Mapping[str, str | None], strict: bool
+                          ) -> Iterator[tuple[str, str]]:
+        """Yield (input, topic) of the auxiliary inputs; strict: raise DjetError if one lacks."""
         for what, name in wanted.items():
-            # The bag's own ground truth is no measurement, even where other poses replace it.
-            fitting = [topic.name for topic in self._fitting(BESIDE[what]) if topic.name not in (
-                self._ground_truth_topic(), self.image_topic)
-                and (what not in _KNOWN_BY or _KNOWN_BY[what].search(topic.name))]
+            # The bag's ground truth is not a measurement, even if a file replaces it.
+            fitting = [topic.name for topic in self._fitting(AUXILIARY[what])
+                       if topic.name not in (self._ground_truth_topic(), self.image_topic)
+                       and (what not in _TOPIC_PATTERNS
+                            or _TOPIC_PATTERNS[what].search(topic.name))]
             chosen = [topic for topic in fitting if name in (None, topic)]
             if len(chosen) == 1:
                 yield what, chosen[0]
             elif strict and what == 'tf':
-                raise DjetError(f'{self.bag.path} has no /tf, which odometry.guess_frame asks '
-                                'for; record it too')
+                raise DjetError(f'{self.bag.path} has no topic /tf, which odometry.guess_frame '
+                                'requires; record it too')
             elif strict and name is not None:
                 raise DjetError(f"{self.bag.path} has no topic '{name}' for '{what}'; choose with "
                                 f'--{what}-topic from: {", ".join(fitting) or "none"}')
@@ -269,14 +271,14 @@ class BagRecording(Recording):
         return [topic for topic in self._topics if topic.msgtype in types]
 
     def _choose(self, what: str, option: str, types: Collection[str], name: str | None) -> Topic:
-        """Topic of some types by its name or, without one, because there is only one."""
+        """Return the topic of a name or, without a name, the only one of these types."""
         fitting = self._fitting(types)
         chosen = [topic for topic in fitting if name in (None, topic.name)]
         if len(chosen) == 1:
             return chosen[0]
         if not fitting:
             others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
-            raise DjetError(f'{self.bag.path} has no {what} topic, but {one_line(others)}; '
+            raise DjetError(f'{self.bag.path} has no {what} topic, only {one_line(others)}; '
                             'record it too')
         choices = one_line(', '.join(
             f'{topic.name} ({topic.message_count})' for topic in fitting))
@@ -286,20 +288,22 @@ class BagRecording(Recording):
                         f'choose one with {option}')
 
     def _info_topic(self, name: str | None) -> str:
-        """Topic beside the images (image_transport's rule), or the only one of an only camera."""
+        """Return the CameraInfo of the image's namespace, or the only one of a single camera."""
         if name is None:
             have = self._fitting(CAMERA_INFO_TYPES)
-            # .../image_raw/compressed belongs to .../camera_info, as .../image_raw does.
+            # As in image_transport: .../image_raw and .../image_raw/compressed both belong to
+            # .../camera_info.
             for folder in list(PurePosixPath(self.image_topic).parents)[:2]:
-                if (beside := str(folder / 'camera_info')) in {topic.name for topic in have}:
-                    return beside
+                if (info := str(folder / 'camera_info')) in {topic.name for topic in have}:
+                    return info
             if len(have) == 1 and len(self._fitting(IMAGE_TYPES)) > 1:
-                raise DjetError(f'{self.bag.path} has no CameraInfo beside {self.image_topic}; '
-                                f'if {have[0].name} is meant, say so with --info-topic')
+                raise DjetError(f'{self.bag.path} has no camera_info in the namespace of '
+                                f'{self.image_topic}; to use {have[0].name}, name it with '
+                                '--info-topic')
         return self._choose('CameraInfo', '--info-topic', CAMERA_INFO_TYPES, name).name
 
     def _ground_truth_topic(self) -> str | None:
-        """Name the only topic that calls itself ground truth."""
+        """Return the only topic of poses with ground truth in its name, or None."""
         fitting = [topic.name for topic in self._fitting(POSE_TYPES)
                    if re.search('ground_?truth', topic.name)]
         return fitting[0] if len(fitting) == 1 else None
@@ -311,40 +315,41 @@ def open_recording(path: Path, image_topic: str | None = None, info_topic: str |
     """
     Open a bag, or a folder of image files in one of the layouts of ``open_sequence``.
 
-    poses: ground truth instead of the recording's own, as KITTI (one row per image) or TUM
-    (stamped) file; beside: what else is wanted, by names in BESIDE, each with its topic or, where
-    that is to be found, None; strict: whether it has to be there; damaged: whether files of images
-    that can't be decoded are handed on as a bag's are, as CompressedImage. Raises DjetError.
+    poses: ground truth in place of the recording's own, a KITTI (one row per image) or TUM
+    (stamped) file; beside: the auxiliary inputs to read, by their names in AUXILIARY, each with
+    its topic, or None to find it; strict: whether a missing input is an error; damaged: whether
+    image files that can't be decoded are passed on, as CompressedImage, as those of a bag are.
+    Raises DjetError.
     """
     beside = beside or {}
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise DjetError(f'{path} is neither a file nor a folder; give a bag or a folder of images')
+        raise DjetError(f'{path} is neither a file nor a folder; name a bag or a folder of images')
     if is_bag(path) or not path.exists():
         return BagRecording(path, image_topic, info_topic, poses, beside, strict)
     if strict and (image_topic or info_topic or beside.keys() - {'imu'} or any(beside.values())):
-        raise DjetError(f'{path} is a folder of images; topics, speeds, guesses and masks by '
-                        'stamp are for bags')
+        raise DjetError(f'{path} is a folder of images, not a bag: it has no topics, and no '
+                        'recorded speeds, guesses, masks or tf; omit these options')
     sequence = open_sequence(path, own_poses=poses is None)
     if strict and 'imu' in beside and sequence.imu is None:
-        raise DjetError(f'{path} holds nothing of an IMU; leave odometry.imu out, or give a '
-                        'recording that has one')
+        raise DjetError(f'{path} holds no IMU data; set odometry.imu to false, or name a '
+                        'recording with an IMU')
     return SequenceRecording(sequence, 'imu' in beside, poses, damaged)
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
-    """Poses of a TUM file with their stamps, or of a KITTI file, which must have one per image."""
+    """Return (stamps, poses) of a TUM file, or (None, poses) of a KITTI file, one per image."""
     first = next((text for _, text in lines(path)), '')
     if len(first.replace(',', ' ').split()) == 8:
         return read_tum(path)
     poses = read_poses(path)
     if len(poses) != images:
-        raise DjetError(f'{path} has {len(poses)} poses, the recording has {images} images; give '
-                        'the file that belongs to it')
+        raise DjetError(f'{path} has {len(poses)} poses, the recording has {images} images; name '
+                        'the file of poses of this recording')
     return None, poses
 
 
 def _stamped_poses(known: tuple[NDArray[np.int64], Array] | None) -> Iterator[BagMessage]:
-    """Make messages of poses with stamps of their own, if there are any."""
+    """Yield messages of poses with stamps of their own, if there are any."""
     if known is not None:
         for stamp, pose in zip(known[0].tolist(), known[1], strict=True):
             yield _ground_truth(stamp, pose)
@@ -355,7 +360,7 @@ def _ground_truth(stamp: int, pose: Array) -> BagMessage:
 
 
 def _imu_frame(stamp: int, imu: ImuTrack) -> BagMessage:
-    """Tell how the IMU is turned against the camera; where it is does not matter to its rates."""
+    """Return the static transform of the IMU, with its rotation only: rates need no position."""
     pose = np.eye(4)
     pose[:3, :3] = imu.to_camera
     return BagMessage(STATIC_FRAMES_TOPIC, stamp,

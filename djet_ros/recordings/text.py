@@ -1,4 +1,4 @@
-"""Text files of numbers, read with a reason for every refusal."""
+"""Text files of numbers and stamps; errors name file, line and value."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from djet_ros.odometry.messages import FARTHEST
 import numpy as np
 from numpy.typing import NDArray
 
-# Stamps are written into messages as int32 seconds.
+# Limit of stamps in seconds: messages hold them as int32.
 LATEST_SECOND = 2**31 - 2000
 
 
 class LineFile:
     """
-    A new text file that holds whole lines only.
+    A new text file that holds only complete lines.
 
-    Each line is handed to the operating system as it is written, so that a kill loses nothing; of
-    one that a disk has no room for nothing stays. Creating, writing and closing raise OSError.
+    Each line is flushed to the operating system, so that a kill loses nothing; a line that does
+    not fit on the disk is removed again. Creating, writing and closing raise OSError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +32,7 @@ class LineFile:
         self._file = path.open('xb', buffering=0)
 
     def write(self, line: str) -> int:
-        """Append a line, with its end."""
+        """Append a line, which includes its line end."""
         begin = self._file.tell()
         rest = line.encode()
         try:
@@ -45,19 +45,19 @@ class LineFile:
         return len(line)
 
     def close(self) -> None:
-        """Close the file; writing has already been done line by line."""
+        """Close the file."""
         self._file.close()
 
 
 def lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Non-empty lines that are no comment, stripped, with their numbers from 1."""
+    """Yield (number from 1, stripped text) of the lines that are neither empty nor comments."""
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if (text := line.strip()) and not text.startswith('#'):
             yield number, text
 
 
 def numbers(text: str) -> list[float]:
-    """Finite numbers separated by spaces or commas; ValueError names the one that is not."""
+    """Return the finite numbers of a text, separated by spaces or commas; raise ValueError."""
     values = []
     for word in text.replace(',', ' ').split():
         try:
@@ -71,22 +71,23 @@ def numbers(text: str) -> list[float]:
 
 
 def number_rows(path: Path, columns: int) -> Array:
-    """Numbers of a text file, (N, columns) float64, one row per line; DjetError names the line."""
+    """Return the numbers (N, columns) of a text file, a row per line; raise DjetError."""
     table = array('d')
     for number, text in lines(path):
         try:
             row = numbers(text)
         except ValueError as error:
-            raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
+            raise DjetError(f'{path} line {number}: {error}; correct or replace it') from error
         if len(row) != columns:
-            raise DjetError(f'{path} line {number} has {len(row)} numbers, {columns} belong there')
+            raise DjetError(f'{path} line {number} has {len(row)} numbers; it must have '
+                            f'{columns}')
         table.extend(row)
     return np.array(table, dtype=np.float64).reshape(-1, columns)
 
 
 def stamped_rows(path: Path, columns: int, stamp: Callable[[str], int]
                  ) -> tuple[NDArray[np.int64], Array]:
-    """Stamps (N,) in ns, read exactly from the first column, and the others (N, columns - 1)."""
+    """Return stamps (N,) in ns, exact, of the first column, and the others (N, columns - 1)."""
     rows = number_rows(path, columns)
     stamps = [stamped(path, number, text.replace(',', ' ').split()[0], stamp)
               for number, text in lines(path)]
@@ -94,15 +95,15 @@ def stamped_rows(path: Path, columns: int, stamp: Callable[[str], int]
 
 
 def stamped(path: Path, number: int, text: str, stamp: Callable[[str], int]) -> int:
-    """Read one stamp; DjetError names the line."""
+    """Return one stamp; raise DjetError, with file and line, if it is invalid."""
     try:
         return stamp(text)
     except ValueError as error:
-        raise DjetError(f'{path} line {number}: {error}; mend or replace the file') from error
+        raise DjetError(f'{path} line {number}: {error}; correct or replace it') from error
 
 
 def check_positions(positions: Array, path: Path) -> None:
-    """Raise DjetError that names the file and the first of positions (N, 3) that is nowhere."""
+    """Raise DjetError for the first of positions (N, 3) that is not finite or too far away."""
     wrong = np.flatnonzero(~(np.abs(positions) <= FARTHEST).all(axis=1))
     if wrong.size:
         raise DjetError(f'{path}: pose {wrong[0]} is at {positions[wrong[0]].tolist()} m, farther '
@@ -110,34 +111,34 @@ def check_positions(positions: Array, path: Path) -> None:
 
 
 def increasing(stamps_ns: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
-    """Give the stamps back if each is later than the one before, else DjetError."""
+    """Return the stamps; raise DjetError if they do not strictly increase."""
     wrong = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if wrong.size:
         raise DjetError(f'{path}: stamp {wrong[0] + 1} (counted from 0, '
-                        f'{stamps_ns[wrong[0] + 1]} ns) is not after the one before it')
+                        f'{stamps_ns[wrong[0] + 1]} ns) is not after the one before it; stamps '
+                        'must increase')
     return stamps_ns
 
 
 def whole_nanoseconds(text: str) -> int:
-    """Nanoseconds written as a whole number; ValueError for anything else."""
+    """Return nanoseconds written as an integer; raise ValueError for anything else."""
     if not text.isascii() or not text.isdecimal() or len(text) > 19 \
             or int(text) >= LATEST_SECOND * 10**9:
-        raise ValueError(f"'{text[:40]}' is no stamp in nanoseconds")
+        raise ValueError(f"'{text[:40]}' is not a stamp in nanoseconds")
     return int(text)
 
 
 def nanoseconds(text: str) -> int:
     """
-    Nanoseconds of a decimal number of seconds, rounded half to even, without passing a float.
+    Return the nanoseconds of a decimal number of seconds, exact, rounded half to even.
 
-    Raises ValueError for anything that isn't a number of seconds that a message stamp can hold,
-    and for one before zero.
+    Raises ValueError if it is not a number, negative, or too large for the stamp of a message.
     """
     return _nanoseconds(text, 0)
 
 
 def signed_nanoseconds(text: str) -> int:
-    """Read a stamp as ``nanoseconds`` does, also one before zero."""
+    """Return the same as ``nanoseconds``, but accept negative stamps."""
     return _nanoseconds(text, -LATEST_SECOND)
 
 
@@ -147,5 +148,5 @@ def _nanoseconds(text: str, least: int) -> int:
     except InvalidOperation:
         raise ValueError(f"'{text[:40]}' is not a number of seconds") from None
     if not seconds.is_finite() or not least <= seconds < LATEST_SECOND:
-        raise ValueError(f"'{text[:40]}' is no stamp between {least} and {LATEST_SECOND} s")
+        raise ValueError(f"'{text[:40]}' is not a stamp between {least} and {LATEST_SECOND} s")
     return int(seconds.scaleb(9).to_integral_value())

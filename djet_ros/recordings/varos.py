@@ -1,10 +1,10 @@
 """
 The synthetic underwater sequence VAROS (Zwilgmeyer et al., ICCV Workshops 2021).
 
-The layout is taken from public programs that read the data set, not from the data set itself:
-vehicle0/cam0 holds A/*.png (rendered with water and lamps), camM0_timestamps.csv (a row per image,
-beginning with its stamp in ns) and camM0_poses/camM0_poses_transformation_matrix.csv (stamp in ns
-and the rows of a 3x4 matrix: the camera, along optical axes, in the world).
+The layout follows public programs that read the data set; it was not checked against the data set
+itself. vehicle0/cam0 holds A/*.png (rendered with water and lamps), camM0_timestamps.csv (a row
+per image, beginning with its stamp in ns) and camM0_poses/camM0_poses_transformation_matrix.csv
+(stamp in ns and the rows of a 3x4 matrix: pose of the camera's optical frame in the world).
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ from djet_ros.recordings.text import increasing, lines, number_rows, stamped, wh
 import numpy as np
 from numpy.typing import NDArray
 
-# Camera of the public programs: focal length in pixels of an image of this size (width, height).
+# Camera of those programs: focal length in pixels, for images of this size (width, height).
 FOCAL_LENGTH = 990.323
 SIZE = (1280, 720)
 
 
 class VarosSequence(FrameSequence):
     """
-    A folder of VAROS: the recording's own, vehicle0, or cam0.
+    A folder of VAROS: the recording, its vehicle0, or its cam0.
 
-    Stamps are those of the data set plus STAMP_OFFSET_NS. Ground truth is known where a pose has
-    the stamp of an image. Raises DjetError where the folder does not keep to the layout.
+    Stamps are those of the data set plus STAMP_OFFSET_NS. An image has ground truth if a pose has
+    the same stamp. Raises DjetError if the folder does not have this layout.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read everything but the images, and check that it belongs together."""
+        """Read everything but the images, and check its consistency."""
         camera = varos_camera(folder)
         if camera is None:
             raise DjetError(f'{folder} is no VAROS folder; it must hold vehicle0/cam0')
         images = ImageFiles(sorted((camera / 'A').glob('*.png')))
         if images.size != SIZE:
-            raise DjetError(f'{camera / "A"} has images of {images.size[0]}x{images.size[1]}, the '
-                            f'known camera of VAROS is for {SIZE[0]}x{SIZE[1]}')
+            raise DjetError(f'{camera / "A"} has images of {images.size[0]}x{images.size[1]}, but '
+                            f'the calibration of VAROS is for {SIZE[0]}x{SIZE[1]}')
         K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
                       [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
         stamps = _stamps(camera / 'camM0_timestamps.csv')
         if len(stamps) != len(images.paths):
             raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
-                            f'{len(images.paths)} images; there must be one for each')
+                            f'{len(images.paths)} images; there must be one per image')
         poses = _poses(camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
         super().__init__(f'VAROS {folder.resolve().name}', images, K, stamps + STAMP_OFFSET_NS,
                          poses)
 
 
 def varos_camera(folder: Path) -> Path | None:
-    """Find the camera's folder in the recording's, the vehicle's or itself, by what it holds."""
+    """Return cam0 of a folder of a recording, of a vehicle or of cam0 itself, or None."""
     for camera in (folder / 'vehicle0' / 'cam0', folder / 'cam0', folder):
         if (camera / 'camM0_timestamps.csv').exists() and any((camera / 'A').glob('*.png')):
             return camera
@@ -67,7 +67,7 @@ def _stamps(path: Path) -> NDArray[np.int64]:
 
 
 def _poses(path: Path, stamps: NDArray[np.int64]) -> Array | None:
-    """Poses (N, 4, 4) at stamps (N,), relative to the first known; NaN where none is."""
+    """Return poses (N, 4, 4) at stamps (N,), relative to the first known; NaN if unknown."""
     if not path.exists():
         return None
     rows = number_rows(path, 13)

@@ -1,4 +1,4 @@
-"""``djet lab ablate``: the paper's Table 2, and what each part of D-JET contributes."""
+"""``djet lab ablate``: ablation study of D-JET, with the paper's Table 2."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from djet_ros.lab.ablation import ablation_methods, PARTS
 from djet_ros.lab.ablation_report import write_ablation
 
 DESCRIPTION = """\
-Estimate the relative pose of all neighbouring frames by D-JET as a preset has it, and with one
-change at a time: sampling area, step strategy, robust loss, and whatever else tells the presets
-apart. RP-E and the 5-point method stand beside it. A run that was broken off is taken up where it
-ended.
+Estimate the relative pose of all consecutive frames by D-JET with the parameters of a preset, and
+with one change at a time: sampling window, step strategy, robust loss, and all other parameters
+in which presets differ. RP-E and the 5-point method are included for comparison. An interrupted
+run is resumed.
 """
 
 
@@ -22,13 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_run_arguments(parser)
     parser.add_argument('--windows', default='3,5,7,15', metavar='LIST',
-                        help='sides of the sampling area in pixels, odd (default: %(default)s)')
+                        help='sides of the sampling window in pixels, odd (default: %(default)s)')
     parser.add_argument('--parts', default=','.join(PARTS), metavar='LIST',
-                        help='what is changed (default: %(default)s)')
+                        help='parts of the method to vary (default: %(default)s)')
     parser.add_argument('--good-start', action='store_true',
-                        help='give all variants the pose of RP-E, preset best, as a start, and '
-                        'only the matches that agree with it: what is left is the effect of the '
-                        'surfaces')
+                        help='start all variants from the pose of RP-E, preset best, with only '
+                        'its inliers as matches, to isolate the effect of the surfaces')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,4 +44,4 @@ def _windows(text: str) -> list[int]:
     try:
         return [int(word) for word in split(text)]
     except ValueError:
-        raise DjetError(f"--windows is '{text}'; give odd numbers such as 3,5,7") from None
+        raise DjetError(f"--windows is '{text}'; write odd integers such as 3,5,7") from None

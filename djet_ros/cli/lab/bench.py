@@ -1,4 +1,4 @@
-"""``djet lab bench``: ratios of speed, from one run."""
+"""``djet lab bench``: speed, as ratios to an OpenCV pipeline in the same run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_json_output, write_json
+from djet_ros.cli.options import add_json_output, check_json_output, RECORDINGS, write_json
 from djet_ros.cli.terminal import console, new_table
 from djet_ros.errors import DjetError
 from djet_ros.lab.bench import bench, QUOTED_POINTS
@@ -14,23 +14,24 @@ from rich.console import Console
 from rich.table import Table
 
 DESCRIPTION = """\
-Measure the pipeline against the plain chain of OpenCV (ORB, brute-force cross-check,
-findEssentialMat, recoverPose), pair by pair in one run, and how the D-JET stage grows with points
-and window. With all cores our next frame is prepared beside the pair, as in a replay; OpenCV's
-chain takes its frames in turn. Writes the figures as JSON and a plot beside them.
+Measure the time per pair against a plain OpenCV pipeline (ORB, brute-force matching with
+cross-check, findEssentialMat, recoverPose), alternating in one run, and how the D-JET stage scales
+with the number of matches and the window size. With all cores our next frame is prepared in
+parallel to the pair, as in a replay; the OpenCV pipeline is sequential. Writes the results as JSON
+and a plot next to it.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('source', type=Path, metavar='SOURCE', help='a sequence or a bag')
+    parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     parser.add_argument('--pairs', type=int, default=40, metavar='N',
-                        help='pairs to measure (default: %(default)s)')
+                        help='number of pairs to measure (default: %(default)s)')
     add_json_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write and show the figures."""
+    """Measure, write and print the results."""
     check_json_output(args)
     if args.pairs < 1:
         raise DjetError(f'--pairs is {args.pairs}; it must be at least 1')
@@ -44,20 +45,22 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(figures: dict[str, Any]) -> Table:
     both = (figures, figures['all_cores'])
-    title = f"{figures['pairs']} pairs: ratios of medians, mean times"
+    title = f"{figures['pairs']} pairs: ratios of median times, and mean times"
     table = new_table(title, '', 'one thread', 'all cores')
-    table.add_row('pipeline over OpenCV chain',
+    table.add_row('time / OpenCV pipeline, preset best',
                   *(f"{run['pipeline_over_opencv']:.2f}" for run in both))
-    table.add_row('the same, preset fast', *(f"{run['fast_over_opencv']:.2f}" for run in both))
-    table.add_row('pairs per second', *(f"{run['pairs_per_second']:.1f}" for run in both))
-    table.add_row('the same, preset fast', *(f"{run['fast_pairs_per_second']:.1f}"
-                                             for run in both))
+    table.add_row('time / OpenCV pipeline, preset fast',
+                  *(f"{run['fast_over_opencv']:.2f}" for run in both))
+    table.add_row('pairs per second, preset best',
+                  *(f"{run['pairs_per_second']:.1f}" for run in both))
+    table.add_row('pairs per second, preset fast',
+                  *(f"{run['fast_pairs_per_second']:.1f}" for run in both))
     for stage in figures['stages_ms']:
         table.add_row(f'{stage} [ms]', *(f"{run['stages_ms'][stage]:.1f}" for run in both))
-    table.add_row(f'D-JET stage, {QUOTED_POINTS} points [ms]', f"{figures['djet_stage_ms']:.1f}",
+    table.add_row(f'D-JET stage, {QUOTED_POINTS} matches [ms]', f"{figures['djet_stage_ms']:.1f}",
                   '')
-    table.add_row(f"{figures['kernel_tests']} tests of a pixel over cv2.ORB.compute's 256",
-                  f"{figures['kernel_speedup_over_cv2']:.0f} x", '')
+    table.add_row(f"speed-up of surfaces ({figures['kernel_tests']} tests per pixel) over "
+                  'cv2.ORB.compute (256)', f"{figures['kernel_speedup_over_cv2']:.0f} x", '')
     table.add_row('memory per frame [MB]', f"{figures['bytes_per_frame'] / 1e6:.1f}", '')
     return table
 

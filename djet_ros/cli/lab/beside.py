@@ -1,4 +1,4 @@
-"""``djet lab beside``: what a gyro and masks are good for."""
+"""``djet lab beside``: benefit of a gyro and of masks, on rendered scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import partial
 import json
 
-from djet_ros.cli.lab.pair_runs import recorded
+from djet_ros.cli.lab.pair_runs import run_and_record
 from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers, split
 from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
@@ -29,38 +29,37 @@ from djet_ros.recordings.outputs import make_folder, write_whole
 import numpy as np
 from rich.table import Table
 
-# Pairs that are listed one by one at most.
+# Maximum number of wrong pairs that are listed.
 _LISTED = 20
 
 DESCRIPTION = """\
-Render ways through scenes that are hard for a camera alone (fast turns, two seconds of black
-images, a lorry that fills half of the picture, traffic before a camera that stands), and two that
-are not, and run the odometry through each with and without a gyro of a telephone's errors, or with
-an exact mask of what moves. Writes all of it as JSON. A run that was broken off is taken up where
-it ended.
+Render sequences that are hard for a camera alone (fast rotations, two seconds of black images, a
+lorry that fills half of the image, traffic in front of a stationary camera), and two that are not,
+and run the odometry on each without aids, with a gyro (errors of a MEMS in a telephone), or with
+an exact mask of moving objects. Writes the results as JSON. An interrupted run is resumed.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('--trials', default=','.join(TRIALS), metavar='LIST',
-                        help='(default: %(default)s)')
+                        help='sequences to run (default: %(default)s)')
     add_seeds(parser)
     parser.add_argument('--frames', type=int, default=1000, metavar='N',
-                        help='of each trial at most (default: all, up to 301)')
-    add_output(parser, 'folder of the results')
+                        help='maximum number of frames per sequence (default: all, up to 301)')
+    add_output(parser, 'folder for the results')
     add_workers(parser)
     add_flags(parser, ('estimator.max_features',))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all trials, and show what became of them."""
+    """Run all trials, and print the errors."""
     trials = split(args.trials)
     if unknown := [name for name in trials if name not in TRIALS]:
-        raise DjetError(f"--trials has '{unknown[0]}'; choose of {', '.join(TRIALS)}")
+        raise DjetError(f"--trials has '{unknown[0]}'; choose from {', '.join(TRIALS)}")
     check_workers(args)
     if args.frames < 3:
-        raise DjetError(f'--frames is {args.frames}; at least three are needed')
+        raise DjetError(f'--frames is {args.frames}; it must be at least 3')
     make_folder(args.output)
     moments = _moments(args, [TrialChunk(name, seed, args.frames)
                               for name in trials for seed in args.seeds])
@@ -76,28 +75,29 @@ def run(args: argparse.Namespace) -> int:
 def _moments(args: argparse.Namespace, chunks: Sequence[TrialChunk]) -> list[Moment]:
     config = from_flat(flag_values(args)).estimator
     settings = {'frames': args.frames, 'estimator': asdict(config)}
-    return recorded(args, Moment, settings, chunks, partial(run_trial, config=config))
+    return run_and_record(args, Moment, settings, chunks, partial(run_trial, config=config))
 
 
 def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:
     out = console()
     out.print(_pairs(rows))
-    print(f'failed: {FAILURE},\n  or a way where there was none; wrong: of those, the ones told '
-          'as if they were right; stood: told\n  as no motion; turn and way: errors of rotation '
-          'and direction in degrees, mean and worst of what\n  was told; ratio: of the mean, over '
-          'that with nothing; black images are not among these pairs')
+    print(f'failed: {FAILURE},\n  or a translation of a stationary camera; undetected: failed '
+          'pairs that were reported as tracked;\n  stationary: pairs estimated as no motion; rot. '
+          'and dir.: errors of rotation and translation\n  direction in degrees, mean and '
+          'maximum; ratio: mean rotation error / that without aids.\n  Pairs with a black image '
+          'are excluded')
     if any(np.isfinite(row.dark_off_deg) or row.bias_off for row in rows):
-        out.print(_beyond(rows))
-        print('dark: worst turn since it was light, and its squared error over its covariance, 3 '
-              'on average if\n  that is true; bias: how far off at the end, as a share of the '
-              'true one')
+        out.print(_dark_and_bias(rows))
+        print('dark: largest rotation error in deg since the last image that was not black, and '
+              'largest NEES\n  (normalised squared error, expectation 3); bias: final error of '
+              'the gyro bias in % of the true bias')
     if wrong := [moment for moment in moments if is_wrong(moment)]:
-        out.print(_list_of(wrong))
+        out.print(_wrong_pairs(wrong))
 
 
 def _pairs(rows: Sequence[Row]) -> Table:
-    table = compact_table('', 'with', 'pairs', 'failed', 'wrong', 'stood', 'turn', 'worst',
-                          'ratio', 'way', 'worst', names=2)
+    table = compact_table('', 'aid', 'pairs', 'failed', 'undetected', 'stationary', 'rot. mean',
+                          'max', 'ratio', 'dir. mean', 'max', names=2)
     alone = {row.trial: row.rotation_deg[0] for row in rows if row.aid == NOTHING}
     for row in rows:
         ratio = row.rotation_deg[0] / max(alone.get(row.trial, float('nan')), 1e-9)
@@ -108,8 +108,8 @@ def _pairs(rows: Sequence[Row]) -> Table:
     return table
 
 
-def _beyond(rows: Sequence[Row]) -> Table:
-    table = compact_table('', 'with', 'dark: off deg', 'square', 'bias: off %, by seed', names=2)
+def _dark_and_bias(rows: Sequence[Row]) -> Table:
+    table = compact_table('', 'aid', 'dark: error', 'NEES', 'bias: error, by seed', names=2)
     for row in rows:
         if np.isfinite(row.dark_off_deg) or row.bias_off:
             table.add_row(row.trial, row.aid, _figure(row.dark_off_deg, 3),
@@ -118,9 +118,9 @@ def _beyond(rows: Sequence[Row]) -> Table:
     return table
 
 
-def _list_of(wrong: Sequence[Moment]) -> Table:
-    table = compact_table('wrong', 'seed', 'with', 'frame', 'status', 'rotation deg',
-                          'direction deg', names=2)
+def _wrong_pairs(wrong: Sequence[Moment]) -> Table:
+    table = compact_table('undetected failures', 'seed', 'aid', 'frame', 'status', 'rot. deg',
+                          'dir. deg', names=2)
     for one in wrong[:_LISTED]:
         table.add_row(one.trial, str(one.seed), one.aid, str(one.frame), one.status,
                       _figure(one.rotation_error_deg, 2), _figure(one.direction_error_deg, 1))

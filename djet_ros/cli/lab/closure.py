@@ -1,4 +1,4 @@
-"""``djet lab closure``: how well the rotations of three frames agree, without ground truth."""
+"""``djet lab closure``: rotation closure error of frame triplets, without ground truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_json_output, split, write_json
+from djet_ros.cli.options import (
+    add_json_output,
+    check_json_output,
+    RECORDINGS,
+    split,
+    write_json,
+)
 from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.errors import DjetError
@@ -18,43 +24,43 @@ from djet_ros.lab.sequences import plain_name, readable_frames
 import numpy as np
 from rich.table import Table
 
-# The 5-point method has no covariance of its own worth the name, and no surfaces.
+# The 5-point method has no meaningful covariance.
 CHOICES = tuple(name for name in METHODS if name != 'five_point')
 
 DESCRIPTION = """\
-Rotations from frame to frame and across two frames have to agree, whatever the camera did. Show
-by how much they do not, by method: a lower bound of their error on any recording, no ground truth
-needed, and a test of what the covariances claim. Writes all triangles as JSON and a plot beside
-them.
+The rotation from frame i to i + 2 must equal the product of those from i to i + 1 and i + 1 to
+i + 2. Print the closure error by method: a lower bound of the rotation error on any recording,
+without ground truth, and a consistency check of the covariances. Writes all triplets as JSON and a
+plot next to it.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('source', type=Path, metavar='SOURCE', help='a sequence or a bag')
+    parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     parser.add_argument('--methods', default=','.join(CHOICES), metavar='LIST',
-                        help='(default: %(default)s)')
+                        help='methods to compare (default: %(default)s)')
     parser.add_argument('--frames', type=int, default=150, metavar='N',
-                        help='how many frames to use, from the first (default: %(default)s)')
+                        help='number of frames to use, from the first (default: %(default)s)')
     add_json_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate the triangles, write and show them."""
+    """Estimate the triplets, write and print their closure errors."""
     check_json_output(args)
     if args.frames < 3:
-        raise DjetError(f'--frames is {args.frames}; a triangle needs 3')
+        raise DjetError(f'--frames is {args.frames}; it must be at least 3')
     methods, name = split(args.methods), plain_name(args.source)
     check_names('method', methods, CHOICES)
     with TemporaryDirectory() as workspace:
         sequence = readable_frames(args.source, Path(workspace))
-        with progress_bar('triangles', max(min(args.frames, len(sequence)) - 2, 1)) as progress:
+        with progress_bar('triplets', max(min(args.frames, len(sequence)) - 2, 1)) as progress:
             found = closures(sequence, methods, args.frames, progress)
     summaries = {method: summary(triangles) for method, triangles in found.items()}
     console().print(_table(name, summaries))
-    print('claimed: standard deviation by the covariances; square: of left over claimed, 3 on '
-          'average if true;\noff truth: error of single rotations, median, where there is ground '
-          'truth')
+    print('sigma: median standard deviation of the closure error by the covariances; NEES: mean '
+          'normalised\nsquared closure error, expectation 3; error: median error of single '
+          'rotations against ground truth,\nif there is any')
     write_json(args.output, {
         'source': name, 'summary': summaries,
         'triangles': {method: [triangle and asdict(triangle) for triangle in triangles]
@@ -64,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _table(title: str, summaries: dict[str, dict[str, Any]]) -> Table:
-    table = new_table(f'{title}: rotation left by three frames, deg', '', 'median', '95 %',
-                      'claimed', 'square (3)', 'triangles', 'off truth')
+    table = new_table(f'{title}: rotation closure error, deg', '', 'median', '95 %',
+                      'sigma', 'NEES (3)', 'triplets', 'error')
     for method, one in summaries.items():
         table.add_row(
             TITLES[method], f"{one['median_deg']:.4f}", f"{one['p95_deg']:.4f}",
@@ -76,7 +82,7 @@ def _table(title: str, summaries: dict[str, dict[str, Any]]) -> Table:
 
 
 def draw(found: dict[str, list[Triangle | None]], title: str, path: Path) -> None:
-    """Plot which share of the triangles leaves less than an angle, and what was claimed."""
+    """Plot the cumulative distribution of closure errors, and their ratio to sigma."""
     from djet_ros.lab.style import COLOURS, DASHES, figure
     with figure(path, 8.0, 3.2) as empty:
         left, right = empty.subplots(1, 2)
@@ -87,8 +93,8 @@ def draw(found: dict[str, list[Triangle | None]], title: str, path: Path) -> Non
             left.step(np.sort([t.angle for t in closed]), shares, where='post', **look)
             right.plot([t.first for t in closed],
                        [t.angle / t.claimed for t in closed], lw=0.8, **look)
-        left.set(xscale='log', xlabel='rotation left by three frames [deg]', ylim=(0, 100),
-                 ylabel='share of triangles [%]', title=title)
+        left.set(xscale='log', xlabel='rotation closure error [deg]', ylim=(0, 100),
+                 ylabel='share of triplets [%]', title=title)
         left.legend()
-        right.set(xlabel='first frame', ylabel='left / claimed', ylim=(0, None),
+        right.set(xlabel='first frame', ylabel='closure error / sigma', ylim=(0, None),
                   title='against the covariances')

@@ -1,4 +1,4 @@
-"""``djet lab coverage``: whether poses are as sure as their covariances say."""
+"""``djet lab coverage``: calibration of the covariances of poses."""
 
 from __future__ import annotations
 
@@ -27,11 +27,13 @@ from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.errors import DjetError
 from djet_ros.lab.coverage import (
+    ALONE,
     cover_chunk,
     Coverage,
     coverage_rows,
     CoverageRow,
     draw_reliability,
+    IN_A_ROW,
     LEVELS,
     PAIRS_PER_CHUNK,
     SURE_DIRECTION,
@@ -46,10 +48,10 @@ from djet_ros.recordings.outputs import make_folder, write_whole
 from rich.table import Table
 
 DESCRIPTION = """\
-Estimate all neighbouring frames, each pair alone and in a row as the odometry does, and hold the
-errors against the covariances: the share of poses inside their 50 to 99.9 % ellipsoids, scene by
-scene, a reliability plot, and the list of pairs that are wrong and sure. Rendered scenes are kept
-in OUTPUT/scenes. A run that was broken off is taken up where it ended.
+Estimate the relative pose of all consecutive frames, each pair by itself and in sequence as in
+the odometry, and compare the errors with the covariances: the share of poses inside their 50 to
+99.9 % ellipsoids, scene by scene, a reliability plot, and the list of overconfident failures.
+Rendered scenes are kept in OUTPUT/scenes. An interrupted run is resumed.
 """
 
 
@@ -58,26 +60,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('sources', nargs='*', type=Path, metavar='SOURCE',
                         help='sequences with ground truth: folders or bags')
     parser.add_argument('--scenes', default='', metavar='LIST',
-                        help=f'scenes to render, or all: of {", ".join(SCENES)}')
+                        help=f'scenes to render: all, or some of {", ".join(SCENES)}')
     add_seeds(parser)
     parser.add_argument('--frames', type=int, default=17, metavar='N',
                         help='frames of each rendered scene (default: %(default)s)')
-    add_output(parser, 'folder of the results')
+    add_output(parser, 'folder for the results')
     add_frames(parser)
     add_workers(parser)
     add_flags(parser, ('estimator.method', 'estimator.calibration_sigma'))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render what is missing, estimate, and show how reliable the covariances are."""
+    """Render missing scenes, estimate all pairs, and print the coverage."""
     scenes = list(SCENES) if args.scenes == 'all' else split(args.scenes)
     if unknown := [name for name in scenes if name not in SCENES]:
-        raise DjetError(f"--scenes has '{unknown[0]}'; choose of {', '.join(SCENES)}, or all")
+        raise DjetError(f"--scenes has '{unknown[0]}'; choose from {', '.join(SCENES)}, or all")
     check_workers(args)
     if args.frames < 2:
-        raise DjetError(f'--frames is {args.frames}; at least two are needed')
+        raise DjetError(f'--frames is {args.frames}; it must be at least 2')
     if not scenes and not args.sources:
-        raise DjetError('there is nothing to measure; name a SOURCE or --scenes')
+        raise DjetError('no SOURCE and no --scenes: nothing to measure; name one of them')
     make_folder(args.output)
     with local_workers(args.workers) as executor:
         rendered = _rendered(executor, args.output / 'scenes',
@@ -107,7 +109,7 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
 
 @contextmanager
 def _opened(args: argparse.Namespace, rendered: Sequence[Path]) -> Iterator[list[Dataset]]:
-    """Open all sequences; frames of bags are good within the context."""
+    """Open all sequences; the extracted frames of bags exist only within the context."""
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()
     try:
         yield [*open_datasets([*args.sources, *rendered],
@@ -118,11 +120,11 @@ def _opened(args: argparse.Namespace, rendered: Sequence[Path]) -> Iterator[list
 
 def _rendered(executor: Executor, folder: Path, wanted: Sequence[tuple[str, int]],
               frames: int) -> list[Path]:
-    """Render scenes and seeds that an earlier run has not, and give their folders."""
+    """Render the scenes that an earlier run has not, and return the folders of all."""
     places = [folder / f'{name}-{seed}-{frames}' for name, seed in wanted]
-    # Poses are written last: where they are, the rest is.
+    # Poses are written last: a folder with poses is complete.
     missing = [executor.submit(render_sequence, name, place, frames, seed, overwrite=True)
-               for (name, seed), place in zip(wanted, places) if not _whole(place)]
+               for (name, seed), place in zip(wanted, places) if not _is_complete(place)]
     with progress_bar('scenes', len(missing)) as progress:
         _await(missing, progress)
     return [next(place.glob('sequences/*')) for place in places]
@@ -138,30 +140,35 @@ def _await(futures: Sequence[Any], progress: Callable[..., None]) -> None:
             future.cancel()
 
 
-def _whole(place: Path) -> bool:
+def _is_complete(place: Path) -> bool:
     return any(place.glob('poses/*.txt'))
 
 
 def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:
     out = console()
     for start in dict.fromkeys(row.start for row in rows):
-        out.print(_shares([row for row in rows if row.start == start],
-                          f'poses inside their own ellipsoids, pairs {start}'))
-    print('untold: pairs with a pose that failed without a direction, such as NO_PARALLAX where '
-          'the camera moved\n'
-          'none: pairs given up; right: of those, the ones whose best guess was right\n'
+        out.print(_coverage_table([row for row in rows if row.start == start],
+                                  f'share of poses inside their ellipsoids, {_STARTS[start]}'))
+    print('no dir.: pairs tracked without a translation direction although the camera moved, '
+          'such as NO_PARALLAX\n'
+          'lost: pairs without a pose; correct: of those, the ones whose best estimate was '
+          'correct\n'
           f'failed: {FAILURE}\n'
-          f'sure: of those, the ones that claim better than {SURE_ROTATION:g} and '
-          f'{SURE_DIRECTION:g} deg\n'
-          'NEES: median of e^T C^-1 e, over its expectation; bounds of shares are in '
-          'coverage.json')
-    if wrong := [record for record in records if record.wrong_and_sure]:
-        out.print(_list_of(wrong))
+          f'overconf.: of those, the ones with standard deviations below {SURE_ROTATION:g} '
+          f'(rotation) and {SURE_DIRECTION:g} deg (direction)\n'
+          'NEES: median of e^T C^-1 e, over the median of its distribution; confidence intervals '
+          'of the shares are in coverage.json')
+    if wrong := [record for record in records if record.overconfident]:
+        out.print(_overconfident_pairs(wrong))
 
 
-def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
-    table = compact_table('', 'pairs', 'OK', 'untold', 'none', 'right', 'failed', 'sure', 'NEES',
-                          *(f'{100 * level:g}%' for level in LEVELS), title=title)
+# Titles of the two ways to start a pair.
+_STARTS = {ALONE: 'each pair by itself', IN_A_ROW: 'pairs in sequence'}
+
+
+def _coverage_table(rows: Sequence[CoverageRow], title: str) -> Table:
+    table = compact_table('', 'pairs', 'OK', 'no dir.', 'lost', 'correct', 'failed', 'overconf.',
+                          'NEES', *(f'{100 * level:g}%' for level in LEVELS), title=title)
     for row in rows:
         table.add_row(row.scene, *map(str, (
             row.pairs, row.told, row.untold, row.given_up, row.needlessly, row.failed,
@@ -170,9 +177,9 @@ def _shares(rows: Sequence[CoverageRow], title: str) -> Table:
     return table
 
 
-def _list_of(wrong: Sequence[Coverage]) -> Table:
-    table = new_table('wrong and sure', 'sequence', 'frames', 'start', 'rotation deg',
-                      'claimed', 'direction deg', 'claimed', 'inliers')
+def _overconfident_pairs(wrong: Sequence[Coverage]) -> Table:
+    table = new_table('overconfident failures', 'sequence', 'frames', 'start', 'rotation deg',
+                      'sigma', 'direction deg', 'sigma', 'inliers')
     for one in wrong:
         table.add_row(one.sequence, f'{one.previous} {one.current}', one.start,
                       f'{one.rotation_error_deg:.2f}', f'{one.rotation_claim_deg:.3f}',

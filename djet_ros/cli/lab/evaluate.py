@@ -11,10 +11,10 @@ from djet_ros.lab.methods import default_methods, make_methods, TITLES
 from djet_ros.lab.report import write_report
 
 DESCRIPTION = """\
-Estimate the relative pose of all neighbouring frames by several methods on the same matches, and
-by whole chains of other libraries (sift_poselib, klt_poselib) on the same images, compare with
-the ground truth, and write tables, plots, trajectories and index.html; the drift per 100 m too,
-where the way is that long. A run that was broken off is taken up where it ended.
+Estimate the relative pose of all consecutive frames by several methods on the same matches, and
+by complete pipelines of other libraries (sift_poselib, klt_poselib) on the same images, compare
+with ground truth, and write tables, plots, trajectories and index.html; also the drift per 100 m
+of paths that are long enough. An interrupted run is resumed.
 """
 
 
@@ -22,9 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_run_arguments(parser)
     parser.add_argument('--methods', metavar='LIST',
-                        help=f'of {", ".join(TITLES)} (default: all that are installed)')
+                        help=f'methods to compare, of {", ".join(TITLES)} (default: all that are '
+                        'installed)')
     parser.add_argument('--evo', action='store_true',
-                        help="also evo's metrics of the trajectories, by its own commands")
+                        help='add APE and RPE of the trajectories, computed by evo')
 
 
 def run(args: argparse.Namespace) -> int:

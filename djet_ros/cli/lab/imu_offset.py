@@ -1,4 +1,4 @@
-"""``djet lab imu-offset``: by how much the clock of an IMU is ahead of the camera's."""
+"""``djet lab imu-offset``: time offset and rotation between IMU and camera."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.imu_offset import fit_imu
-from djet_ros.lab.visual_turns import listen
+from djet_ros.lab.visual_turns import rotations_and_rates
 from djet_ros.recordings.recording import open_recording
 import numpy as np
 
 DESCRIPTION = """\
-Find, from a recording in which the camera turns to and fro, by how much the IMU's clock is ahead
-of that of the images (odometry.imu_offset, t_imu = t_image + offset), how the IMU is turned
-against the camera (odometry.imu_rotation), and the bias of its gyro. No target is needed.
+Estimate, from a recording in which the camera rotates back and forth, the time offset of the IMU
+(odometry.imu_offset, t_imu = t_image + offset), the rotation between IMU and camera
+(odometry.imu_rotation), and the gyro bias. No calibration target is needed.
 """
 
 
@@ -26,22 +26,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', type=Path, metavar='SOURCE',
                         help='bag, or folder of EuRoC, TUM-VI, KITTI raw or a rendered scene')
     parser.add_argument('--widest', type=float, default=0.5, metavar='S',
-                        help='largest offset that is tried, in seconds (default: %(default)s)')
+                        help='largest offset to search for, in seconds (default: %(default)s)')
     add_topics(parser, 'image', 'info', 'imu')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the recording through the odometry, without its IMU, and print what suits it best."""
+    """Run the recording through the odometry, without its IMU, and print the estimate."""
     if not 0 < args.widest <= 10:
-        raise DjetError(f'--widest is {args.widest:g}; it must lie between 0 and 10 s')
+        raise DjetError(f'--widest is {args.widest:g}; it must be between 0 and 10 s')
     with open_recording(args.source, args.image_topic, args.info_topic,
                         beside={'imu': args.imu_topic}) as recording, \
             progress_bar('imu-offset', len(recording)) as advance:
-        turns, stamps, rates = listen(recording, Config(), advance)
-    fit = fit_imu(turns, stamps, rates, args.widest)
+        rotations, stamps, rates = rotations_and_rates(recording, Config(), advance)
+    fit = fit_imu(rotations, stamps, rates, args.widest)
     print(f'odometry.imu_offset: {fit.offset:.5f}   # seconds, sigma {fit.offset_sigma:.5f}')
     print('odometry.imu_rotation: "' + ' '.join(f'{q:.6f}' for q in fit.quaternion()) + '"')
     bias = ' '.join(f'{value:.4f}' for value in np.degrees(fit.bias))
-    print(f'# gyro bias {bias} deg/s; {fit.pairs} pairs, left over {np.degrees(fit.residual):.4f} '
+    print(f'# gyro bias {bias} deg/s; {fit.pairs} pairs, residual {np.degrees(fit.residual):.4f} '
           'deg/s')
     return 0

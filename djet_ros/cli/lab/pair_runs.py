@@ -1,4 +1,4 @@
-"""What the commands share that estimate pairs: arguments, workers, progress, tables."""
+"""Arguments, workers, progress and tables of the commands that estimate many pairs."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-# Parameters that every method shares, so that changing them keeps the comparison fair.
+# Parameters that apply to all methods, so that the comparison stays fair.
 SHARED_PARAMETERS = ('estimator.max_features', 'estimator.corner_contrast',
                      'estimator.fast_threshold', 'estimator.ransac_threshold')
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every command needs that spreads pairs over workers."""
+    """Add the arguments of the commands that distribute pairs over workers."""
     parser.add_argument('sources', nargs='+', type=Path, metavar='SOURCE',
                         help='a KITTI sequence or a folder of them, a bag with ground truth, or a '
                         'folder of TUM RGB-D, EuRoC or VAROS')
-    add_output(parser, 'folder of the results')
+    add_output(parser, 'folder for the results')
     parser.add_argument('--presets', metavar='LIST', default='best,paper',
-                        help='parameters to run with (default: %(default)s)')
+                        help='presets of parameters to run with (default: %(default)s)')
     add_frames(parser)
     parser.add_argument('--stride', type=int, default=1, metavar='N',
-                        help='frames from one to the other of a pair (default: %(default)s)')
+                        help='frame distance of the two images of a pair (default: %(default)s)')
     workers = parser.add_mutually_exclusive_group()
     add_workers(workers)
     workers.add_argument('--scheduler', metavar='ADDRESS',
-                         help='Dask scheduler that spreads the work instead, such as '
+                         help='Dask scheduler to distribute the work with instead, such as '
                          'tcp://host:8786')
     add_flags(parser, SHARED_PARAMETERS)
 
 
 def shared_values(args: argparse.Namespace) -> dict[str, Any]:
-    """Give the estimator's parameters that stand on the command line, by their plain names."""
+    """Return the estimator parameters of the command line, by their names without section."""
     return {name.rpartition('.')[2]: value for name, value in flag_values(args).items()}
 
 
-def recorded(args: argparse.Namespace, kind: Callable[..., R], settings: Mapping[str, Any],
-             chunks: Sequence[C], work: Callable[[C], list[R]]) -> list[R]:
-    """Do the work of all chunks on this machine, with a progress bar, and keep the records."""
+def run_and_record(args: argparse.Namespace, kind: Callable[..., R], settings: Mapping[str, Any],
+                   chunks: Sequence[C], work: Callable[[C], list[R]]) -> list[R]:
+    """Process all chunks on this machine, with a progress bar, and store the records."""
     with (RecordStore(args.output, kind, settings, overwrite=args.overwrite) as store,
           local_workers(args.workers) as executor, progress_bar('pairs') as progress):
         return run(executor, chunks, work, store, progress)
@@ -67,10 +67,10 @@ def recorded(args: argparse.Namespace, kind: Callable[..., R], settings: Mapping
 @contextmanager
 def evaluated(args: argparse.Namespace, competing: Sequence[Method]
               ) -> Iterator[tuple[list[Dataset], list[PairRecord]]]:
-    """Run all pairs with a progress bar; datasets and records are good within the context."""
+    """Evaluate all pairs with a progress bar; datasets are readable only within the context."""
     check_workers(args)
     selection = Selection(args.start, args.end, args.stride)
-    # Frames of bags are kept beside the results, where workers on other machines see them too.
+    # Frames of bags are extracted next to the results, which workers on other machines see too.
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()
     try:
         datasets = open_datasets(args.sources, selection, workspace)
@@ -79,7 +79,7 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
                     'methods': [method.settings() for method in competing]}
         workers = (dask_workers(args.scheduler) if args.scheduler
                    else local_workers(args.workers))
-        # First the workers: where there are none, earlier records stay.
+        # Workers first: if there are none, earlier records are kept.
         with (workers as executor,
               RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store,
               progress_bar('pairs') as progress):
@@ -91,7 +91,7 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
 
 
 def show(tables: Sequence[ReadableTable], folder: Path) -> None:
-    """Print the tables, and where the page is that has them too."""
+    """Print the tables, and the path of the page."""
     out = console()
     for table in tables:
         _print(out, table)
@@ -99,7 +99,7 @@ def show(tables: Sequence[ReadableTable], folder: Path) -> None:
 
 
 def _print(out: Console, table: ReadableTable) -> None:
-    """Print a table section by section; figures that are not ours are dim."""
+    """Print a table section by section; published figures are dim."""
     for section, lines in groupby(table.lines, lambda line: line.cells[:table.sections]):
         printed = Table(title=', '.join(section), title_justify='left', box=SIMPLE_HEAD,
                         padding=0)

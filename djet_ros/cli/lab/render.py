@@ -15,17 +15,17 @@ from djet_ros.lab.scenes.imu import Mems
 
 DESCRIPTION = """\
 Render images, calibration, times and true camera poses into OUT, in the layout of the KITTI
-odometry benchmark, and beside them imu.csv: what an IMU on the camera would measure.
+odometry benchmark, with imu.csv: the samples of a simulated IMU on the camera.
 """
 
 _MEMS = {
     'rate': 'samples per second',
-    'gyro': 'density of the white noise of the gyro, rad/s per root of Hz',
-    'gyro_walk': 'random walk of its bias, rad/s² per root of Hz',
-    'gyro_bias': 'standard deviation of its bias at the start, rad/s',
-    'accelerometer': 'density of the white noise of the accelerometer, m/s² per root of Hz',
-    'accelerometer_walk': 'random walk of its bias, m/s³ per root of Hz',
-    'accelerometer_bias': 'standard deviation of its bias at the start, m/s²',
+    'gyro': 'white noise density of the gyro, rad/s/√Hz',
+    'gyro_walk': 'random walk of the gyro bias, rad/s²/√Hz',
+    'gyro_bias': 'standard deviation of the initial gyro bias, rad/s',
+    'accelerometer': 'white noise density of the accelerometer, m/s²/√Hz',
+    'accelerometer_walk': 'random walk of the accelerometer bias, m/s³/√Hz',
+    'accelerometer_bias': 'standard deviation of the initial accelerometer bias, m/s²',
 }
 
 
@@ -37,14 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f'scenes:\n{scenes}'
     parser.add_argument('scene', metavar='SCENE', choices=tuple(SCENES), help='see below')
     parser.add_argument('out', type=Path, metavar='OUT',
-                        help='folder that gets sequences/NN and poses/NN.txt')
+                        help='folder for sequences/NN and poses/NN.txt')
     parser.add_argument('--frames', type=int, metavar='N',
-                        help='how many (default: as suits the scene)')
+                        help='number of frames (default: depends on the scene)')
     parser.add_argument('--seed', type=int, default=0, metavar='S',
-                        help='another seed is another place (default: %(default)s)')
+                        help='random seed of the scene (default: %(default)s)')
     parser.add_argument('--size', type=_size, metavar='WxH',
-                        help='pixels of a picture (default: as suits the scene: 1241x376, as '
-                             'KITTI has, 960x540 or 640x480)')
+                        help='image size in pixels (default: depends on the scene: 1241x376 as in '
+                             'KITTI, 960x540 or 640x480)')
     imu = parser.add_argument_group('IMU')
     for name, text in _MEMS.items():
         imu.add_argument(f'--{name.replace("_", "-")}', dest=f'mems.{name}', type=float,
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render, with a progress bar on stderr, and say what was written."""
+    """Render, with a progress bar on stderr, and print what was written."""
     with progress_bar(args.scene) as progress:
         folder = render_sequence(args.scene, args.out, args.frames, args.seed, args.size,
                                  progress, overwrite=args.overwrite, mems=_mems(args))
@@ -68,13 +68,13 @@ def _mems(args: argparse.Namespace) -> Mems:
     values = {name: getattr(args, f'mems.{name}') for name in _MEMS}
     for name, value in values.items():
         if not (math.isfinite(value) and value >= 0 and (name != 'rate' or 1 <= value <= 10_000)):
-            raise DjetError(f'--{name.replace("_", "-")} is {value:g}; it must not be negative, '
-                            'and the rate lies between 1 and 10000')
+            limits = 'between 1 and 10000' if name == 'rate' else 'finite and not negative'
+            raise DjetError(f'--{name.replace("_", "-")} is {value:g}; it must be {limits}')
     return Mems(**values)
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Width and height of a text such as 620x188."""
+    """Return width and height of a text such as 620x188."""
     match = re.fullmatch(r'(\d{1,5})x(\d{1,5})', text)
     if match is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not WIDTHxHEIGHT, such as 620x188")

@@ -1,4 +1,4 @@
-"""``djet lab similarity``: the paper's Figure 1, for one image or between two."""
+"""``djet lab similarity``: the paper's Figure 1, for one image or two."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from djet_ros.lab.similarity import (
 import numpy as np
 
 DESCRIPTION = """\
-Draw how alike the descriptors of keypoints are to those of all pixels around them: in the same
-image, or, with a second image, around their matches in that one. The first row shows the patches,
-the second the Hamming distances as heat maps, with the fitted paraboloids and their minima.
+Plot the Hamming distances between the descriptors of keypoints and those of all pixels around
+them: in the same image or, with a second image, around their matches in that one. The first row
+shows the patches, the second the distances as heat maps, with the fitted paraboloids and their
+minima.
 """
 
 _LARGEST_RADIUS = 100
@@ -30,21 +31,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('image', type=Path, metavar='IMAGE', help='PNG or JPEG')
     parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2',
-                        help='second image of the same place (default: the first)')
+                        help='second image of the same scene (default: the first)')
     add_output(parser, 'PNG to write', 'similarity.png', 'FILE')
     parser.add_argument('--points', nargs='+', metavar='X,Y',
                         help='pixels in the first image (default: the strongest keypoints)')
     parser.add_argument('--count', type=int, default=6, metavar='N',
-                        help='how many keypoints without --points (default: %(default)s)')
+                        help='number of keypoints without --points (default: %(default)s)')
     parser.add_argument('--radius', type=int, default=20, metavar='PIXELS',
-                        help='of the heat maps (default: %(default)s)')
+                        help='radius of the heat maps (default: %(default)s)')
     add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_features',
                        'estimator.detector', 'estimator.corner_contrast',
                        'estimator.fast_threshold'))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the figure, and say where it is."""
+    """Draw the figure, and print its path."""
     check_output(args, '.png')
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
@@ -52,8 +53,9 @@ def run(args: argparse.Namespace) -> int:
         [numbers(text, '--points', 'X,Y') for text in args.points])
     config = from_flat(flag_values(args)).estimator
     if not config.window // 2 <= args.radius <= _LARGEST_RADIUS or args.count < 1:
-        raise DjetError(f'--radius is {args.radius} and --count {args.count}; the radius must lie '
-                        f'between {config.window // 2} and {_LARGEST_RADIUS}, the count above 0')
+        raise DjetError(f'--radius is {args.radius} and --count {args.count}; the radius must be '
+                        f'between {config.window // 2} and {_LARGEST_RADIUS}, the count at least '
+                        '1')
     if args.other is None:
         similarity = self_similarity(gray, points, args.count, args.radius, config)
     else:

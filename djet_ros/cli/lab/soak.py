@@ -1,4 +1,4 @@
-"""``djet lab soak``: memory and latency over many frames."""
+"""``djet lab soak``: memory and latency in a long run."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from djet_ros.cli.terminal import progress_bar
 from djet_ros.lab.soak import SIZE, soak
 
 DESCRIPTION = f"""\
-Run many rendered frames of {SIZE[0]}x{SIZE[1]} through the odometry, black ones, gaps and steps
-back in time among them, and record memory and latency. Writes the figures as JSON and a plot
-beside them. The exit code is 1 if memory grows beyond the bound.
+Run many rendered frames of {SIZE[0]}x{SIZE[1]} through the odometry, including black images, gaps
+and stamps that jump back, and record memory and latency. Writes the results as JSON and a plot
+next to it. The exit code is 1 if memory grows beyond the limit.
 """
 
 
@@ -22,23 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--frames', type=int, default=20_000, metavar='N',
                         help='frames to process (default: %(default)s)')
     parser.add_argument('--max-growth', type=float, default=10.0, metavar='MB',
-                        help='resident memory that may come on top of what a fifth of the frames '
-                        'took (default: %(default)s)')
+                        help='largest growth of resident memory after the first fifth of the '
+                        'frames (default: %(default)s)')
     add_json_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Soak, write and show the figures."""
+    """Run, write and print the results."""
     check_json_output(args)
     with progress_bar('frames', args.frames) as progress:
         figures = soak(args.frames, args.max_growth, progress)
     latency = figures['latency_ms']
     print(f"{figures['frames']} frames in {figures['seconds']:.0f} s; latency p50 "
           f"{latency['p50_ms']:.1f}, p95 {latency['p95_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
-          f"largest {latency['max_ms']:.1f} ms\n"
-          f"memory {figures['memory_mb']:.1f} MB, grown by {figures['growth_mb']:.1f} MB "
-          f"({figures['most_growth_mb']:g} MB are allowed): "
-          f"{'held' if figures['held'] else 'NOT HELD'}")
+          f"max {latency['max_ms']:.1f} ms\n"
+          f"memory {figures['memory_mb']:.1f} MB, growth {figures['growth_mb']:.1f} MB "
+          f"(limit {figures['most_growth_mb']:g} MB): "
+          f"{'passed' if figures['held'] else 'FAILED'}")
     write_json(args.output, figures, lambda plot: draw(figures, plot))
     return 0 if figures['held'] else 1
 

@@ -1,4 +1,4 @@
-"""``djet lab surfaces``: one correspondence through the rounds of Algorithm 1."""
+"""``djet lab surfaces``: one match through the iterations of Algorithm 1."""
 
 from __future__ import annotations
 
@@ -15,13 +15,18 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.sequences import pair_of_frames
 from djet_ros.lab.similarity import read_image
-from djet_ros.lab.surface_steps import animate_trace, draw_trace, follow, telling_match
+from djet_ros.lab.surface_steps import (
+    animate_trace,
+    draw_trace,
+    illustrative_match,
+    trace_rounds,
+)
 import numpy as np
 from numpy.typing import NDArray
 
 DESCRIPTION = """\
-Show one match on its Hamming surface, round by round of D-JET: the sampled window, the fitted
-paraboloid and its minimum, the epipolar line of the pose, and the optimum on it.
+Plot one match on its Hamming surface, iteration by iteration of D-JET: the sampled window, the
+fitted paraboloid and its minimum, the epipolar line of the pose, and the optimum on it.
 """
 
 
@@ -32,20 +37,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('other', type=Path, nargs='?', metavar='IMAGE2', help='the second image')
     add_output(parser, 'PNG, or GIF for an animation', 'surfaces.png', 'FILE')
     parser.add_argument('--camera', metavar='FX,FY,CX,CY',
-                        help='camera of two images, in pixels')
+                        help='camera matrix of two images, in pixels')
     parser.add_argument('--pair', type=int, default=0, metavar='I',
                         help='frames I and I + 1 of a sequence (default: %(default)s)')
     parser.add_argument('--match', type=int, metavar='K',
-                        help='number of the match (default: one that agrees and moves far)')
+                        help='index of the match (default: the inlier with a minimum in every '
+                        'iteration that moves farthest)')
     parser.add_argument('--preset', choices=PRESETS, default='paper',
-                        help='parameters; paper moves in small steps (default: %(default)s, whose '
-                        'defaults are those below)')
+                        help='preset of parameters; paper takes small steps (default: '
+                        '%(default)s, whose values are the defaults below)')
     add_flags(parser, ('estimator.window', 'estimator.window_sigma', 'estimator.max_iterations',
                        'estimator.step', 'estimator.step_share'), from_flat({'preset': 'paper'}))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the figure, and say where it is."""
+    """Draw the figure, and print its path."""
     check_output(args, '.png', '.gif')
     draw = draw_trace if args.output.suffix.lower() == '.png' else animate_trace
     config = from_flat(flag_values(args)).estimator
@@ -54,17 +60,18 @@ def run(args: argparse.Namespace) -> int:
     previous, current = estimator.view(first, K), estimator.view(second, K)
     x, y = estimator.match(previous, current)
     if len(x) < config.min_matches:
-        raise DjetError(f'the two images have {len(x)} matches, {config.min_matches} are needed')
-    trace = follow(previous, current, x, y, config)
-    match = telling_match(trace) if args.match is None else args.match
+        raise DjetError(f'the two images have {len(x)} matches, at least {config.min_matches} are '
+                        'needed; choose images of the same scene with texture')
+    trace = trace_rounds(previous, current, x, y, config)
+    match = illustrative_match(trace) if args.match is None else args.match
     draw(args.output, trace, match)
-    print(f'match {match} of {len(trace.y)}, {len(trace.rounds)} rounds')
+    print(f'match {match} of {len(trace.y)}, {len(trace.rounds)} iterations')
     print(f'figure: {args.output}')
     return 0
 
 
 def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
-    """Two images (H, W) and their camera matrix (3, 3)."""
+    """Return two images (H, W) and their camera matrix (3, 3)."""
     if args.other is None:
         with TemporaryDirectory(prefix='djet-') as workspace:
             return pair_of_frames(args.source, args.pair, Path(workspace))

@@ -1,7 +1,7 @@
 """
-What happens to the light between the scene and the file: haze, lamps, particles, blur, noise.
+Effects of medium, light and camera: haze, lamps, particles, blur, noise.
 
-An effect takes a shot and gives its new radiance; a camera is a list of effects.
+An effect maps a shot to its new radiance; a camera is a list of effects.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 @dataclass(frozen=True)
 class Shot:
     """
-    One picture on its way through the camera.
+    An image in the simulated camera.
 
-    radiance: (H, W) gray values, not yet cut to 0..255; inverse_depth: (H, W) in 1/m, zero at
+    radiance: (H, W) gray values, not yet clipped to 0..255; inverse_depth: (H, W) in 1/m, zero at
     infinity; pose: (4, 4) camera to level axes; index: frame number; seed: of everything random.
     """
 
@@ -35,7 +35,7 @@ class Shot:
 
     @cached_property
     def rays(self) -> Gray:
-        """Directions (H, W, 3) that the pixels look in, with z = 1."""
+        """Return the viewing directions (H, W, 3) of the pixels, with z = 1."""
         height, width = self.radiance.shape
         K_inv = np.linalg.inv(self.K)
         rays = np.empty((height, width, 3), np.float32)
@@ -46,21 +46,21 @@ class Shot:
 
 
 class Effect(Protocol):
-    """Something that changes the picture."""
+    """A change of the image."""
 
     def __call__(self, shot: Shot) -> Gray:
-        """Give the new radiance (H, W)."""
+        """Return the new radiance (H, W)."""
 
 
 @dataclass(frozen=True)
 class Haze:
-    """Fade to the tone ``air`` with depth; clear: metres until 63 % are lost."""
+    """Attenuation towards the tone ``air``; clear: attenuation length in metres (63 % lost)."""
 
     clear: float
     air: float
 
     def __call__(self, shot: Shot) -> Gray:
-        """Mix with the tone of the air."""
+        """Blend with the tone of the air by depth."""
         depth = 1 / np.maximum(shot.inverse_depth, np.float32(1e-6))
         left = np.exp(-depth / np.float32(self.clear))
         return np.asarray(self.air + (shot.radiance - self.air) * left)
@@ -69,12 +69,12 @@ class Haze:
 @dataclass(frozen=True)
 class Headlight:
     """
-    A lamp that the camera carries through murky water.
+    A lamp on a camera in murky water.
 
-    place: (3,) of the lamp and aim: (3,) direction of its cone, both in camera axes; spread: the
-    cone's half angle in radians; power: radiance of a white surface one metre away; ambient: the
-    same of the daylight left; clear: metres until 63 % of the light are lost; glow: brightness of
-    the lit water itself; sway: radians by which the aim wanders.
+    place: (3,) position of the lamp and aim: (3,) direction of its cone, both in camera axes;
+    spread: half angle of the cone in radians; power: radiance of a white surface at 1 m; ambient:
+    the same of the daylight; clear: attenuation length in metres; glow: brightness of the lit
+    water; sway: amplitude in radians of the aim's oscillation.
     """
 
     place: tuple[float, float, float]
@@ -87,7 +87,7 @@ class Headlight:
     sway: float = 0.0
 
     def __call__(self, shot: Shot) -> Gray:
-        """Light the scene; radiance coming in is the albedo times 255."""
+        """Light the scene; the input radiance is the albedo times 255."""
         depth = 1 / np.maximum(shot.inverse_depth, np.float32(1 / 60))
         points = shot.rays * depth[..., None] - np.array(self.place, np.float32)
         distance = np.sqrt(np.einsum('ijk,ijk->ij', points, points))
@@ -104,7 +104,7 @@ class Headlight:
         return np.asarray(unit(np.array(self.aim) + swing), np.float32)
 
     def _beam(self, along: Gray, distance: Gray) -> Gray:
-        """Brightness of the cone, 1 on its axis, with a soft border."""
+        """Return the brightness of the cone, 1 on its axis, with a soft border."""
         cosine = np.clip(along / np.maximum(distance, np.float32(1e-3)), -1, 1)
         return np.asarray(1 / (1 + (np.arccos(cosine) / np.float32(self.spread)) ** 4))
 
@@ -112,10 +112,10 @@ class Headlight:
 @dataclass(frozen=True)
 class MarineSnow:
     """
-    Bright particles that sink and drift in a box of water round the camera.
+    Bright particles that drift in a box of water around the camera.
 
-    count: particles in a cube of ``reach`` metres; drift: (3,) m per frame in level axes;
-    tone: brightness of a particle one metre away.
+    count: number of particles in a cube of ``reach`` metres; drift: (3,) m per frame in level
+    axes; tone: brightness of a particle at 1 m.
     """
 
     count: int
@@ -131,7 +131,7 @@ class MarineSnow:
         return _with_spots(shot.radiance, pixels, radius, light)
 
     def _seen(self, shot: Shot) -> tuple[Array, Array]:
-        """Pixels (M, 2) and depths (M,) of the particles in view and before the scene."""
+        """Return pixels (M, 2) and depths (M,) of the visible particles."""
         rng = np.random.default_rng([shot.seed, 77])
         home = rng.uniform(0, self.reach, (self.count, 3))
         whirl = rng.normal(0, 0.004, (self.count, 3)) * np.sin(
@@ -150,7 +150,7 @@ class MarineSnow:
 
 
 def _with_spots(radiance: Gray, pixels: Array, radius: Array, light: Array) -> Gray:
-    """Add Gaussian spots at sub-pixel places (M, 2); sigma = radius (M,) pixels."""
+    """Add Gaussian spots at sub-pixel positions (M, 2); sigma = radius (M,) pixels."""
     reach = 8
     offsets = np.arange(-reach, reach + 1)
     centre = np.rint(pixels).astype(int)
@@ -175,7 +175,7 @@ class Defocus:
     period: int
 
     def __call__(self, shot: Shot) -> Gray:
-        """Blur where it is the turn of this frame."""
+        """Blur the frames of each period that are out of focus."""
         if shot.index % self.period >= self.length:
             return shot.radiance
         return np.asarray(cv2.GaussianBlur(shot.radiance, (0, 0), self.sigma), np.float32)
@@ -183,13 +183,13 @@ class Defocus:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Gain that jumps: the frames' gains are ``gains``, each for ``hold`` frames, in a circle."""
+    """Gain that cycles through ``gains``, each for ``hold`` frames."""
 
     gains: tuple[float, ...]
     hold: int
 
     def __call__(self, shot: Shot) -> Gray:
-        """Brighten or darken."""
+        """Apply the gain of this frame."""
         return np.asarray(shot.radiance * self.gains[shot.index // self.hold % len(self.gains)])
 
 
@@ -201,7 +201,7 @@ class SensorNoise:
     photon: float = 0.0
 
     def __call__(self, shot: Shot) -> Gray:
-        """Add noise that belongs to this frame."""
+        """Add noise, reproducible by frame number."""
         rng = np.random.default_rng([shot.seed, 78, shot.index])
         noise = rng.standard_normal(shot.radiance.shape, np.float32)
         variance = self.read ** 2 + self.photon ** 2 * np.maximum(shot.radiance, 0)

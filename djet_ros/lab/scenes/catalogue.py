@@ -1,4 +1,4 @@
-"""The named scenes."""
+"""Catalogue of the named scenes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _CAR_SIZE = (1241, 376)
 _DIVE_SIZE = (960, 540)
 _HAND_SIZE = (640, 480)
 _SMALLEST, _LARGEST = 64, 4096
-# Metres of road that go on after the last frame, so that there is always something to see.
+# Length in metres of the road beyond the last frame, to fill its view.
 _OUTLOOK = 100.0
 _LANE = 1.4
 
@@ -54,10 +54,9 @@ class Entry:
     """
     A named scene.
 
-    number: the NN of its folder; frames (None: to the end of the way) and size: what is rendered
-    unless asked otherwise; build: from seed and size (width, height); text: what it shows;
-    parallax: whether the camera moves through it, so that directions of translation mean
-    something.
+    number: NN of its folder; frames (None: to the end of the route), size: defaults of a
+    rendering; build: function of seed and size (width, height); text: description; parallax:
+    whether the camera translates, so that translation directions are defined.
     """
 
     number: int
@@ -69,31 +68,31 @@ class Entry:
 
 
 def make_scene(name: str, seed: int = 0, size: tuple[int, int] | None = None) -> Scene:
-    """Scene of that name; DjetError where there is none, or none of that size or seed."""
+    """Return the scene of a name; raise DjetError for an unknown name or invalid size or seed."""
     entry = find(name)
     width, height = size = size or entry.size
     if not (_SMALLEST <= width <= _LARGEST and _SMALLEST <= height <= _LARGEST):
-        raise DjetError(f'size is {width}x{height}; both must lie between {_SMALLEST} and '
-                        f'{_LARGEST} pixels')
+        raise DjetError(f'--size is {width}x{height}; width and height must be between '
+                        f'{_SMALLEST} and {_LARGEST} pixels')
     if seed < 0:
-        raise DjetError(f'seed is {seed}; it must not be negative')
+        raise DjetError(f'--seed is {seed}; it must not be negative')
     return entry.build(seed, size)
 
 
 def find(name: str) -> Entry:
-    """Catalogue entry of that name; DjetError lists the names there are."""
+    """Return the catalogue entry of a name; raise DjetError with all names if it is unknown."""
     if name not in SCENES:
         raise DjetError(f"there is no scene '{name}'; choose from {', '.join(SCENES)}")
     return SCENES[name]
 
 
 def suggested_frames(scene: Scene) -> int:
-    """How many frames of a scene to render if nobody says; None in the catalogue means all."""
+    """Return the default number of frames of a scene; None in the catalogue means all."""
     return find(scene.name).frames or scene.path.limit
 
 
 def car_camera(size: tuple[int, int]) -> Array:
-    """Camera matrix (3, 3) of KITTI's gray camera, scaled to the size (width, height)."""
+    """Return K (3, 3) of KITTI's gray camera, scaled to a size (width, height)."""
     scale, scale_y = size[0] / 1241, size[1] / 376
     return np.array([[718.856 * scale, 0, (607.1928 + 0.5) * scale - 0.5],
                      [0, 718.856 * scale, (185.2157 + 0.5) * scale_y - 0.5],
@@ -105,7 +104,7 @@ def _road() -> Route:
     return winding(1000 + _OUTLOOK, 0.25, (170, 90))
 
 
-# Several scenes share textures and streets, which take a second to make.
+# Cached: several scenes share textures and streets, which take a second to make.
 @lru_cache(maxsize=2)
 def _palette(seed: int, varied: bool) -> Palette:
     return make_palette(np.random.default_rng([seed, 0]), varied)
@@ -118,7 +117,7 @@ def _road_world(seed: int, varied: bool) -> World:
 
 def _street_scene(name: str, seed: int, size: tuple[int, int], path: Trajectory | None = None,
                   world: World | None = None, effects: tuple[Effect, ...] = ()) -> Scene:
-    """Scene with the car's camera; without anything else said, a drive along the road."""
+    """Return a scene with the car's camera, by default a drive along the road."""
     return Scene(name, world or _road_world(seed, True), path or _drive(), car_camera(size), size,
                  seed, background=200.0,
                  effects=(Haze(450, 205), *effects, SensorNoise(0.8, 0.06)))
@@ -162,7 +161,7 @@ def _build_repeated(seed: int, size: tuple[int, int]) -> Scene:
 
 
 def _build_moving(seed: int, size: tuple[int, int]) -> Scene:
-    """Behind a lorry that now falls back and now pulls away."""
+    """Drive behind a lorry of varying distance."""
     drive = _drive()
 
     def lorry(index: int) -> Array:
@@ -176,13 +175,14 @@ def _build_moving(seed: int, size: tuple[int, int]) -> Scene:
                          World(still.panels, (Mover(panels, lorry),)))
 
 
-# Lorries that cross: metres ahead of the camera, metres a frame to the right, and between two.
+# Crossing lines of lorries: metres ahead of the camera, metres per frame to the right, and metres
+# between two lorries.
 _CROSSINGS = ((6.0, 0.9, 17.0), (11.0, -0.7, 23.0))
 _ABREAST = 3
 
 
 def _build_traffic(seed: int, size: tuple[int, int]) -> Scene:
-    """Stand before a street on which lorries come from both sides."""
+    """Stand at a street with lorries from both sides."""
     spot, rng = _on_the_spot(0.0), np.random.default_rng([seed, 6])
     panels, here = truck(rng), spot.pose(0)
     begins = rng.uniform(0, 20, len(_CROSSINGS))
@@ -195,7 +195,7 @@ def _build_traffic(seed: int, size: tuple[int, int]) -> Scene:
 
 def _crossing(here: Array, ahead: float, speed: float, gap: float, begin: float, index: int
               ) -> Array:
-    """Pose (4, 4) of a lorry of a line that goes round and round, far out of sight at its ends."""
+    """Return the pose (4, 4) of a lorry of a line that wraps around out of sight."""
     length = _ABREAST * gap
     across = (begin + abs(speed) * index) % length - length / 2
     way = level_pose(across if speed > 0 else -across, ahead, np.copysign(np.pi / 2, speed))
@@ -210,7 +210,7 @@ def _loop_world(seed: int) -> World:
 
 
 def _lap(rounds: int) -> Route:
-    """Round a block, from the middle of one side and to the right."""
+    """Return the route around a block, clockwise from the middle of one side."""
     corner = (8 * np.pi / 2, 1 / 8)
     once = [(20, 0), corner, (30, 0), corner, (40, 0), corner, (30, 0), corner, (20, 0)]
     return route_of(once * rounds)
@@ -221,7 +221,7 @@ def _build_loop(seed: int, size: tuple[int, int]) -> Scene:
     return _street_scene('loop', seed, size, path, _loop_world(seed))
 
 
-# Right and left round two corners, as (length, curvature).
+# A right and a left turn, as (length, curvature).
 _BENDS = ((12, 0), (7 * np.pi / 2, 1 / 7), (16, 0), (7 * np.pi / 2, -1 / 7), (20, 0))
 
 
@@ -259,30 +259,30 @@ def _build_underwater(seed: int, size: tuple[int, int]) -> Scene:
 
 
 SCENES: dict[str, Entry] = {
-    'road': Entry(0, 60, _CAR_SIZE, _build_road, 'a street of mild curves, 1 m a frame'),
+    'road': Entry(0, 60, _CAR_SIZE, _build_road, 'street with slight curves, 1 m per frame'),
     'underwater': Entry(1, 60, _DIVE_SIZE, _build_underwater,
-                        'a dim, hazy sea floor in the light of a lamp, with drifting particles'),
-    'loop': Entry(2, None, _CAR_SIZE, _build_loop, 'twice round a block'),
-    'rotation': Entry(3, 40, _CAR_SIZE, _build_rotation, 'turning on the spot, 1 deg a frame',
+                        'dim, hazy sea floor lit by a lamp, with drifting particles'),
+    'loop': Entry(2, None, _CAR_SIZE, _build_loop, 'two laps around a block'),
+    'rotation': Entry(3, 40, _CAR_SIZE, _build_rotation, 'pure rotation, 1 deg per frame',
                       parallax=False),
-    'standstill': Entry(4, 20, _CAR_SIZE, _build_standstill, 'standing; only the noise changes',
-                        parallax=False),
-    'sharp_turn': Entry(5, 80, _CAR_SIZE, _build_sharp_turn, 'slow turns of 4 deg a frame'),
+    'standstill': Entry(4, 20, _CAR_SIZE, _build_standstill,
+                        'stationary camera; only the noise changes', parallax=False),
+    'sharp_turn': Entry(5, 80, _CAR_SIZE, _build_sharp_turn, 'slow turns of 4 deg per frame'),
     'moving_object': Entry(6, 40, _CAR_SIZE, _build_moving,
-                           'behind a lorry that fills half of the picture'),
+                           'behind a moving lorry that fills half of the image'),
     'repeated_texture': Entry(7, 40, _CAR_SIZE, _build_repeated,
-                              'a row of houses that are all alike'),
+                              'street of identical houses'),
     'exposure_jump': Entry(8, 40, _CAR_SIZE, _build_exposure,
                            'exposure that jumps every 5 frames'),
     'blur': Entry(9, 40, _CAR_SIZE, _build_blur, '3 of every 8 frames out of focus'),
     'indoor': Entry(10, 60, _HAND_SIZE, build_indoor,
-                    'a white corridor with a shining floor, edges like stairs'),
+                    'white corridor with a reflecting floor, aliased edges'),
     'handheld': Entry(11, 60, _HAND_SIZE, build_handheld,
-                      'looking round a study with a jerky hand, at times only turning'),
+                      'jerky hand-held camera in a study, at times pure rotation'),
     'forest': Entry(12, 60, _DIVE_SIZE, build_forest,
-                    'a path through a wood: weak, random texture'),
+                    'path through a forest: weak, random texture'),
     'whip': Entry(13, 60, _HAND_SIZE, build_whip,
-                  'swung to and fro in the study, 15 deg a frame'),
+                  'camera swung back and forth in the study, 15 deg per frame'),
     'traffic': Entry(14, 60, _CAR_SIZE, _build_traffic,
-                     'standing before a street that lorries cross', parallax=False),
+                     'stationary camera at a street with crossing lorries', parallax=False),
 }

@@ -42,7 +42,7 @@ class Plan:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Give the cells in order, from one before the start to the end."""
+        """Return the cells in order, from one before the start to the end."""
         side, cells = 0, [(0, -1), (0, 0)]
         for run, turn in zip(self.runs, (*self.turns, 0)):
             for _ in range(run):
@@ -52,7 +52,7 @@ class Plan:
         return tuple(cells)
 
     def route(self) -> Route:
-        """Give the way through the middle, up to 4 m before the end."""
+        """Return the way through the middle, up to 4 m before the end."""
         # How long before its corner an eased bend begins, beyond what a sharp one would take.
         eased = route_of([(CELL, 0), _BEND, (CELL, 0)]).points[-1, 1] - CELL
         pieces: list[tuple[float, float]] = []

@@ -1,4 +1,4 @@
-"""Scenes through which somebody carries a camera: a corridor, a study, a wood."""
+"""Scenes of a hand-held camera: a corridor, a study, a forest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import numpy as np
 
 
 def centred_camera(size: tuple[int, int], focal: float) -> Array:
-    """Camera matrix (3, 3) of that focal length in widths, its axis in the picture's middle."""
+    """Return K (3, 3) of a focal length in image widths, with a central principal point."""
     width, height = size
     return np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2],
                      [0, 0, 1]])
@@ -35,7 +35,7 @@ def _corridor(seed: int) -> tuple[inside.Plan, tuple[Panel, ...], tuple[Panel, .
 
 
 def build_indoor(seed: int, size: tuple[int, int]) -> Scene:
-    """Walk along a corridor whose floor shines, by a camera that has no filter before its grid."""
+    """Walk along a corridor with a reflecting floor, with a camera without antialiasing."""
     plan, floor, above = _corridor(seed)
     path = Walk(plan.route(), speed=0.11, height=1.5, tilt=0.18, glance=0.16, seed=seed)
     return Scene('indoor', World((*floor, *above)), path, centred_camera(size, 0.6), size, seed,
@@ -48,14 +48,14 @@ def _study(seed: int) -> World:
 
 
 def build_handheld(seed: int, size: tuple[int, int]) -> Scene:
-    """Look round a cluttered study with a jerky hand."""
+    """Move a jerky hand-held camera in a cluttered study."""
     path = HandHeld((0.0, -1.3, 0.0), np.deg2rad(14), seed)
     return Scene('handheld', _study(seed), path, centred_camera(size, 0.82), size, seed,
                  effects=(Shutter(0.12, path.turning), SensorNoise(1.2, 0.1)))
 
 
 def build_whip(seed: int, size: tuple[int, int]) -> Scene:
-    """Swing a camera to and fro in the study, so fast that a fifth of each picture is new."""
+    """Swing a camera back and forth in the study, so fast that a fifth of each image is new."""
     path = Whip((0.0, -1.3, 0.0), np.deg2rad(15), np.deg2rad(45), np.deg2rad(14), seed)
     return Scene('whip', _study(seed), path, centred_camera(size, 0.82), size, seed,
                  effects=(SensorNoise(1.2, 0.1),))
@@ -72,7 +72,7 @@ def _forest(seed: int) -> World:
 
 
 def build_forest(seed: int, size: tuple[int, int]) -> Scene:
-    """Walk along a path through a wood."""
+    """Walk along a path through a forest."""
     path = Walk(_path(), speed=0.22, height=1.4, tilt=0.1, glance=0.08, seed=seed)
     return Scene('forest', _forest(seed), path, centred_camera(size, 0.7), size, seed,
                  background=225.0, effects=(Haze(70, 190), SensorNoise(1.0, 0.08)))

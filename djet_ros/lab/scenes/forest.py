@@ -1,4 +1,4 @@
-"""A path through a wood: uneven ground under leaves, trunks, shrubs, grass and a canopy."""
+"""A path through a forest: uneven ground under leaves, trunks, shrubs, grass and a canopy."""
 
 from __future__ import annotations
 

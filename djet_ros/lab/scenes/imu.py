@@ -1,4 +1,4 @@
-"""What an IMU on a rendered camera would feel: exact rates of its way, and a MEMS's errors."""
+"""Simulated IMU on a rendered camera: exact rates of the trajectory, plus errors of a MEMS."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Mems:
 @dataclass(frozen=True)
 class FeltMotion:
     """
-    Samples at stamps_ns (M,): as measured, along the IMU's axes, and the true biases (M, 3).
+    Measured samples at stamps_ns (M,) in the IMU's axes, and the true biases (M, 3).
 
-    to_camera: (3, 3) rotation of the IMU's axes to those of the camera.
+    to_camera: (3, 3) rotation from the IMU's axes to those of the camera.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -48,18 +48,18 @@ class FeltMotion:
     to_camera: Array
 
 
-# The IMU's axes as a robot has them: x forward, y left, z up.
+# The IMU's axes in the camera: x forward, y left, z up (REP 103).
 TO_CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
 def feel(poses: Array, period: float, mems: Mems, seed: int, level: Array | None = None
          ) -> FeltMotion:
     """
-    Feel the way of a camera with poses (N, 4, 4) every period seconds, from stamp 0 to the last.
+    Simulate an IMU on a camera with poses (N, 4, 4) every ``period`` seconds, from stamp 0 on.
 
-    Between the poses, the way is the smoothest one (cubic splines), so that the rates between two
-    poses add up to exactly the rotation between them. level: (3, 3) rotation of the poses' axes to
-    level ones, by default none.
+    Poses are interpolated by cubic splines, and the rates between two poses integrate to exactly
+    the rotation between them. level: (3, 3) rotation from the poses' axes to level ones, by
+    default the identity.
     """
     times: Array = np.arange(len(poses)) * np.float64(period)
     samples = np.arange(round(float(times[-1]) * mems.rate) + 1) / mems.rate

@@ -1,4 +1,4 @@
-"""Two pictures of a scene with all that is true about them."""
+"""Two images of a scene with ground truth."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from djet_ros.lab.scenes.texture import Gray
 import numpy as np
 from numpy.typing import NDArray
 
-# Relative differences of depth below which a point belongs to the surface that is seen, and
-# relative second differences of inverse depth below which a surface is flat.
+# Relative depth difference below which a point is on the visible surface, and relative second
+# difference of inverse depth below which a surface is flat.
 _SAME_SURFACE = 2e-3
 _FLATNESS = 1e-5
 
@@ -34,10 +34,10 @@ class ScenePair:
 
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """
-        Where still points (N, 2) of the previous image are in the current one, and which are seen.
+        Return positions (N, 2) of static points (N, 2) in the current image, and their visibility.
 
-        Seen means: the point lies well inside one surface, and inside the current image, and
-        nothing hides it there. Positions (N, 2) of the others are not to be used.
+        A point is visible if it is well inside one surface and inside the current image, and not
+        occluded there. Positions of the others are invalid.
         """
         depth, inside = _depth_at(self.depth_previous, points)
         rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ np.linalg.inv(self.K).T
@@ -52,9 +52,9 @@ class ScenePair:
 
 def _depth_at(depth: Gray, points: Array) -> tuple[Array, NDArray[np.bool_]]:
     """
-    Depth (N,) at sub-pixel points (N, 2), and whether they lie well inside a plane and the image.
+    Return depth (N,) at sub-pixel points (N, 2), and whether they are well inside a plane.
 
-    Inverse depth is affine in the pixel on a plane, so interpolating it is exact there.
+    On a plane inverse depth is affine in the pixel, so that its interpolation is exact.
     """
     inverse = 1 / depth.astype(float)
     height, width = depth.shape
@@ -70,7 +70,7 @@ def _depth_at(depth: Gray, points: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _bent(inverse: Array) -> NDArray[np.bool_]:
-    """Tell (H, W) where inverse depth (H, W) is not affine from a pixel to its neighbours."""
+    """Return the pixels (H, W) at which inverse depth (H, W) is not affine."""
     bend = np.zeros_like(inverse)
     bend[:, 1:-1] += np.abs(inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:])
     bend[1:-1] += np.abs(inverse[:-2] - 2 * inverse[1:-1] + inverse[2:])
@@ -79,7 +79,7 @@ def _bent(inverse: Array) -> NDArray[np.bool_]:
 
 def render_pair(name: str, first: int = 0, step: int = 1, seed: int = 0,
                 size: tuple[int, int] | None = None) -> ScenePair:
-    """Frames ``first`` and ``first + step`` of a named scene."""
+    """Render frames ``first`` and ``first + step`` of a named scene."""
     scene = make_scene(name, seed, size)
     last = first + step
     poses = scene.trajectory(max(first, last) + 1)

@@ -68,7 +68,7 @@ def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
     """
     Project panels into the camera of pose (4, 4), camera to world, and sort them by depth.
 
-    Panels that lie wholly beyond ``reach`` metres are left out.
+    Panels entirely beyond ``reach`` metres are omitted.
     """
     R, c = pose[:3, :3], pose[:3, 3]
     origin, a, b = (panels.origin - c) @ R, panels.a @ R, panels.b @ R

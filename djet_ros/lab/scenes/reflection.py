@@ -10,7 +10,7 @@ from djet_ros.lab.scenes.raster import look, Raster, shade, visible
 from djet_ros.lab.scenes.texture import Gray
 import numpy as np
 
-# By how much a point's depth may be off that of the floor there, as a part of it.
+# Relative tolerance of depth for points on the floor.
 _ON_FLOOR = 1e-3
 
 
@@ -29,7 +29,7 @@ class Gloss:
     polish: float
 
     def __call__(self, shot: Shot) -> Gray:
-        """Lay the mirror image over the floor where it is seen."""
+        """Add the mirror image to the visible floor."""
         height = -shot.pose[1, 3]
         down = np.asarray(shot.rays @ shot.pose[1, :3].astype(np.float32), np.float32)
         floor = np.abs(shot.inverse_depth * np.float32(height) - down) < _ON_FLOOR * down
@@ -39,7 +39,7 @@ class Gloss:
         return np.asarray(shot.radiance + light, np.float32)
 
     def _mirrored(self, shot: Shot) -> Gray:
-        """Radiance (H, W) of the world upside down."""
+        """Return the radiance (H, W) of the mirrored world."""
         rows, columns = shot.radiance.shape
         raster = Raster((columns, rows), 1)
         view = look(upside_down(self.above.at(shot.index)), shot.pose, shot.K, raster)

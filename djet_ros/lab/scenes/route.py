@@ -90,7 +90,7 @@ class Trajectory(Protocol):
 
     @property
     def limit(self) -> int:
-        """How many frames there are at most."""
+        """Return the maximum number of frames."""
 
     def pose(self, index: int) -> Array:
         """Pose (4, 4), camera to level axes, of one frame."""
@@ -114,7 +114,7 @@ class Drive:
 
     @cached_property
     def _frames(self) -> Array:
-        """At which (fractional) frame the car passes each station but the first."""
+        """Return the (fractional) frames at which the car passes each station but the first."""
         curvature = np.maximum(np.abs(self.route.curvature), 1e-9)
         return np.cumsum(_STEP / np.minimum(self.speed, self.turning / curvature))
 

@@ -21,13 +21,12 @@ _SUPERSAMPLING = 2
 @dataclass(frozen=True)
 class Scene:
     """
-    Everything that determines its pictures, which are the same bytes whenever they are rendered.
+    Everything that determines its images, which are the same bytes in every rendering.
 
-    K: (3, 3) pixels, pixel centres at integers; size: (width, height); background: gray where
-    there is nothing; effects: what the camera does to the light, in this order; reach: metres
-    beyond which nothing is drawn; samples: in each direction of a pixel, 2 for smooth edges or 1
-    for edges like stairs.
-    Poses given and taken are camera to first camera, so the first is the identity.
+    K: (3, 3) pixels, pixel centres at integers; size: (width, height); background: gray value of
+    empty pixels; effects: of the camera, in order of application; reach: metres beyond which
+    nothing is drawn; samples: per pixel and direction, 2 for antialiased edges, 1 for aliased
+    ones. Poses are camera to first camera, so the first is the identity.
     """
 
     name: str
@@ -42,17 +41,17 @@ class Scene:
     samples: int = _SUPERSAMPLING
 
     def trajectory(self, frames: int) -> Array:
-        """Poses (frames, 4, 4), camera to first camera, in metres; DjetError if it is too long."""
+        """Return poses (frames, 4, 4), camera to first camera, in metres. Raises DjetError."""
         if not 1 <= frames <= self.path.limit:
-            raise DjetError(f"scene '{self.name}' has 1 to {self.path.limit} frames, "
-                            f'{frames} were asked for')
+            raise DjetError(f"--frames is {frames}; scene '{self.name}' has 1 to "
+                            f'{self.path.limit} frames')
         return np.stack([self._from_level @ self.path.pose(i) for i in range(frames)])
 
     def render(self, pose: Array, index: int = 0) -> NDArray[np.uint8]:
         """
-        Picture (H, W) from a pose (4, 4), camera to first camera.
+        Render the image (H, W) from a pose (4, 4), camera to first camera.
 
-        index: frame number; it only matters for what moves by itself (traffic, particles, noise).
+        index: frame number, which determines moving objects, particles and noise.
         """
         shot = self._expose(pose, index)
         for effect in self.effects:
@@ -60,14 +59,14 @@ class Scene:
         return np.asarray(np.clip(np.rint(shot.radiance), 0, 255), np.uint8)
 
     def depth(self, pose: Array, index: int = 0) -> Gray:
-        """Exact z in metres (H, W) at the pixel centres, infinite where there is nothing."""
+        """Return the exact depth z (H, W) in metres at the pixel centres, infinite if empty."""
         _, inverse = visible(*self._look(self._to_level @ pose, index, 1))
         with np.errstate(divide='ignore'):
             return np.asarray(1 / inverse, np.float32)
 
     @property
     def level(self) -> Array:
-        """Rotation (3, 3) of the first camera's axes to level ones: x right, y down, z ahead."""
+        """Return the rotation (3, 3), first camera to level axes (x right, y down, z ahead)."""
         return np.asarray(self._to_level[:3, :3])
 
     @cached_property
@@ -83,7 +82,7 @@ class Scene:
         return look(self.world.at(index), level, self.K, raster, self.reach), raster
 
     def _expose(self, pose: Array, index: int) -> Shot:
-        """Light that arrives at the camera through clear air."""
+        """Return the radiance at the camera before all effects."""
         level = self._to_level @ pose
         view, raster = self._look(level, index, self.samples)
         ids, inverse = visible(view, raster)

@@ -1,4 +1,4 @@
-"""Rendering a scene into files, in the layout of the KITTI odometry benchmark."""
+"""Rendering of a scene to files, in the layout of the KITTI odometry benchmark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME_PERIOD = 0.1
 _IMU = 'imu.csv'
 _IMU_COLUMNS = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
                 'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]')
-# Says what was rendered; a folder without it is not ours to replace.
+# File that describes the rendering; folders without it are not overwritten.
 _LABEL = 'scene.txt'
 
 
@@ -30,11 +30,11 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
     """
     Render a named scene into ``out/sequences/NN`` and its ground truth into ``out/poses/NN.txt``.
 
-    frames and size (width, height): as the scene suggests unless given; progress is called with
-    (frames done, frames in all). mems: errors of the IMU, which is written into imu.csv where
-    there are three frames or more. Gives the sequence's folder. Raises DjetError if it is there
-    already, unless ``overwrite``, or can't be written. Times and poses come last, so that an
-    interrupted rendering can't be taken for a whole one.
+    frames, size (width, height): by default those of the catalogue; progress is called with
+    (frames done, total); mems: errors of the IMU, whose samples are written to imu.csv if there
+    are at least three frames. Returns the sequence's folder. Raises DjetError if it exists,
+    unless ``overwrite``, or can't be written. Times and poses are written last, so that an
+    interrupted rendering is not mistaken for a complete one.
     """
     scene, number = make_scene(name, seed, size), find(name).number
     poses = scene.trajectory(frames if frames is not None else suggested_frames(scene))
@@ -60,7 +60,7 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
                                           'utf-8')
     except OSError as error:
         raise DjetError(f'{error.filename or out} could not be written: {error.strerror}; '
-                        'choose another folder or make room') from error
+                        'choose another folder or free disk space') from error
     with KittiWriter(truth) as writer:
         for index, pose in enumerate(poses):
             writer.write(round(index * FRAME_PERIOD * 1e9), pose)
@@ -68,7 +68,7 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
 
 
 def rendered_scene(folder: Path) -> str | None:
-    """Name of the scene that a folder of images was rendered from; None for any other folder."""
+    """Return the name of the scene that a folder was rendered from; None for other folders."""
     label = folder / _LABEL
     if not label.is_file():
         return None
@@ -77,13 +77,13 @@ def rendered_scene(folder: Path) -> str | None:
 
 
 def _clear(folder: Path, truth: Path, overwrite: bool) -> None:
-    """Make the folders; take away an earlier rendering, and nothing else, if that is wanted."""
+    """Make the folders, and with ``overwrite`` remove an earlier rendering, but nothing else."""
     present = next((path for path in (folder, truth) if path.exists()), None)
     if present is not None and not overwrite:
-        raise DjetError(f'{present} exists already; choose another folder or say --overwrite')
+        raise DjetError(f'{present} exists already; choose another folder or pass --overwrite')
     if present is not None and not (folder / _LABEL).exists():
-        raise DjetError(f'{present} was not rendered ({folder / _LABEL} is missing) and is left '
-                        'as it is; choose another folder')
+        raise DjetError(f'{present} was not rendered by djet ({folder / _LABEL} is missing), so '
+                        'it is not overwritten; choose another folder')
     for path in (truth, folder / 'calib.txt', folder / 'times.txt',
                  folder / _IMU, *(folder / 'image_0').glob('[0-9]*.png')):
         path.unlink(missing_ok=True)
@@ -92,7 +92,7 @@ def _clear(folder: Path, truth: Path, overwrite: bool) -> None:
 
 
 def _write_imu(path: Path, felt: FeltMotion) -> None:
-    """Write samples as EuRoC has them, with the true biases at both ends as a comment."""
+    """Write samples in the format of EuRoC, with the first and last true biases in a comment."""
     first, last = (' '.join(f'{value:.6e}' for value in felt.rate_biases[i]) for i in (0, -1))
     rows = ''.join(
         f'{stamp},{",".join(f"{value:.9e}" for value in (*rate, *force))}\n'
@@ -108,5 +108,5 @@ def _png(gray: NDArray[np.uint8]) -> bytes:
 
 
 def _projection(K: Array) -> str:
-    """Row of a calib.txt: the 3x4 projection of a rectified camera at the origin."""
+    """Return a row of a calib.txt: the 3x4 projection of a rectified camera at the origin."""
     return ' '.join(f'{value:.12e}' for value in np.hstack([K, np.zeros((3, 1))]).ravel())

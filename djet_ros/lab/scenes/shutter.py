@@ -1,4 +1,4 @@
-"""Motion blur by the camera's own turning while the shutter is open."""
+"""Motion blur by the camera's rotation during the exposure."""
 
 from __future__ import annotations
 
@@ -43,5 +43,5 @@ class Shutter:
 
     @staticmethod
     def _steps(pixels: float) -> int:
-        """How many pictures to average; an odd number, so that the frame's own is among them."""
+        """Return the number of images to average; odd, to include that of the frame's pose."""
         return min(2 * int(_PER_PIXEL * pixels / 2) + 1, _MOST)

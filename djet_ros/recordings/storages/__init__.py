@@ -1,4 +1,4 @@
-"""The file formats of recordings; all give connections, and messages in time order."""
+"""Readers of the file formats of bags, with messages in the order of their stamps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FORMATS = ((mcap.MAGIC, mcap.McapFile), (sqlite.MAGIC, sqlite.SqliteFile),
 
 
 def open_storage(path: Path) -> Storage:
-    """Open a file by what it is, not by its name; BrokenFile or OSError where that fails."""
+    """Open a file by its content, not its name. Raises BrokenFile or OSError."""
     with path.open('rb') as file:
         start = file.read(16)
     for magic, storage in FORMATS:
@@ -22,5 +22,5 @@ def open_storage(path: Path) -> Storage:
             return storage(path)
     if not start:
         raise BrokenFile('it is empty (0 bytes)')
-    raise BrokenFile(f'it is no MCAP, rosbag2 sqlite3 or ROS 1 bag (format 2.0), it begins with '
-                     f'{start[:8]!r}; give one of these')
+    raise BrokenFile(f'it is no MCAP, rosbag2 sqlite3 or ROS 1 bag (format 2.0): it begins with '
+                     f'{start[:8]!r}')

@@ -1,17 +1,17 @@
-"""What a recording says of one topic, and what every storage offers and raises."""
+"""Interface of the readers of bag files."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from typing import NamedTuple, Protocol
 
-# No piece that is unpacked or read at once may be larger: an uncompressed 6000x5000 colour
-# image fits, and a file that declares more is hostile or damaged.
+# Limit in bytes of anything read or decompressed at once: an uncompressed 6000x5000 colour image
+# fits; a file that declares more is damaged or malicious.
 LARGEST_PIECE = 128 << 20
 
 
 class BrokenFile(Exception):
-    """The bytes of a recording make no sense; the message says how, the caller knows the file."""
+    """A damaged or unsupported file; the message has the reason, the caller adds the path."""
 
 
 class Connection(NamedTuple):
@@ -19,7 +19,7 @@ class Connection(NamedTuple):
     A topic with its type as recorded.
 
     msgtype: 'package/msg/Name'; encoding: 'cdr' (ROS 2) or 'ros1'; definition: the text of the
-    message definition, or '' where the file holds none.
+    message definition, or '' if the file holds none.
     """
 
     number: int
@@ -31,7 +31,7 @@ class Connection(NamedTuple):
 
 
 class Storage(Protocol):
-    """One file of a recording. Opening it raises BrokenFile where there is no sense in it."""
+    """One file of a bag. Opening it raises BrokenFile if it is not readable."""
 
     connections: list[Connection]
 
@@ -39,11 +39,11 @@ class Storage(Protocol):
         """
         Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
-        After the last message before a break in the file, raises BrokenFile.
+        If the file is damaged, yields everything before the damage, then raises BrokenFile.
         """
 
 
 def ros2_name(msgtype: str) -> str:
-    """Name of a message type in ROS 2 style: sensor_msgs/Image -> sensor_msgs/msg/Image."""
+    """Return a message type in ROS 2 style: sensor_msgs/Image -> sensor_msgs/msg/Image."""
     package, _, name = msgtype.rpartition('/')
     return msgtype if package.endswith('/msg') else f'{package}/msg/{name}'

@@ -1,11 +1,11 @@
 """
-Recordings that are a row of compressed chunks (MCAP, ROS 1 bags), read in time order.
+Bags of compressed chunks (MCAP, ROS 1 bags), read in time order.
 
-The storage readers of rosbags want a file that was closed properly, and decompress a chunk
-without a bound. Recorders lose power, and files come from strangers; so here a file without an
-index is walked from its start, everything before a break is delivered before the break is
-reported, and no chunk takes more memory than LARGEST_PIECE. Memory holds the chunks of which a
-message waits for its turn, within bounds; never the whole file.
+The readers of rosbags require a properly closed file, and decompress chunks without a size limit.
+But recorders lose power, and files may be malicious. So here a file without an index is scanned
+from its start, everything before a damage is delivered before it is reported, and no chunk takes
+more memory than LARGEST_PIECE. Only chunks with pending messages are kept in memory, within
+limits.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from typing import BinaryIO, NamedTuple
 
 from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PIECE
 
-# Chunks of one recorder overlap by a message or two; more are held where tools merged topics, or
-# wrote one after the other. These are half a gigabyte of chunks, and 150 MB of messages' places.
+# Limits for sorting: bytes of chunks held (half a gigabyte) and pending messages (150 MB of their
+# positions). Chunks of one recorder overlap by a message or two; more are held if a tool merged
+# topics, or wrote them one after the other.
 MOST_HELD = 4 * LARGEST_PIECE
 MOST_WAITING = 1 << 19
-# Messages outside chunks are read in stretches of about this size.
+# Messages outside chunks are grouped to about this many bytes.
 STRETCH = 4 << 20
 
 
 class Chunk(NamedTuple):
     """
-    A stretch of the file whose messages are read at once.
+    A part of the file whose messages are read at once.
 
-    start: ns of its earliest message; offset, length: bytes in the file;
-    loose: the records lie in the file as they are, without a chunk around them.
+    start: stamp of its earliest message in ns; offset, length: bytes in the file; loose: whether
+    the records are directly in the file, without a chunk around them.
     """
 
     start: int
@@ -42,14 +43,14 @@ class Chunk(NamedTuple):
 
 
 class Records(NamedTuple):
-    """The unpacked records of a chunk, and how it is torn if some are missing at its end."""
+    """The decompressed records of a chunk; torn: the damage, if some at its end are missing."""
 
     data: memoryview
     torn: str | None = None
 
 
 class Place(NamedTuple):
-    """Where a message lies: connection number, stamp in ns, first byte and end in its chunk."""
+    """Position of a message: connection number, stamp in ns, first byte and end in its chunk."""
 
     connection: int
     stamp: int
@@ -58,11 +59,11 @@ class Place(NamedTuple):
 
 
 class Waiting:
-    """Messages that wait for their turn, and the chunks that they keep in memory."""
+    """Priority queue of messages by stamp, and the chunks that they keep in memory."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, int, int, memoryview]] = []
-        # Of each chunk: its size, and how many of its messages wait.
+        # By chunk: its size in bytes, and its number of pending messages.
         self._sizes: dict[int, int] = {}
         self._counts: Counter[int] = Counter()
         self._held = 0
@@ -71,7 +72,7 @@ class Waiting:
         return bool(self._heap)
 
     def add(self, chunk: int, place: Place, data: memoryview) -> bool:
-        """Take a message of a chunk, whose records are given; False where that is one too many."""
+        """Add a message of a chunk; data: the chunk's records. Return False beyond a limit."""
         heappush(self._heap, (place.stamp, chunk, place.begin, place.connection,
                               data[place.begin:place.end]))
         if chunk not in self._sizes:
@@ -81,11 +82,11 @@ class Waiting:
         return len(self._heap) <= MOST_WAITING and self._held <= MOST_HELD
 
     def first(self) -> int:
-        """Give the earliest stamp, in ns."""
+        """Return the earliest stamp, in ns."""
         return self._heap[0][0]
 
     def pop(self) -> tuple[int, int, memoryview]:
-        """Take out the earliest: connection number, stamp in ns, serialised message."""
+        """Remove and return the earliest: connection number, stamp in ns, serialised message."""
         stamp, chunk, _, connection, data = heappop(self._heap)
         self._counts[chunk] -= 1
         if not self._counts[chunk]:
@@ -95,10 +96,10 @@ class Waiting:
 
 
 class ChunkedFile(ABC):
-    """A recording of which subclasses know the records."""
+    """Base of the readers of chunked files; subclasses know the format of records."""
 
     def __init__(self, path: Path) -> None:
-        """Find the connections and chunks, by the index or by walking the whole file."""
+        """Find the connections and chunks, by the index or by scanning the whole file."""
         self.path = path
         self.size = path.stat().st_size
         self.connections: list[Connection] = []
@@ -111,10 +112,10 @@ class ChunkedFile(ABC):
 
     @abstractmethod
     def _read_index(self, file: BinaryIO) -> bool:
-        """Fill in connections and chunks from the index; False where it is absent or damaged."""
+        """Read connections and chunks from the index; return False if it is absent or damaged."""
 
     def _scan(self, file: BinaryIO) -> None:
-        """Fill in connections and chunks by walking the file up to its end or break."""
+        """Find connections and chunks by scanning the file up to its end or a damage."""
         self._chunks.clear()
         self._counts.clear()
         try:
@@ -123,9 +124,9 @@ class ChunkedFile(ABC):
             self._broken = str(error)
 
     def _scan_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
-        """Take a chunk with what it tells of connections."""
+        """Add a chunk and the connections that it declares."""
         start = None
-        # The chunk is kept even if the loop meets its break: what lies before that is good.
+        # A damaged chunk is kept too: its messages before the damage are valid.
         try:
             for place in self._places(self._unpack(file, chunk), learn=True):
                 self._counts[place.connection] += 1
@@ -136,25 +137,25 @@ class ChunkedFile(ABC):
 
     @abstractmethod
     def _scan_records(self, file: BinaryIO) -> None:
-        """Walk the file anew, with ``_scan_chunk`` for its chunks; BrokenFile at its break."""
+        """Scan the file, with ``_scan_chunk`` for its chunks; raise BrokenFile at a damage."""
 
     @abstractmethod
     def _unpack(self, file: BinaryIO, chunk: Chunk) -> Records:
-        """Unpack as much of a chunk as there is; BrokenFile where there is nothing."""
+        """Decompress as much of a chunk as there is; raise BrokenFile if there is nothing."""
 
     @abstractmethod
     def _places(self, records: Records, learn: bool = False) -> Iterator[Place]:
         """
-        Find the messages among records; BrokenFile after the last if some are missing.
+        Yield the messages among records; raise BrokenFile after the last if some are missing.
 
-        learn: whether to take what the records tell of connections, too.
+        learn: whether to add the connections that the records declare, too.
         """
 
     def messages(self, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """
         Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
-        After the last message before a break in the file, raises BrokenFile.
+        If the file is damaged, yields everything before the damage, then raises BrokenFile.
         """
         with self.path.open('rb') as file:
             chunks = sorted(self._chunks)
@@ -176,7 +177,7 @@ class ChunkedFile(ABC):
 
     def _load(self, file: BinaryIO, chunk: Chunk, number: int, wanted: Collection[int],
               waiting: Waiting) -> str | None:
-        """Let the messages of a chunk wait; give how it is broken, if it is."""
+        """Queue the messages of a chunk; return the damage if it has one."""
         full = False
         try:
             records = self._unpack(file, chunk)
@@ -187,18 +188,19 @@ class ChunkedFile(ABC):
         except BrokenFile as error:
             return str(error)
         if full:
-            # What waits may belong after what was not read: none of it can be delivered.
+            # Pending messages may be later than those not read: none of them can be delivered.
             raise BrokenFile(
-                f'its messages are so far out of order, at byte {chunk.offset}, that more than '
-                f'{MOST_WAITING} of them or {MOST_HELD >> 20} MB of chunks would have to be held '
-                'to sort them; everything before that was read')
+                f'its messages are so far out of order, at byte {chunk.offset}, that sorting them '
+                f'would take more than {MOST_WAITING} messages or {MOST_HELD >> 20} MB of chunks '
+                'in memory; everything before that was read')
         return None
 
 
 def read_exactly(file: BinaryIO, offset: int, length: int) -> bytes:
-    """Bytes of the file, never more than LARGEST_PIECE; BrokenFile where it ends before them."""
+    """Return bytes of a file, at most LARGEST_PIECE; raise BrokenFile if it ends before them."""
     if not 0 <= length <= LARGEST_PIECE or offset >= 2**63:
-        raise BrokenFile(f'a record at byte {offset} declares {length} bytes')
+        raise BrokenFile(f'a record at byte {offset} declares {length} bytes, at most '
+                         f'{LARGEST_PIECE} are read')
     file.seek(offset)
     data = file.read(length)
     if len(data) < length:

@@ -1,4 +1,4 @@
-"""Decompression that gives at most as many bytes as were announced."""
+"""Decompression with a limit on the size of the output."""
 
 from __future__ import annotations
 
@@ -27,45 +27,46 @@ DECOMPRESSORS = {
 
 def decompress(data: bytes | memoryview, method: str, size: int) -> memoryview:
     """
-    Decompress to ``size`` bytes, or to fewer where the data is cut short.
+    Decompress to ``size`` bytes, or fewer if the data is truncated.
 
-    BrokenFile where the data is no such stream, would give more, or announces too much.
+    Raises BrokenFile if the data is damaged, gives more bytes, or declares too many.
     """
     if size > LARGEST_PIECE:
-        raise BrokenFile(f'it announces {size} bytes in one piece, at most {LARGEST_PIECE} are '
-                         'unpacked')
+        raise BrokenFile(f'it declares {size} bytes in one piece, at most {LARGEST_PIECE} are '
+                         'decompressed')
     if method in ('', 'none'):
         return memoryview(data)[:size]
     if method not in DECOMPRESSORS:
-        raise BrokenFile(f"its compression '{method[:40]}' is not known")
+        raise BrokenFile(f"its compression '{method[:40]}' is not supported; it must be one of "
+                         f"{', '.join(DECOMPRESSORS)}")
     stream = DECOMPRESSORS[method]()
     try:
         unpacked = stream.decompress(bytes(data), max_length=size + 1)
     except (zstd.ZstdError, RuntimeError, OSError, EOFError, ValueError) as error:
         raise BrokenFile(f'its {method} data is damaged ({error})') from error
     if len(unpacked) > size:
-        raise BrokenFile(f'a piece of {method} data gives more than the {size} bytes announced')
+        raise BrokenFile(f'a piece of {method} data gives more than the {size} bytes declared')
     return memoryview(unpacked)
 
 
 def decompress_message(data: memoryview) -> memoryview:
-    """Unpack a message that was compressed on its own (rosbag2's compression mode 'message')."""
+    """Decompress a single message (rosbag2's compression mode 'message')."""
     stream = zstd.ZstdDecompressor()
     try:
         unpacked = stream.decompress(bytes(data), max_length=LARGEST_PIECE + 1)
     except zstd.ZstdError as error:
         raise BrokenFile(f'a zstd message is damaged ({error})') from error
     if not stream.eof:
-        raise BrokenFile('a zstd message is cut short or too large')
+        raise BrokenFile('a zstd message is truncated or too large')
     return memoryview(unpacked)
 
 
 def decompress_file(path: Path, folder: Path) -> None:
     """
-    Unpack a .zstd file into a folder, which must be removed later, under the old name.
+    Decompress a .zstd file into a folder, under the same name; the caller removes it.
 
-    At most half of the free space there is taken. A file that is cut short
-    gives what is there; one that can't be unpacked leaves nothing.
+    It takes at most half of the free space. A truncated file is decompressed as far as it goes; a
+    damaged one leaves nothing.
     """
     unpacked = folder / path.name
     room = shutil.disk_usage(folder).free // 2
@@ -78,7 +79,7 @@ def decompress_file(path: Path, folder: Path) -> None:
                     break
                 room -= target.write(stream.decompress(block, max_length=BLOCK))
                 if room < 0:
-                    raise BrokenFile('it takes unpacked more than half of the free space in '
+                    raise BrokenFile('decompressed, it takes more than half of the free space in '
                                      f'{folder.parent}; set TMPDIR to a larger disk')
     except BaseException as error:
         unpacked.unlink(missing_ok=True)

@@ -33,10 +33,10 @@ MESSAGE_HEAD = struct.Struct('<HIQQ')
 
 
 class McapFile(ChunkedFile):
-    """One MCAP file, indexed or not, whole or cut short."""
+    """One MCAP file, with or without index, complete or truncated."""
 
     def __init__(self, path: Path) -> None:
-        """Read the index, or walk the file where it has none."""
+        """Read the index, or scan the file if it has none."""
         self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}
         super().__init__(path)
@@ -65,7 +65,7 @@ class McapFile(ChunkedFile):
             return False
 
     def _read_summary(self, summary: bytes) -> bool:
-        """Take over the summary; False where it doesn't account for every message."""
+        """Read the summary section; return False if it does not account for every message."""
         total, schemas, channels, indexed = -1, -1, -1, 0
         for code, begin, end in split_records(Records(memoryview(summary))):
             fields = Fields(summary[begin:end])
@@ -107,7 +107,7 @@ class McapFile(ChunkedFile):
                                       begin - RECORD.size, position))
 
     def _add_loose(self, place: Place) -> None:
-        """Let a message outside chunks extend the last stretch, or begin one."""
+        """Add a message outside chunks to the last group of them, or begin a new one."""
         self._counts[place.connection] += 1
         last = self._chunks[-1] if self._chunks else None
         if (last and last.loose and last.offset + last.length == place.begin
@@ -152,32 +152,32 @@ class McapFile(ChunkedFile):
 
 
 class Fields:
-    """The fields of one record, taken one after the other; BrokenFile where they run out."""
+    """Sequential reader of the fields of a record; raises BrokenFile at its end."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._position = 0
 
     def unpack(self, layout: str) -> tuple[int, ...]:
-        """Integers of a struct layout."""
+        """Read the integers of a struct layout."""
         return struct.unpack(layout, self._take(struct.calcsize(layout)))
 
     def blob(self, multiple: int = 1) -> bytes:
-        """Bytes after their own length, which must be a multiple of something."""
+        """Read bytes preceded by their length, which must be a multiple of ``multiple``."""
         size, = self.unpack('<I')
         if size % multiple:
             raise BrokenFile(f'a list of {multiple}-byte entries has {size} bytes')
         return self._take(size)
 
     def text(self) -> str:
-        """UTF-8 text after its length."""
+        """Read UTF-8 text preceded by its length."""
         try:
             return self.blob().decode()
         except UnicodeDecodeError as error:
             raise BrokenFile('a name in it is not text') from error
 
     def rest(self) -> memoryview:
-        """Everything that was not taken yet."""
+        """Return everything that was not read yet."""
         return memoryview(self._data)[self._position:]
 
     def _take(self, size: int) -> bytes:
@@ -188,7 +188,7 @@ class Fields:
 
 
 def split_records(records: Records) -> Iterator[tuple[int, int, int]]:
-    """Yield (code, first byte, end) of each record; BrokenFile after the last one if torn."""
+    """Yield (code, first byte, end) of each record; raise BrokenFile after the last if torn."""
     data, torn = records
     position = 0
     while position + RECORD.size <= len(data):
@@ -203,7 +203,7 @@ def split_records(records: Records) -> Iterator[tuple[int, int, int]]:
 
 
 def _message(records: bytes | memoryview, begin: int) -> tuple[int, int]:
-    """Channel and log time of the message record whose fields begin there."""
+    """Return channel and log time of the message record whose fields begin there."""
     if begin + MESSAGE_HEAD.size > len(records):
         raise BrokenFile('a message record is too short')
     channel, _, stamp, _ = MESSAGE_HEAD.unpack_from(records, begin)

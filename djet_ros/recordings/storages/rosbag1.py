@@ -19,10 +19,10 @@ UINT32 = struct.Struct('<I')
 
 
 class Ros1File(ChunkedFile):
-    """One ROS 1 bag, indexed or not (``.bag.active``), whole or cut short."""
+    """One ROS 1 bag, with or without index (``.bag.active``), complete or truncated."""
 
     def __init__(self, path: Path) -> None:
-        """Read the index, or walk the file where it has none."""
+        """Read the index, or scan the file if it has none."""
         self._topics: dict[int, tuple[str, str, str]] = {}
         super().__init__(path)
         self.connections = [
@@ -99,7 +99,7 @@ class Ros1File(ChunkedFile):
 
 
 def _read_record(file: BinaryIO, position: int) -> tuple[dict[str, bytes], int, int]:
-    """Header of the record at a position, and where its data begins and how long it is."""
+    """Return header, first data byte and data length of the record at a position."""
     size, = UINT32.unpack(read_exactly(file, position, UINT32.size))
     header = _fields(memoryview(read_exactly(file, position + UINT32.size, size)))
     begin = position + UINT32.size + size
@@ -108,7 +108,7 @@ def _read_record(file: BinaryIO, position: int) -> tuple[dict[str, bytes], int, 
 
 
 def _split_records(records: Records) -> Iterator[tuple[dict[str, bytes], int, int]]:
-    """Yield (header, first byte, end) of each record; BrokenFile after the last one if torn."""
+    """Yield (header, first byte, end) of each record; raise BrokenFile after the last if torn."""
     data, torn = records
     position = 0
     while position < len(data):
@@ -124,7 +124,7 @@ def _split_records(records: Records) -> Iterator[tuple[dict[str, bytes], int, in
 
 
 def _fields(data: memoryview) -> dict[str, bytes]:
-    """Fields ``name=value`` of a header, each after its length."""
+    """Return the fields ``name=value`` of a header, each preceded by its length."""
     fields = {}
     position = 0
     while position < len(data):
@@ -135,7 +135,7 @@ def _fields(data: memoryview) -> dict[str, bytes]:
 
 
 def _counted(data: memoryview, position: int) -> tuple[int, int]:
-    """First byte and end of the bytes that follow their own length."""
+    """Return first byte and end of bytes that are preceded by their length."""
     begin = position + UINT32.size
     if begin > len(data):
         raise BrokenFile('a chunk or header ends within a length')

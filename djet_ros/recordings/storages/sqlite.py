@@ -1,4 +1,4 @@
-"""rosbag2's sqlite3 storage (.db3), in the schemas of all ROS 2 distributions."""
+"""rosbag2's sqlite3 storage (.db3), with the schemas of all ROS 2 distributions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SqliteFile:
     """One rosbag2 database."""
 
     def __init__(self, path: Path) -> None:
-        """Read the topics; BrokenFile where the file is no rosbag2 database."""
+        """Read the topics; raise BrokenFile if the file is no rosbag2 database."""
         self.path = path
         with closing(_connect(path)) as database:
             try:
@@ -35,7 +35,7 @@ class SqliteFile:
         if missing := {'topics', 'messages'} - tables:
             raise BrokenFile(f"it has no table '{min(missing)}': it was cut short, or not written "
                              'by rosbag2')
-        # Databases older than ROS 2 Iron hold no definitions.
+        # Message definitions are stored since ROS 2 Iron.
         definitions = dict(database.execute(
             'SELECT topic_type, encoded_message_definition FROM message_definitions '
             "WHERE encoding = 'ros2msg'")) if 'message_definitions' in tables else {}
@@ -53,7 +53,7 @@ class SqliteFile:
         """
         Yield (connection number, stamp in ns, serialised message) in the order of stamps.
 
-        After the last message before a break in the file, raises BrokenFile.
+        If the file is damaged, yields everything before the damage, then raises BrokenFile.
         """
         messages = self._in_order(wanted)
         return _but_last_before_break(messages) if _ends_within_page(self.path) else messages
@@ -63,7 +63,7 @@ class SqliteFile:
                  f'WHERE topic_id IN ({", ".join("?" * len(wanted))}) ORDER BY ')
         delivered = False
         with closing(_connect(self.path)) as database:
-            # A break can take the index by stamps and leave the messages: then as recorded.
+            # If the index by stamps is damaged but the messages are not: in recorded order.
             for order in ('timestamp, id', 'id'):
                 try:
                     for row in database.execute(query + order, tuple(wanted)):
@@ -83,7 +83,7 @@ def _ends_within_page(path: Path) -> bool:
 
 
 def _but_last_before_break(messages: Iterator[Message]) -> Iterator[Message]:
-    """Leave out the message that a break lies in: sqlite fills a page cut in two with zeros."""
+    """Drop the last message of a file truncated within a page, which sqlite fills with zeros."""
     held = next(messages, None)
     for message in messages:
         if held is not None:
@@ -102,7 +102,7 @@ def _checked(row: tuple[Any, Any, Any]) -> Message:
 
 
 def _count(database: sqlite3.Connection) -> dict[int, int]:
-    """Messages per topic id; in a damaged file 1 each, as what is left can't be counted."""
+    """Return messages per topic id; 1 each in a damaged file, which can't be counted."""
     try:
         return dict(database.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
     except sqlite3.DatabaseError:
@@ -110,12 +110,12 @@ def _count(database: sqlite3.Connection) -> dict[int, int]:
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Open a database read-only; BrokenFile where it can't be."""
+    """Open a database read-only; raise BrokenFile if it can't be."""
     try:
         try:
             return _opened(path, 'mode=ro')
         except sqlite3.OperationalError:
-            # A recorder that was killed leaves a journal, which a reader must not roll back.
+            # A killed recorder leaves a journal, which a reader must not roll back.
             return _opened(path, 'immutable=1')
     except sqlite3.Error as error:
         raise BrokenFile(str(error)) from error
@@ -126,7 +126,7 @@ def _opened(path: Path, mode: str) -> sqlite3.Connection:
     try:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_PIECE)
         database.execute('PRAGMA trusted_schema = OFF')
-        # Lets a file that was cut short be read as far as it goes.
+        # Reads a truncated file as far as it goes.
         database.execute('PRAGMA writable_schema = ON')
         database.execute('SELECT count(*) FROM sqlite_master').fetchone()
     except sqlite3.Error:
