@@ -226,7 +226,7 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
             assert isinstance(recording, BagRecording)
     with pytest.raises(DjetError, match='is neither a bag nor a folder of KITTI'):
         open_sequence(asl / 'mav0' / 'cam0')
-    with pytest.raises(DjetError, match='it holds sequences/07: give one of these'):
+    with pytest.raises(DjetError, match='it holds sequences/07: name one of these'):
         open_sequence(folder.parent.parent)
     with pytest.raises(DjetError, match='nowhere does not exist'):
         open_sequence(tmp_path / 'nowhere')
@@ -247,7 +247,7 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
     ('cam0/sensor.yaml', '[160, 120]', '!!bool so', 'is not valid YAML'),
     ('cam0/sensor.yaml', 'data: [0.0', 'data: [1e308', 'is no rigid transformation'),
     ('cam0/sensor.yaml', ' 0.3, 0.0,', ' 0.3, 5.0,', 'is no rigid transformation'),
-    ('state_groundtruth_estimate0/data.csv', ',1,0,0,0,', ',2,0,0,0,', 'has length 2, it must'),
+    ('state_groundtruth_estimate0/data.csv', ',1,0,0,0,', ',2,0,0,0,', 'has length 2; it must'),
     ('state_groundtruth_estimate0/data.csv', ',7,8,', ',1e300,8,', 'farther than 1e[+]09 m'),
 ])
 def test_a_wrong_euroc_folder_is_named(asl, file, old, new, said):
@@ -263,6 +263,6 @@ def test_a_wrong_euroc_folder_is_named(asl, file, old, new, said):
 @pytest.mark.parametrize('left', ['', '%YAML:1.0\n', '%YAML:1.0\n---\n', '%YAML:1.0\n---\nsens'])
 def test_a_camera_description_that_is_cut_at_its_head_is_one_line(asl, left):
     (asl / 'mav0/cam0/sensor.yaml').write_text(left)
-    with pytest.raises(DjetError, match='no intrinsics and no T_BS') as caught:
+    with pytest.raises(DjetError, match='neither intrinsics nor T_BS') as caught:
         euroc(asl)
     assert '\n' not in str(caught.value)

@@ -96,7 +96,8 @@ DAMAGES = {
     "'-1' is not a stamp": lambda f: replace(f / 'times.txt', '0.000000e+00', '-1'),
     "'1e300' is not a stamp": lambda f: replace(f / 'times.txt', '1.036223e-01', '1e300'),
     'is not after the one before': lambda f: replace(f / 'times.txt', '1.036223e-01', '0'),
-    '07.txt line 1 has 11 numbers, 12': lambda f: replace(f / '../../poses/07.txt', ' 0 ', ' '),
+    '07.txt line 1 has 11 numbers; it must have 12':
+        lambda f: replace(f / '../../poses/07.txt', ' 0 ', ' '),
     'pose 0 is no rigid transformation': lambda f: replace(f / '../../poses/07.txt', '1', '2'),
     'pose 1 is no rigid transformation (':
         lambda f: replace(f / '../../poses/07.txt', '9.998000066666e-01', '1e300'),

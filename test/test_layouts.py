@@ -136,7 +136,7 @@ def test_a_bag_of_a_folder_holds_its_imu_and_how_it_is_mounted(asl: Path) -> Non
     ('imu0/data.csv', ',0.1,', ',nan,', 'not a finite number'),
     ('imu0/data.csv', ',0.1,0.2', ',0.1', 'has 6 numbers'),
     ('imu0/sensor.yaml', 'T_BS', 'S_BT', 'no ASL sensor description'),
-    ('imu0/sensor.yaml', '[0.0, -1.0', '[5.0, -1.0', 'no rigid motion'),
+    ('imu0/sensor.yaml', '[0.0, -1.0', '[5.0, -1.0', 'no rigid transformation'),
 ])
 def test_a_wrong_imu_is_named(asl: Path, file: str, old: str, new: str, said: str) -> None:
     path = asl / 'mav0' / file
@@ -228,7 +228,7 @@ def test_7_scenes_is_read_as_it_is(tmp_path: Path, suffix: str) -> None:
 def test_a_pose_of_7_scenes_that_is_none_is_named(tmp_path: Path) -> None:
     folder = seven_scenes_folder(tmp_path / 'seq-01', 'png')
     (folder / 'frame-000001.pose.txt').write_text('1 0 0 0\n')
-    with pytest.raises(DjetError, match='has 1 rows, a pose has 4'):
+    with pytest.raises(DjetError, match='has 1 rows; a pose must have 4'):
         seven_scenes(folder)
 
 

@@ -118,7 +118,7 @@ def test_of_a_line_that_the_disk_has_no_room_for_nothing_stays(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 7, limits[1]))
         try:
             for _ in range(2):
-                with pytest.raises(DjetError, match='what it holds so far is whole'):
+                with pytest.raises(DjetError, match='the poses written so far are complete'):
                     writer.write(20, np.eye(4))
                 assert (tmp_path / 'full.txt').read_bytes() == whole
         finally:

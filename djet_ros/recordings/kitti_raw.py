@@ -94,14 +94,14 @@ def clock_nanoseconds(text: str) -> int:
     """Return the ns since 1970 of a UTC time such as '2011-09-26 13:02:25.964389445'."""
     whole, _, rest = text.partition('.')
     if len(rest) > 9 or (rest and not (rest.isascii() and rest.isdecimal())):
-        raise ValueError(f"'{text[:40]}' is no stamp of the form 2011-09-26 13:02:25.964389445")
+        raise ValueError(f"'{text[:40]}' is not a stamp of the form 2011-09-26 13:02:25.964389445")
     try:
         clock = datetime.strptime(whole, '%Y-%m-%d %H:%M:%S').replace(tzinfo=UTC)
     except ValueError:
-        raise ValueError(f"'{text[:40]}' is no stamp of the form 2011-09-26 13:02:25.964389445"
+        raise ValueError(f"'{text[:40]}' is not a stamp of the form 2011-09-26 13:02:25.964389445"
                          ) from None
     if not 1970 < clock.year < 2038:
-        raise ValueError(f"'{text[:40]}' is no stamp between 1971 and 2037")
+        raise ValueError(f"'{text[:40]}' is not a stamp between 1971 and 2037")
     return int(clock.timestamp()) * 10**9 + int(rest.ljust(9, '0'))
 
 
