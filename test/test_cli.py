@@ -142,8 +142,9 @@ def test_a_file_of_parameters_for_others_alone_is_refused_by_every_command_that_
     path.write_text('/left/eye: {ros__parameters: {preset: fast}}')
     done = djet(*words, str(path))
     assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == (f'djet: error: {path}: it is for /left/eye, and nothing is taken from '
-                           f"it: this is {nodes}; '/**' is for all\n")
+    assert done.stderr == (
+        f'djet: error: {path}: it has parameters for /left/eye and none for {nodes}, so it is '
+        "ignored; name the node in the file, or use '/**' for all nodes\n")
 
 
 @pytest.mark.parametrize('body', ["raise ValueError('a bug')", 'import djet_ros.no_such_module'])

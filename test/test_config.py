@@ -1,4 +1,4 @@
-"""The configuration: one source, read strictly, written so that it reads back."""
+"""The parameter schema: strict parsing, YAML round trip, flags and generated files."""
 
 import argparse
 from array import array
@@ -30,7 +30,7 @@ def written(tmp_path, text):
 def test_the_shipped_yaml_is_the_generated_one(name):
     expected = dump_yaml(Config(), GENERATED[name], preset_as_comments=True)
     assert (CONFIG / name).read_text() == expected, (
-        f"write config/{name} anew: python -c 'from djet_ros.config.sections import *; "
+        f"regenerate config/{name}: python -c 'from djet_ros.config.sections import *; "
         'from djet_ros.config.yaml_files import *; print(dump_yaml(Config(), '
         f"{GENERATED[name]}, preset_as_comments=True), end=str())' > config/{name}")
 
@@ -210,7 +210,7 @@ LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(
     LAUGHS + 'estimator: {window: *a11}',
     LAUGHS.replace('[', '{<<: [').replace(']', ']}').replace('[ha, ha]', '{ha: 1}')])
 def test_aliases_that_unfold_to_more_than_memory_holds_are_refused(tmp_path, text):
-    with pytest.raises(DjetError, match='its aliases unfold to more than'):
+    with pytest.raises(DjetError, match='its aliases expand to more than'):
         load_yaml(written(tmp_path, text))
 
 
@@ -290,8 +290,8 @@ def test_a_file_for_other_nodes_alone_is_said_as_ros_understands_names(
     path = written(tmp_path, f"'{name}': {{ros__parameters: {{preset: paper}}}}")
     said = why_unused(path, node)
     assert said == '' if meant else said == (
-        f"{path}: it is for /{name.strip('/')}, and nothing is taken from it: this is {node}; "
-        "'/**' is for all")
+        f"{path}: it has parameters for /{name.strip('/')} and none for {node}, so it is ignored; "
+        "name the node in the file, or use '/**' for all nodes")
 
 
 def test_a_file_for_several_nodes_is_for_each_of_them(tmp_path):
@@ -300,12 +300,13 @@ def test_a_file_for_several_nodes_is_for_each_of_them(tmp_path):
         other: {ros__parameters: {}}
     """)
     assert why_unused(path, '/left/vo_node') == why_unused(path, '/other') == ''
-    assert 'is for /left/vo_node, /other, and' in why_unused(path, '/vo_node')
-    assert 'is for no node, and' in why_unused(written(tmp_path, '{}'), '/vo_node')
+    assert 'has parameters for /left/vo_node, /other and none for' in why_unused(path, '/vo_node')
+    assert 'has parameters for no node and none for' in why_unused(
+        written(tmp_path, '{}'), '/vo_node')
 
 
 def gap(path, *nodes):
-    """Give the max_gap that a file has, offline or for nodes."""
+    """Return max_gap as read from a file, offline or for some nodes."""
     return load_yaml(path, **({'nodes': nodes} if nodes else {})).odometry.max_gap
 
 
@@ -320,8 +321,9 @@ def test_a_file_for_the_odometry_in_a_namespace_serves_offline_and_there_and_now
     for other in ('/right/vo_node', '/vo_node', '/left/eye'):
         with pytest.raises(DjetError) as error:
             gap(path, other)
-        assert str(error.value) == (f'{path}: it is for /left/vo_node, and nothing is taken from '
-                                    f"it: this is {other}; '/**' is for all")
+        assert str(error.value) == (
+            f'{path}: it has parameters for /left/vo_node and none for {other}, so it is ignored; '
+            "name the node in the file, or use '/**' for all nodes")
 
 
 def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_meant(tmp_path):
@@ -333,8 +335,8 @@ def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_m
     assert (gap(path, '/left/vo_node'), gap(path, '/right/vo_node')) == (3, 7)
     assert gap(path, '/rear/vo_node') == 1.5
     assert load_yaml(path, nodes=['/left/vo_node']).odometry.max_lost == 9
-    with pytest.raises(DjetError, match='it is for /left/vo_node and /right/vo_node, and one of '
-                                        'them is meant; give a file for that one'):
+    with pytest.raises(DjetError, match='it has parameters for /left/vo_node and /right/vo_node, '
+                                        'and only one of them can be used; give a file with'):
         load_yaml(path)
     path.write_text(f'{path.read_text().rstrip()}\n'
                     '        vo_node: {ros__parameters: {preset: fast}}')
@@ -345,9 +347,10 @@ def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_m
 def test_a_file_for_other_nodes_alone_is_refused_and_not_taken_for_the_defaults(tmp_path):
     for name in ('left_vo', 'pose_graph_node', '/*/eye'):
         path = written(tmp_path, f"'{name}': {{ros__parameters: {{slam.loop_votes: 7}}}}")
-        with pytest.raises(DjetError, match='nothing is taken from it: this is /vo_node; ') as one:
+        with pytest.raises(DjetError, match='none for /vo_node, so it is ignored; ') as one:
             load_yaml(path)
-        assert str(one.value).startswith(f'{path}: it is for /{name.strip("/")}, ')
+        assert str(one.value).startswith(
+            f'{path}: it has parameters for /{name.strip("/")} and none ')
 
 
 def test_loops_go_by_the_pose_graphs_own_parameters_and_by_the_odometrys(tmp_path):

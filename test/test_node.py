@@ -511,7 +511,7 @@ def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
     assert "unknown parameter 'name_of_robot'" in one.log
     # The file may serve the pose graph too.
     assert 'slam.loop_gap' not in one.log
-    assert 'nothing is taken' not in one.log
+    assert 'so it is ignored' not in one.log
 
 
 def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
@@ -519,8 +519,9 @@ def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
     path.write_text('vo_node: {ros__parameters: {odometry: {max_gap: 3}}}')
     with nodes(tmp_path, IMAGE) as start:
         one = start('-r', '__ns:=/left', '--params-file', str(path))
-        wait_for_log(one, f'{path}: it is for /vo_node, and nothing is taken from it: this is '
-                          "/left/vo_node; '/**' is for all")
+        wait_for_log(one, f'{path}: it has parameters for /vo_node and none for /left/vo_node, '
+                          "so it is ignored; name the node in the file, or use '/**' for all "
+                          'nodes')
 
 
 def test_a_change_is_applied_between_frames_or_refused_with_the_reason(

@@ -1,1 +1,1 @@
-"""One schema of parameters: sections, flat names, YAML files and flags."""
+"""The parameter schema: sections, flat names, YAML files and command-line flags."""

@@ -1,4 +1,4 @@
-"""The configuration as flags of a command line."""
+"""Parameters as command-line flags."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def add_flags(parser: argparse.ArgumentParser | argparse._ArgumentGroup,
     """
     Add a command-line flag for each flat name: ``--max-gap`` for ``odometry.max_gap``.
 
-    ``flag_values`` takes what was given out of the parsed arguments; config: what holds where
-    nothing was given, for the help.
+    ``flag_values`` reads the values back from the parsed arguments. config: the defaults shown
+    in the help.
     """
     known = flat(config or Config())
     for name in names:
@@ -29,7 +29,7 @@ def add_flags(parser: argparse.ArgumentParser | argparse._ArgumentGroup,
 
 
 def flag_values(args: argparse.Namespace) -> dict[str, Any]:
-    """Give the parameters given as flags, by flat name; DjetError where one can't be read."""
+    """Return the parameters given as flags, by flat name; DjetError if one cannot be parsed."""
     known = flat(Config())
     return {name: parse_value(known[name], text) for name, text in vars(args).items()
             if name in known and text is not None}

@@ -1,5 +1,5 @@
 """
-Every parameter by its flat name, as in ROS: ``estimator.window``, ``odometry.max_gap``.
+All parameters by flat name, as in ROS: ``estimator.window``, ``odometry.max_gap``.
 
 ROS parameters, YAML files and command-line flags are all derived from these.
 """
@@ -20,13 +20,13 @@ from djet_ros.errors import DjetError
 
 Value = bool | int | float | str
 
-# Share of equal letters beyond which one name is taken for another mistyped.
-_LIKE = 0.75
+# difflib ratio above which an unknown name is taken for a misspelling.
+_MISSPELLING_RATIO = 0.75
 
 
 @dataclass(frozen=True)
 class FlatParameter:
-    """One parameter under its flat name, with its value, its type (kind) and its description."""
+    """A parameter with its flat name, value, type (kind) and description."""
 
     name: str
     value: Value
@@ -35,12 +35,12 @@ class FlatParameter:
 
 
 def flat(config: Config) -> dict[str, FlatParameter]:
-    """All parameters of the configuration by flat name, in the order of declaration."""
+    """Return all parameters of a configuration by flat name, in order of declaration."""
     return {item.name: item for name in ('', *SECTIONS) for item in section(config, name)}
 
 
 def section(config: Config, part: str) -> Iterator[FlatParameter]:
-    """Parameters of one section, or with '' those that stand in none."""
+    """Yield the parameters of a section; '' is the top level."""
     owner = getattr(config, part) if part else config
     for name, description in describe(owner).items():
         value = getattr(owner, name)
@@ -50,11 +50,11 @@ def section(config: Config, part: str) -> Iterator[FlatParameter]:
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     """
-    Give the configuration with the values of some parameters changed, by flat name.
+    Return the configuration with some parameters changed, by flat name.
 
-    A preset among the values first sets the whole estimator to it; the others come on top.
-    Integers are taken for floats, and a list of numbers for a text that holds them. Raises
-    DjetError on an unknown name (naming the nearest), on a value of another type, and on one
+    A preset among the values is applied first, to the whole estimator; the other values override
+    it. An int is accepted for a float, and a list of numbers for a string of numbers. Raises
+    DjetError on an unknown name (suggesting the most similar one), a wrong type, and a value
     outside its described range.
     """
     known = flat(config)
@@ -72,7 +72,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
                        if name.startswith(mark)}
             if changes:
                 section = replace(getattr(config, part), **changes)
-                mark = ''  # what sections have to do with one another is said by full names
+                mark = ''  # checks across sections use full names in their messages
                 config = replace(config, **{part: section})
     except ValueError as error:
         raise DjetError(f'{mark}{error}') from None
@@ -80,18 +80,18 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def from_flat(values: Mapping[str, Any]) -> Config:
-    """Give the default configuration with some values changed; see ``with_values``."""
+    """Return the default configuration with some values changed; see ``with_values``."""
     return with_values(Config(), values)
 
 
 def why_unknown(name: str) -> str:
-    """Word that no parameter has this name, with the one whose last name is nearly the same."""
-    def likeness(full: str) -> tuple[float, float]:
+    """Return the error text for an unknown parameter, suggesting the most similar name."""
+    def similarity(full: str) -> tuple[float, float]:
         return (_ratio(full.rpartition('.')[2], str(name).rpartition('.')[2]),
                 _ratio(full, str(name)))
 
-    nearest = max(flat(Config()), key=likeness)
-    hint = f"; did you mean '{nearest}'?" if likeness(nearest)[0] > _LIKE else ''
+    nearest = max(flat(Config()), key=similarity)
+    hint = f"; did you mean '{nearest}'?" if similarity(nearest)[0] > _MISSPELLING_RATIO else ''
     return f"unknown parameter '{name}'{hint}"
 
 
@@ -100,13 +100,13 @@ def _ratio(a: str, b: str) -> float:
 
 
 def _typed(item: FlatParameter, value: Any) -> Value:
-    """Check the type of a value, taking an int for a float and a YAML true for 'true'."""
-    # YAML 1.1 takes 1e-4 for a text.
+    """Check the type of a value, converting int to float and YAML's true to 'true'."""
+    # YAML 1.1 reads 1e-4 as a string.
     if item.kind is float and type(value) in (int, float, str):
         return _finite(item, value)
     if item.kind is str and type(value) is bool and str(value).lower() in item.description.choices:
         return str(value).lower()
-    # rclpy has an array for what was a list.
+    # rclpy turns lists of numbers into arrays.
     if item.description.numbers and isinstance(value, (list, tuple, array)) \
             and all(type(one) in (int, float) for one in value):
         return ' '.join(map(str, value))
@@ -132,15 +132,16 @@ def _wrong_type(item: FlatParameter, value: Any) -> DjetError:
 
 
 def shown(value: Any) -> str:
+    """Return a value as shown in error messages, shortened."""
     try:
         return f'{value!r:.80}'
     except ValueError:
-        # Python refuses to write out integers of thousands of digits.
+        # Python refuses to convert integers of thousands of digits to text.
         return 'a huge number'
 
 
 def explain(item: FlatParameter) -> str:
-    """One line for people: what the parameter means and which values it takes."""
+    """Return the description of a parameter with its choices or range."""
     allowed = item.description
     if allowed.choices:
         return f'{allowed.text} [{" | ".join(allowed.choices)}]'
@@ -151,7 +152,7 @@ def explain(item: FlatParameter) -> str:
 
 
 def parse_value(item: FlatParameter, text: str) -> Value:
-    """Read a value of the parameter's type from a command line; DjetError where it isn't one."""
+    """Parse a value of the parameter's type from a command line; DjetError if it is not one."""
     try:
         if item.kind is bool:
             return {'true': True, 'false': False}[text.lower()]

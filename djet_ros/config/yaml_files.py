@@ -1,4 +1,4 @@
-"""The configuration as YAML, plain or in the layout of ROS."""
+"""Parameter files in YAML, with plain sections or in the ros__parameters layout."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
 
-# Parameters that every ROS node may find in its section and that are not ours to judge.
+# Parameters of every ROS node, which these commands ignore.
 _ROS_OWN = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
 _YAML_HEAD = """\
 # Parameters of the nodes, also read by `djet replay` and `djet slam` with --config FILE.
-# Made from djet_ros/config by its dump_yaml; a test holds that the two agree.
+# Generated from djet_ros/config by dump_yaml; a test checks that it is up to date.
 """
 
 
 _PRESET_NOTE = """\
-# The values that the preset sets are shown as comments; uncomment one to change it.
+# Values set by the preset are commented out; uncomment one to override it.
 """
 
 
 def load_yaml(path: Path, take: Callable[[Config, Mapping[str, Any]], Config] = with_values,
               nodes: Sequence[str] = (NODE_NAME,)) -> Config:
     """
-    Read a YAML file over the defaults.
-
-    take: how these take the values; nodes: for whom it is read, by full names such as
-    '/left/vo_node', or without a slash in whichever namespace the file has it. Of the pose graph's
-    own parameters slam.* alone are taken.
+    Return the defaults overridden by a YAML file.
 
     Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with
-    namespaces and wildcards. Raises DjetError, beginning with the path, on anything that is not
-    such a file, and where nothing of it is for these nodes.
+    namespaces and wildcards. nodes: the nodes whose parameters are read, by full name such as
+    '/left/vo_node', or without a leading slash for that node in any namespace. Of the pose graph
+    node only slam.* is read. take: applies the values to the defaults.
+
+    Raises DjetError, beginning with the path, if the file is not such a file or has no
+    parameters for these nodes.
     """
     content = read_yaml(path)
     try:
@@ -52,7 +52,7 @@ def load_yaml(path: Path, take: Callable[[Config, Mapping[str, Any]], Config] = 
 
 
 def _ours(content: Any, nodes: Sequence[str]) -> Any:
-    """Take the parameters of some nodes out of ROS's layout; a plain layout stays as it is."""
+    """Select the parameters of some nodes from ROS's layout; a plain layout is kept."""
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -71,21 +71,21 @@ def _ours(content: Any, nodes: Sequence[str]) -> Any:
 
 
 def _full_name(node: str, names: Sequence[str]) -> str:
-    """Give the full name that a file, by the names in it, has for a node; DjetError if several."""
+    """Return the full name of a node in a file with these names; DjetError if ambiguous."""
     if node.startswith('/') or f'/{node}' in names:
         return f'/{node.strip("/")}'
     found = {name for name in names if _last(name) == node and '*' not in name}
     if len(found) > 1:
-        raise DjetError(f'it is for {" and ".join(sorted(found))}, and one of them is meant; '
-                        'give a file for that one')
+        raise DjetError(f'it has parameters for {" and ".join(sorted(found))}, and only one of '
+                        'them can be used; give a file with the parameters of that one')
     return found.pop() if found else f'/{node}'
 
 
 def why_unused(path: Path, node: str) -> str:
     """
-    Say that a file of ROS parameters is for other nodes alone; nothing where it is for this one.
+    Return why a ROS parameter file has no effect on a node, or '' if it has one.
 
-    node: its full name, such as '/left/vo_node'. DjetError where the file can't be read.
+    node: full name, such as '/left/vo_node'. DjetError if the file cannot be read.
     """
     names = [name for name, _ in _addressed(read_yaml(path))]
     return '' if any(_is_for(name, node) for name in names) else (
@@ -93,16 +93,17 @@ def why_unused(path: Path, node: str) -> str:
 
 
 def _for_others(names: Iterable[str], nodes: Sequence[str]) -> str:
-    return (f'it is for {", ".join(names) or "no node"}, and nothing is taken from it: this is '
-            f"{' and '.join(nodes)}; '/**' is for all")
+    return (f'it has parameters for {", ".join(names) or "no node"} and none for '
+            f"{' and '.join(nodes)}, so it is ignored; name the node in the file, or use '/**' "
+            'for all nodes')
 
 
-# Namespaces in one another, deeper than anybody's.
+# Nesting of namespaces that is followed at most.
 _DEPTH = 20
 
 
 def _addressed(content: Any, above: str = '', depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Give names of nodes, perhaps with wildcards, and the parameters that a file has for them."""
+    """Yield node names, which may have wildcards, with their parameters in a file."""
     if not isinstance(content, dict) or depth > _DEPTH:
         return
     for key, value in content.items():
@@ -113,7 +114,7 @@ def _addressed(content: Any, above: str = '', depth: int = 0) -> Iterator[tuple[
 
 
 def _is_for(name: str, node: str) -> bool:
-    """Tell whether ROS takes a name, perhaps with wildcards, for that of a node."""
+    """Return whether a name in a file, which may have wildcards, matches a node as in ROS."""
     wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
     pattern = ''.join(wildcards.get(part, f'/{re.escape(part)}') for part in name.split('/')[1:])
     return re.fullmatch(pattern, node) is not None
@@ -124,14 +125,14 @@ def _last(name: str) -> str:
 
 
 def is_ros_own(name: str) -> bool:
-    """Tell of a parameter whether every ROS node has it, such as use_sim_time."""
+    """Return whether a parameter is one of every ROS node, such as use_sim_time."""
     return name.partition('.')[0] in _ROS_OWN
 
 
 def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
-    """Flat names and values; only our own sections are entered, so the depth is bounded."""
+    """Yield flat names and values; only known sections are entered, so the depth is bounded."""
     if not isinstance(content, dict):
-        raise DjetError(f'{shown(content)} stands where parameters were expected')
+        raise DjetError(f'expected a mapping of parameters, but found {shown(content)}')
     for name, value in content.items():
         if name in SECTIONS and isinstance(value, dict):
             yield from ((f'{name}.{inner}', inner_value) for inner, inner_value in value.items())
@@ -142,11 +143,10 @@ def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
 def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,
               preset_as_comments: bool = False) -> str:
     """
-    Write the configuration as YAML in ROS's layout, each parameter under its description.
+    Return the configuration as YAML in ROS's layout, with descriptions as comments.
 
-    parts: the sections that are written; '' are the parameters that stand in none. With
-    preset_as_comments the estimator's values that the preset gives anyway are commented out, so
-    that the file leaves the choice of preset free.
+    parts: the sections to write; '' is the top level. preset_as_comments: comment out the
+    estimator's values that equal those of the preset, so that the preset can still be chosen.
     """
     silent = set()
     if preset_as_comments and 'estimator' in parts:
@@ -164,7 +164,7 @@ def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,
             name = item.name.rpartition('.')[2]
             lines.append(f'{indent}{mark}{name}: {_yaml_scalar(item.value)}')
         if part and silent.issuperset(item.name for item in section(config, part)):
-            # A section of comments alone would be null, which ROS refuses.
+            # A section without values would be null, which ROS refuses.
             lines[0] = f'    # {part}:'
         texts.append('\n'.join(lines) + '\n')
     return (_YAML_HEAD + (_PRESET_NOTE if silent else '') + '/**:\n  ros__parameters:\n'
@@ -174,6 +174,6 @@ def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,
 def _yaml_scalar(value: Value) -> str:
     if isinstance(value, float):
         mantissa, e, exponent = repr(value).partition('e')
-        # YAML 1.1 readers take 1e-06 for a string, and 1.0e-06 for the number that it is.
+        # YAML 1.1 reads 1e-06 as a string, and 1.0e-06 as a number.
         return f'{mantissa}.0e{exponent}' if e and '.' not in mantissa else repr(value)
     return json.dumps(value)
