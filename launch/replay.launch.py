@@ -1,4 +1,4 @@
-"""Play a bag into the odometry: ros2 launch djet_ros replay.launch.py bag:=FOLDER ."""
+"""Play a bag into the odometry node: ros2 launch djet_ros replay.launch.py bag:=FOLDER ."""
 
 from djet_ros.ros.launching import arguments, CONFIG
 from launch import LaunchDescription
@@ -17,31 +17,33 @@ from launch_ros.substitutions import FindPackageShare
 LOOP = LaunchConfiguration('loop')
 
 
-def end_without_a_player(event, context):
-    """End all where the player failed; what it has played to its end can still be looked at."""
+def shut_down_if_player_failed(event, context):
+    """Shut down if the bag player failed; after a complete bag the nodes keep running."""
     if event.returncode and not context.is_shutdown:
-        why = 'the bag is not played; see what bag_player says'
+        why = 'the bag player failed; see the output of bag_player'
         return [LogInfo(msg=why), Shutdown(reason=why)]
     return []
 
 
 def player(*options, condition):
-    """Play the bag, once the node has had the time to find the player."""
+    """Describe the bag player, which waits for discovery before the first message."""
     return ExecuteProcess(
-        name='bag_player', output='screen', condition=condition, on_exit=end_without_a_player,
+        name='bag_player', output='screen', condition=condition,
+        on_exit=shut_down_if_player_failed,
         cmd=['ros2', 'bag', 'play', LaunchConfiguration('bag'), '--clock', '--delay', '3',
              '--rate', LaunchConfiguration('rate'), '--disable-keyboard-controls', *options])
 
 
 def generate_launch_description():
-    """Describe the player, and include vo.launch.py with simulated time."""
+    """Describe the bag player, and include vo.launch.py with simulated time."""
     vo = PathJoinSubstitution([FindPackageShare('djet_ros'), 'launch', 'vo.launch.py'])
     return LaunchDescription([
-        DeclareLaunchArgument('bag', description='folder or file of the recording'),
-        DeclareLaunchArgument('rate', default_value='1.0', description='how many times as fast'),
+        DeclareLaunchArgument('bag', description='folder or file of the bag'),
+        DeclareLaunchArgument('rate', default_value='1.0',
+                              description='playback rate, relative to the recording'),
         DeclareLaunchArgument('loop', default_value='false', choices=['true', 'false'],
-                              description='begin again at the end'),
-        # As djet kitti-to-bag names the images, and so that every image is worked on.
+                              description='whether to restart the bag at its end'),
+        # The topic is that of djet kitti-to-bag; the parameters process every image.
         *arguments('image', 'params_file', 'base_frame', 'rviz', image='/camera/image_rect',
                    params_file=PathJoinSubstitution([CONFIG, 'replay.yaml'])),
         IncludeLaunchDescription(PythonLaunchDescriptionSource(vo), launch_arguments={

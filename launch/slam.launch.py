@@ -11,6 +11,6 @@ def generate_launch_description():
                    'namespace', 'log_level', 'respawn', 'publish_tf', 'image_transport',
                    'use_sim_time', publish_tf='true'),
         node('vo_node', 'vo_node', 'params_file',
-             says=('base_frame', 'publish_tf', 'image_transport')),
+             overrides=('base_frame', 'publish_tf', 'image_transport')),
         node('pose_graph_node', 'pose_graph_node', 'params_file', 'slam_params_file'),
     ])

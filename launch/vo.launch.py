@@ -6,13 +6,13 @@ from launch.substitutions import LaunchConfiguration
 
 
 def generate_launch_description():
-    """Describe the node and, if asked for, RViz."""
+    """Describe the node and, with rviz:=true, RViz."""
     return LaunchDescription([
         *arguments('image', 'camera_info', 'params_file', 'base_frame', 'namespace', 'name',
                    'log_level', 'respawn', 'publish_tf', 'image_transport', 'use_sim_time',
                    'rviz'),
-        # Before the node, which is not to be started where there is no RViz.
+        # Before the node, which must not start if RViz is requested and not installed.
         rviz(),
         node('vo_node', LaunchConfiguration('name'), 'params_file',
-             says=('base_frame', 'publish_tf', 'image_transport')),
+             overrides=('base_frame', 'publish_tf', 'image_transport')),
     ])

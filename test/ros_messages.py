@@ -10,18 +10,18 @@ IMAGE_TYPE, INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 
 SEEN = {
-    # what is published, and what the log says of it
+    # by case: the topic and type that are published, and the expected log line
     'elsewhere': ('/front/image_raw', IMAGE_TYPE,
-                  f'waiting for image on {IMAGE}: nobody publishes it; did you mean '
+                  f'waiting for image on {IMAGE}: it has no publisher; did you mean '
                   '/front/image_raw?'),
     'compressed': (f'{IMAGE}/compressed', COMPRESSED_TYPE,
-                   f'nobody publishes it, but {IMAGE}/compressed; set '
+                   f'it has no publisher, but {IMAGE}/compressed has; set '
                    'ros.image_transport:=compressed'),
     'another type': (IMAGE, COMPRESSED_TYPE,
-                     f'it is published as {COMPRESSED_TYPE}, and not as {IMAGE_TYPE}; set '
+                     f'its type is {COMPRESSED_TYPE}, not {IMAGE_TYPE}; set '
                      'ros.image_transport:=compressed'),
     'its camera_info': ('/elsewhere/camera_info', INFO_TYPE,
-                        f'waiting for camera_info on {INFO}: nobody publishes it; did you mean '
+                        f'waiting for camera_info on {INFO}: it has no publisher; did you mean '
                         '/elsewhere/camera_info?'),
 }
 

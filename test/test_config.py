@@ -238,7 +238,7 @@ def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
     offered = [one for one in scale.description.choices if one != 'ground_truth']
     assert list(live_choices(scale)) == offered
     for value, reason in (('wheels', "is 'wheels'"),
-                          ('ground_truth', "is 'ground_truth', which only a recording has")):
+                          ('ground_truth', "is 'ground_truth', which is available offline only")):
         with pytest.raises(DjetError) as error:
             with_live_values(Config(), {'odometry.scale': value})
         assert str(error.value) == f'odometry.scale {reason}; choose from {", ".join(offered)}'

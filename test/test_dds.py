@@ -171,7 +171,8 @@ def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
 def test_a_sender_without_end_waits_and_nothing_is_lost(live, peer, drive):
     # Each end keeps 32 images beside those that wait for work.
     room = 10 * drive[0].nbytes
-    live(*EVERY, *FAST, before=f'from djet_ros.live import session; session.ROOM = {room}; ')
+    live(*EVERY, *FAST,
+         before=f'from djet_ros.live import session; session.MAX_QUEUE_BYTES = {room}; ')
     infos = peer.advertise(INFO, INFO_TYPE)
     images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(depth=None))
     infos.publish(camera_info(K, SIZE))
@@ -264,7 +265,7 @@ def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
     one = live('-p', 'ros.qos_reliability:=reliable')
     images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(reliable=False), listeners=0)
     peer.wait('the log', lambda: f'incompatible QoS on {IMAGE}' in one.log)
-    assert 'offers best_effort, volatile, /vo_node asks for reliable, volatile' in one.log
+    assert 'offers best_effort, volatile, /vo_node requests reliable, volatile' in one.log
     assert images.listeners == 0
 
 
@@ -288,7 +289,7 @@ def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
     for number, (service, (said, state)) in enumerate({
             'pause': (b'paused: images', 'paused'),
             'resume': (b'resumed: images', 'waiting for an image'),
-            'reset': (b'reset: forgot 2 images', 'waiting for an image')}.items()):
+            'reset': (b'reset: 2 images and their poses discarded', 'waiting for an image')}.items()):
         peer.heard['/diagnostics'].clear()
         answer = call(peer, service, number)
         # success, and a text with its length and its terminating zero
@@ -320,10 +321,10 @@ def test_clients_of_fast_dds_take_its_services_for_absent_and_the_log_says_why(l
     reply = 'std_srvs::srv::dds_::Trigger_Response_'
     peer.graph.listen_raw(f'rr{NODE}/resetReply', reply, lambda *_: None, Profile(), 'clientid=1;')
     peer.graph.listen_raw(f'rr{NODE}/pauseReply', reply, lambda *_: None, Profile(), '')
-    peer.wait('the log', lambda: 'a client on another middleware waits for /vo_node/pause, which '
-              'only those on Cyclone DDS can have; call it with '
+    peer.wait('the log', lambda: 'a client of /vo_node/pause uses another middleware, and only '
+              'clients on Cyclone DDS can be answered; call it with '
               'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp' in one.log)
-    assert 'waits for /vo_node/reset' not in one.log
+    assert 'client of /vo_node/reset' not in one.log
 
 
 def ends(peer: Peer, service: str) -> tuple[list[str], list[str]]:
@@ -494,18 +495,18 @@ def test_rules_for_topics_are_found_among_the_words_for_ros():
 @pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',
                                   '__node:=a/b', '__node:='])
 def test_names_that_ros_refuses_are_refused(rule):
-    with pytest.raises(DjetError, match='is no remapping|is no name of a node'):
+    with pytest.raises(DjetError, match='is not a remapping|is not a valid node name'):
         Names('vo_node', [rule])
-    with pytest.raises(DjetError, match='is no name of a node'):
+    with pytest.raises(DjetError, match='is not a valid node name'):
         Names('vö')
 
 
 @pytest.mark.parametrize(('words', 'environment', 'reason'), [
-    (['-r', 'image=/x'], {}, "'image=/x' is no remapping"),
+    (['-r', 'image=/x'], {}, "'image=/x' is not a remapping"),
     (['-p', 'ros.queue_size'], {}, 'is no parameter; write it as name:=value'),
     (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
     (['-p', 'ros.queue_size:=many'], {}, 'must be of type int'),
-    (['-p', 'odometry.scale:=ground_truth'], {}, 'only a recording has'),
+    (['-p', 'odometry.scale:=ground_truth'], {}, 'available offline only'),
     (['-p', 'odometry.scale:=constant'], {}, 'give the metres of each translation'),
     ([], {'ROS_DOMAIN_ID': 'home'}, "ROS_DOMAIN_ID is 'home'"),
     ([], {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'HOUSE'}, 'choose from LOCALHOST, SUBNET'),

@@ -157,7 +157,8 @@ def test_what_is_asked_for_on_the_way_is_heard_once_however_often_parameters_cha
 @pytest.mark.parametrize(('topic', 'offered', 'remedy'), [
     ('/image', Profile(reliable=False), 'set ros.queue_policy to latest or overrides of /image'),
     ('/imu', Profile(reliable=False), 'set ros.queue_policy to latest or overrides of /imu'),
-    ('/tf_static', Profile(latched=False), 'have it offer reliable, transient_local')])
+    ('/tf_static', Profile(latched=False),
+     'configure the publisher to offer reliable, transient_local')])
 def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic, offered, remedy):
     one = node(**{'ros.queue_policy': 'every', 'odometry.imu': True, 'odometry.guess': True,
                   'odometry.guess_frame': 'wheels'})
@@ -165,21 +166,21 @@ def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic,
     for _ in range(2):
         one.face._tick()
     line, = (line for line in one.graph.lines if line.startswith('incompatible QoS'))
-    assert line.endswith(f'Nothing is received from it; {remedy}')
+    assert line.endswith(f'no messages are received from it; {remedy}')
 
 
 @pytest.mark.parametrize(('asked', 'offered', 'remedy'), [
-    ('best_effort', True, ', or its images are too large to come whole by best effort: set '
-     'ros.qos_reliability to reliable, or give the middleware larger socket buffers'),
-    ('best_effort', False, ', or its images are too large to come whole by best effort: '
-     'give the middleware larger socket buffers'),
+    ('best_effort', True, '; large images may be lost with best-effort QoS: set '
+     'ros.qos_reliability to reliable, or increase the socket buffers of the middleware'),
+    ('best_effort', False, '; large images may be lost with best-effort QoS: '
+     'increase the socket buffers of the middleware'),
     ('reliable', True, '')])
 def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
         node, asked, offered, remedy):
     one = node(**{'ros.qos_reliability': asked})
     one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
-    assert one.face.why_silent('/image') == f'1 publish it, none sends{remedy}'
-    assert one.face.why_silent('/camera_info') == '1 publish it, none sends'
+    assert one.face.why_silent('/image') == f'1 publisher, but no messages arrive{remedy}'
+    assert one.face.why_silent('/camera_info') == '1 publisher, but no messages arrive'
 
 
 @pytest.mark.parametrize(('transport', 'elsewhere', 'hint'), [
@@ -191,4 +192,4 @@ def test_a_hint_at_a_topic_can_be_followed(node, transport, elsewhere, hint):
     one = node(**{'ros.image_transport': transport})
     one.graph.elsewhere = [elsewhere]
     topic = '/image' if transport == 'raw' else '/image/compressed'
-    assert one.face.why_silent(topic) == f'nobody publishes it{hint}'
+    assert one.face.why_silent(topic) == f'it has no publisher{hint}'

@@ -162,8 +162,8 @@ def test_an_odometry_that_does_not_fit_is_said_with_what_can_be_mended(nodes, ca
     end = monotonic() + 30
     while 'incompatible QoS' not in one.log and monotonic() < end:
         sleep(0.1)
-    assert ('Nothing is received from it; have it offer reliable, volatile, or set '
-            f'qos_overrides.{ODOMETRY}.subscription.*') in one.log
+    assert ('no messages are received from it; configure the publisher to offer reliable, '
+            f'volatile, or set qos_overrides.{ODOMETRY}.subscription.*') in one.log
 
 
 def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:
@@ -210,9 +210,9 @@ def test_what_is_missing_is_said_with_its_resolved_name(
         if 'waiting for camera_info' in graph.log:
             break
         sleep(0.1)
-    for line in (f'waiting for odometry on {ODOMETRY}: 1 publish it, none sends',
-                 f'waiting for image on {IMAGE}: nobody publishes it',
-                 f'waiting for camera_info on {INFO}: nobody publishes it'):
+    for line in (f'waiting for odometry on {ODOMETRY}: 1 publisher, but no messages arrive',
+                 f'waiting for image on {IMAGE}: it has no publisher',
+                 f'waiting for camera_info on {INFO}: it has no publisher'):
         assert line in graph.log
     # The odometry's debug_image is an image, too, and not meant.
     assert 'did you mean' not in graph.log

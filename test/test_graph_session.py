@@ -86,7 +86,7 @@ def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):
     one = live(base_frame='base_link')
     one.drive(WAYS[:3])
     until(lambda: any("tf does not know where 'camera' is on 'base_link'; until then the "
-                      'odometry is not used' in line for line in one.graph.lines))
+                      'odometry is ignored' in line for line in one.graph.lines))
     assert not one.graph.heard('/tf')
     one.graph.frames['base_link', 'camera'] = MOUNTING
     one.drive(WAYS[3:6])
@@ -95,7 +95,7 @@ def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):
 
 
 def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
-    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE', 0.0)
+    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE_TIMEOUT', 0.0)
     one = live(optimise_period=1000.0)
     one.drive(WAYS)
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
@@ -105,7 +105,7 @@ def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
 
 
 def test_what_is_missing_is_said_by_its_topic(live, monkeypatch):
-    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE', 0.0)
+    monkeypatch.setattr('djet_ros.live.graph_session.SILENCE_TIMEOUT', 0.0)
     one = live()
     one.session.camera_info(camera_info(K, SIZE))
     for _ in range(3):
@@ -122,7 +122,8 @@ def test_closed_loops_are_logged(live):
     one = live(optimise_period=0.0)
     one.drive(WAYS)
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
-    until(lambda: any(f"{one.slam.map.count('loop')} in all" in line for line in one.graph.lines))
+    until(lambda: any(f"{one.slam.map.count('loop')} in total" in line
+                      for line in one.graph.lines))
 
 
 def test_a_reset_begins_a_new_map(live):

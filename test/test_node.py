@@ -226,10 +226,11 @@ def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
     one = node('-r', 'camera_info:=/elsewhere/info', **FAST)
     # Its own debug_image is an image, too, and not meant.
     for what, topic in (('image', IMAGE), ('camera_info', '/elsewhere/info')):
-        line = wait_for_log(one, f'waiting for {what} on {topic}: nobody publishes it')
+        line = wait_for_log(one, f'waiting for {what} on {topic}: it has no publisher')
         assert 'did you mean' not in line
     publisher.advertise('/elsewhere/info', INFO_TYPE)
-    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publish it, none sends')
+    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publisher, but no messages '
+                      'arrive')
 
 
 @pytest.mark.parametrize('case', SEEN)
@@ -279,7 +280,7 @@ def test_camera_and_camera_info_may_be_killed_and_come_again(
         subscriber.heard.clear()
         victim.kill()
         subscriber.wait('silence', said('waiting for an image'))
-        wait_for_log(one, f'waiting for image on {IMAGE}: nobody publishes it')
+        wait_for_log(one, f'waiting for image on {IMAGE}: it has no publisher')
         subscriber.heard.clear()
     again = Peer('camera_driver')
     camera(again)
@@ -321,7 +322,7 @@ def test_a_qos_that_does_not_fit_is_said_with_both_sides(
     publisher.advertise(IMAGE, IMAGE_TYPE, listeners=0, reliability='best_effort')
     line = wait_for_log(one, f'incompatible QoS on {IMAGE}')
     assert '/camera_driver offers best_effort, volatile' in line
-    assert '/vo_node asks for reliable, volatile' in line
+    assert '/vo_node requests reliable, volatile' in line
     assert f'set {remedy} or qos_overrides.{IMAGE}.subscription.*' in line
     publisher.advertise(INFO, INFO_TYPE)
     assert one.log.count('incompatible QoS') == 1
@@ -463,7 +464,7 @@ def test_pause_and_resume(node, publisher, subscriber, drive):
     play(publisher, drive[:3])
     subscriber.wait('a pair', paired(2))
     assert publisher.call('pause') == {
-        'success': True, 'message': 'paused: images are dropped and counted until a resume'}
+        'success': True, 'message': 'paused: images are dropped and counted until ~/resume'}
     play(publisher, drive[3:6], first=3)
     sleep(0.5)
     assert publisher.call('resume')['success']
@@ -541,7 +542,7 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
     assert 'Max: 20000' in reasons[3]
     assert reasons[4].startswith("estimator.loss is 'hubber'; choose from none, huber, cauchy")
     assert 'read-only' in reasons[5]
-    assert 'which only a recording has; choose from structure, none, constant' in reasons[6]
+    assert 'which is available offline only; choose from structure, none, constant' in reasons[6]
     assert reasons[6].count('ground_truth') == 1
     assert publisher.ask('configure', node=NODE, values={'odometry.scale': 'none'})[0][0]
     play(publisher, drive[3:5], first=3)
@@ -633,7 +634,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
 
 @pytest.mark.parametrize(('words', 'reason'), [
     (['-p', 'estimator.window:=4'], 'estimator.window is 4; it must be odd'),
-    (['-p', 'odometry.scale:=ground_truth'], 'only a recording has'),
+    (['-p', 'odometry.scale:=ground_truth'], 'available offline only'),
     (['-p', 'odometry.scale:=camera_height'], 'give the metres from the ground to the camera'),
     (['-p', 'nonsense'], "Couldn't parse parameter override rule: '-p nonsense'"),
     (['--params-file', '/no/such.yaml'], "Couldn't parse params file: '--params-file /no/such"),
@@ -645,7 +646,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['--no-such-flag'], '--no-such-flag'),
     (['--', '-x'], "nobody knows what '-x' is; words for ROS, such as -r image:="),
     (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
-     "/image can not be had with qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
+     "/image does not accept qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
     (['-p', 'qos_overrides./image.subscription.depth:=many'],
      "{'subscription.depth': 'many'"),
 ])
@@ -661,7 +662,7 @@ def test_what_the_user_can_mend_ends_it_with_one_line_and_code_2(tmp_path, words
 
 @pytest.mark.parametrize(('variable', 'value', 'reason'), [
     ('ROS_DOMAIN_ID', 'abc', 'ROS_DOMAIN_ID is not an integral number'),
-    ('CYCLONEDDS_URI', '<bad', 'error creating node; look'),
+    ('CYCLONEDDS_URI', '<bad', 'error creating node; check'),
     ('ROS_LOG_DIR', '/proc/none', "log directory '/proc/none'")])
 def test_a_fault_of_the_environment_is_not_blamed_on_the_command_line(variable, value, reason):
     if variable == 'CYCLONEDDS_URI' and 'cyclone' not in ENVIRONMENT.get('RMW_IMPLEMENTATION', ''):
@@ -670,9 +671,9 @@ def test_a_fault_of_the_environment_is_not_blamed_on_the_command_line(variable, 
                           capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     last = done.stderr.splitlines()[-1]
-    assert last.startswith('vo_node: error: ROS can not start a node: ')
+    assert last.startswith('vo_node: error: the ROS node could not be created: ')
     assert reason in last
-    assert 'look at the lines above, if any, and at the environment: ROS_DOMAIN_ID' in last
+    assert 'check the log lines above, if any, and the environment: ROS_DOMAIN_ID' in last
     assert 'Traceback' not in done.stderr
 
 
@@ -779,7 +780,7 @@ def test_every_image_is_accounted_for_under_load(node, publisher, subscriber, dr
 def test_what_comes_beyond_the_room_is_dropped_counted_and_complained_of(
         node, publisher, subscriber, drive):
     room, sent = 10 * drive[0].nbytes, 60
-    node(before=f'from djet_ros.live import session; session.ROOM = {room}; ',
+    node(before=f'from djet_ros.live import session; session.MAX_QUEUE_BYTES = {room}; ',
          **{'estimator.max_features': 5000, 'estimator.fast_threshold': 2,
             'ros.queue_policy': 'every'})
     camera(publisher)

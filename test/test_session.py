@@ -12,7 +12,7 @@ from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.live import session as sessions
 from djet_ros.live.rate_limit import RateLimit
-from djet_ros.live.session import ROOM, Session
+from djet_ros.live.session import MAX_QUEUE_BYTES, Session
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
@@ -160,7 +160,7 @@ def test_an_image_stamped_ahead_is_dropped_once_the_next_one_has_come(live, driv
 
 
 def test_an_image_after_a_gap_is_worked_on_though_no_other_comes(live, drive, monkeypatch):
-    monkeypatch.setattr(sessions, '_NEXT_PATIENCE', 0.05)
+    monkeypatch.setattr(sessions, '_NEXT_IMAGE_TIMEOUT', 0.05)
     one = live()
     one.send(drive[:2])
     one.send(drive[2:3], first=100)
@@ -178,7 +178,7 @@ def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live,
     assert counts.processed + counts.dropped.total() == counts.received
     # The newest is never the one that is dropped.
     assert one.tracker.last.stamp_ns == (len(drive) - 1) * PERIOD
-    assert 'images dropped: they come faster than they are worked on' in one.graph.lines[0]
+    assert 'images dropped: they arrive faster than they are processed' in one.graph.lines[0]
 
 
 def test_a_camera_that_is_too_fast_on_purpose_is_slowed_down_and_nobody_complains(live, drive):
@@ -200,7 +200,7 @@ def test_a_camera_that_is_too_fast_on_purpose_is_slowed_down_and_nobody_complain
     assert said['frames beyond ros.max_rate'] == '7'
     assert said['frames received'] == said['frames processed'] == '5'
     assert not any(key.startswith('to mend') for key in said)
-    assert not any('come faster' in line for line in fast.graph.lines)
+    assert not any('arrive faster' in line for line in fast.graph.lines)
     fast.session.configure(with_values(fast.tracker.config, {'ros.max_rate': 0.0}))
     fast.session.resume()
     fast.send(drive[:3], first=12)
@@ -217,16 +217,17 @@ def test_a_sender_without_end_fills_no_memory_and_is_complained_of(live, drive, 
         one.session.image(message)
         one.session.mask(message)
     held = getrefcount(message) * len(message.data)
-    assert ROOM < held < 2.2 * ROOM
+    assert MAX_QUEUE_BYTES < held < 2.2 * MAX_QUEUE_BYTES
     one.graph.open.set()
     one.wait_for_images(sent)
     counts = one.tracker.counts
-    assert counts.dropped['queue_full'] == pytest.approx(sent - ROOM / len(message.data), abs=3)
+    assert counts.dropped['queue_full'] == pytest.approx(
+        sent - MAX_QUEUE_BYTES / len(message.data), abs=3)
     one.session.pause()
     assert 'images dropped under load' in one.graph.heard('/diagnostics')[-1].status[0].message
     assert 'lower their rate (that of a player, too)' in one.graph.said()[
         'to mend: images dropped under load']
-    assert any('MB of images wait to be worked on' in line for line in one.graph.lines)
+    assert any('MB of images are queued' in line for line in one.graph.lines)
     assert 'to mend: images pile up' not in one.graph.said()
 
 
@@ -311,13 +312,14 @@ def test_what_was_asked_for_is_answered_and_logged(live, drive):
     answers = [one.session.pause(), one.session.pause(), one.session.resume(),
                one.session.resume(), one.session.reset()]
     assert answers == [
-        'paused: images are dropped and counted until a resume', 'was paused already',
-        'resumed: images are worked on again', 'was not paused',
-        'reset: forgot 3 images and their poses; odom begins at the next image']
+        'paused: images are dropped and counted until ~/resume', 'already paused',
+        'resumed: images are processed again', 'not paused',
+        'reset: 3 images and their poses discarded; odom starts at the next image']
     one.session.configure(with_values(one.tracker.config, {
         'odometry.odom_frame': 'world', 'odometry.max_gap': 2.0}))
     assert one.graph.lines == [f'info: {answer}' for answer in answers] + [
-        'info: from the next image on: odometry.max_gap = 2.0, odometry.odom_frame = world']
+        'info: parameters from the next image on: odometry.max_gap = 2.0, '
+        'odometry.odom_frame = world']
 
 
 def test_a_stop_publishes_an_image_as_a_whole_or_not_at_all(live, drive):
@@ -432,7 +434,7 @@ def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatc
     one.session.camera_info(None)
     one.session.tick()
     assert one.graph.lines == []
-    monkeypatch.setattr(sessions, 'SILENCE', 0.0)
+    monkeypatch.setattr(sessions, 'SILENCE_TIMEOUT', 0.0)
     for _ in range(3):
         one.session.tick()
     assert one.graph.lines == [
@@ -442,7 +444,7 @@ def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatc
 
 
 def test_a_camera_that_falls_silent_is_said_in_the_diagnostics(live, drive, monkeypatch):
-    monkeypatch.setattr(sessions, 'SILENCE', 0.2)
+    monkeypatch.setattr(sessions, 'SILENCE_TIMEOUT', 0.2)
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -467,7 +469,7 @@ def test_diagnostics_are_not_said_twice_in_a_period(live, drive, monkeypatch):
 
 
 def test_an_uncalibrated_camera_is_said_before_any_image_comes(live, monkeypatch):
-    monkeypatch.setattr(sessions, 'SILENCE', 0.0)
+    monkeypatch.setattr(sessions, 'SILENCE_TIMEOUT', 0.0)
     one = live()
     one.session.camera_info(camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12)))
     one.session.tick()

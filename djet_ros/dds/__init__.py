@@ -1,1 +1,1 @@
-"""The live odometry on Eclipse Cyclone DDS, without ROS: wiring alone."""
+"""The live nodes on Eclipse Cyclone DDS, without ROS, and a bag player."""

@@ -32,18 +32,19 @@ from djet_ros.errors import DjetError
 from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
 from djet_ros.recordings.decoding import jazzy
 
-# A write holds Python's interpreter lock; whoever has to wait longer asks again.
+# A blocked write holds Python's interpreter lock, so callers retry instead of waiting longer.
 _MAX_BLOCKING = duration(milliseconds=20)
 
-# Samples that who keeps all may hold, at either end, before the publisher has to wait.
-_KEEP_ALL_ROOM = 32
+# Samples in a keep-all history, at either end, before the publisher blocks.
+_KEEP_ALL_SAMPLES = 32
 
 _GONE = (DDSException.DDS_RETCODE_BAD_PARAMETER, DDSException.DDS_RETCODE_ALREADY_DELETED)
 
 _ANY = ViewState.Any | InstanceState.Any | SampleState.NotRead
 
-# As ROS does, but with the loopback interface by name: from another, Cyclone 11 does not hear a
-# ROS with Cyclone 0.10. And datagrams as large as loopback takes them: an image is 8 and not 300.
+# As in ROS, but with the loopback interface by address: Cyclone 11 on another interface does not
+# receive from a ROS with Cyclone 0.10. And with the largest datagrams that loopback takes: 8 for
+# an image instead of 300.
 _LOCALHOST = """\
 <CycloneDDS><Domain>
   <General>
@@ -77,18 +78,18 @@ _RANGES = {'LOCALHOST': _LOCALHOST, 'SUBNET': _SUBNET, 'OFF': _OFF, 'SYSTEM_DEFA
 
 
 class Publisher:
-    """Publishes messages of one type on one topic; may be used from any thread."""
+    """Publishes one type on one topic; may be used from any thread."""
 
     def __init__(self, writer: DataWriter, sample: Any) -> None:
         self._writer = writer
         self._sample = sample
 
     def publish(self, message: Any) -> bool:
-        """Send a message; False where the subscriptions left no room for it for a moment."""
+        """Publish a message; return False if a subscription has no room for it within 20 ms."""
         return self.send(encode(message))
 
     def send(self, data: bytes) -> bool:
-        """Send a message in CDR; see ``publish``."""
+        """Publish a serialised message (CDR); see ``publish``."""
         try:
             self._writer.write(self._sample(data))
         except DDSException as error:
@@ -99,7 +100,7 @@ class Publisher:
 
     @property
     def listeners(self) -> int:
-        """Count the subscriptions; none once the graph is closed."""
+        """Number of subscriptions; 0 once the graph is closed."""
         try:
             return len(self._writer.get_matched_subscriptions())
         except DDSException as error:
@@ -108,21 +109,21 @@ class Publisher:
             return 0
 
     def listens(self, user_data: str) -> bool:
-        """Tell whether a subscription says this of itself."""
+        """Return whether a subscription has this text in its user data."""
         return any(user_data in _user_data(self._writer.get_matched_subscription_data(handle))
                    for handle in self._writer.get_matched_subscriptions())
 
     def wait_until_taken(self, seconds: float) -> bool:
-        """Wait until all reliable subscriptions have everything."""
+        """Wait until all reliable subscriptions have acknowledged everything; return if so."""
         try:
             return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
         except AttributeError:
-            # Cyclone 11.0.1 looks the code of its own timeout up in the wrong class.
+            # Cyclone 11.0.1 looks up its timeout code in the wrong class.
             return False
 
 
 class Subscription:
-    """Hands messages of one topic to a callback; the callbacks are called by Graph.spin."""
+    """Passes the messages of one topic to a callback, which Graph.spin calls."""
 
     def __init__(self, reader: DataReader, topic: str, profile: Profile, batch: int,
                  callback: Callable[[Any, Any], None], ready: Callable[[], bool] | None) -> None:
@@ -138,11 +139,11 @@ class Subscription:
 
     @property
     def ready(self) -> bool:
-        """Whether messages are to be taken now."""
+        """Whether messages are taken now."""
         return self._ready is None or self._ready()
 
     def dispatch(self) -> None:
-        """Hand out what has come, up to the size of a batch."""
+        """Call the callback for the samples received, up to the batch size."""
         if not self.ready:
             return
         for sample in self._reader.take(self._batch, self.condition):
@@ -150,29 +151,30 @@ class Subscription:
                 self._callback(sample.data, sample.sample_info)
 
     def count_garbage(self) -> None:
-        """Count a sample that is no message of its type as one that never came."""
+        """Count a sample that is not a message of its type as lost."""
         self._garbage += 1
 
     def new_losses(self) -> int:
-        """Count the messages that were lost on the way since the last call."""
+        """Return the number of messages lost in transport since the last call."""
         number, self._garbage = self._garbage, 0
         return number + int(self._reader.get_sample_lost_status().total_count_change)
 
     def new_refusals(self) -> int:
-        """Count the publishers that turned up since the last call and do not fit."""
+        """Return the number of publishers with incompatible QoS since the last call."""
         return int(self._reader.get_requested_incompatible_qos_status().total_count_change)
 
     def user_data_of(self, info: Any) -> str:
-        """Give what the publisher of a sample says of itself."""
+        """Return the user data of the publisher of a sample."""
         return _user_data(self._reader.get_matched_publication_data(info.publication_handle))
 
 
 class Graph:
     """
-    A participant in the ROS graph, with the domain and range that the environment asks for.
+    A participant in the ROS graph.
 
-    Reads ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and CYCLONEDDS_URI, as
-    ROS does with Cyclone DDS. Raises DjetError where one of them can't be used.
+    Domain and discovery are those of ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE,
+    ROS_STATIC_PEERS and CYCLONEDDS_URI, as in ROS with Cyclone DDS. Raises DjetError if one of
+    them is invalid.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -181,23 +183,24 @@ class Graph:
             self._domain = Domain(domain, _configuration(environment))
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            raise DjetError(f'no DDS participant in domain {domain}: {error.msg}; check '
-                            'CYCLONEDDS_URI and the network interfaces') from None
+            raise DjetError(f'no DDS participant could be created in domain {domain}: '
+                            f'{error.msg}; check CYCLONEDDS_URI and the network '
+                            'interfaces') from None
         self._subscriptions: list[Subscription] = []
         self._waiting = WaitSet(self._participant)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._listeners = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
 
     def close(self) -> None:
-        """Leave the graph, and tell the others; nothing can be sent or heard any more."""
-        # Cyclone deletes what Python has forgotten, and at its exit Python forgets nothing: the
-        # others would take this participant for alive until its lease ends.
+        """Leave the graph; nothing can be sent or received any more."""
+        # Cyclone deletes entities only when Python collects them, which it does not do at exit:
+        # to others this participant would be alive until its lease expires.
         self._participant.__del__()
-        # And where a domain is left behind, the process can't enter it again.
+        # A process cannot create a domain again unless it was deleted.
         self._domain.__del__()
 
     def __enter__(self) -> Self:
-        """Give the graph itself."""
+        """Return the graph itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -206,13 +209,13 @@ class Graph:
 
     def advertise(self, topic: str, ros_type: str,
                   profile: Profile = DEFAULT_PROFILE) -> Publisher:
-        """Publish on a topic from now on."""
+        """Create a publisher of a ROS type on a topic."""
         return self.advertise_raw(f'rt{topic}', dds_type_name(ros_type), profile,
                                   _type_hash(ros_type))
 
     def advertise_raw(self, dds_topic: str, dds_type: str, profile: Profile,
                       user_data: str) -> Publisher:
-        """Publish on a topic under its DDS names."""
+        """Create a publisher by DDS topic and type names."""
         sample = sample_type(dds_type)
         writer = DataWriter(self._participant, Topic(self._participant, dds_topic, sample),
                             _qos(profile, user_data))
@@ -223,10 +226,10 @@ class Graph:
                garbage: Callable[[str], None] = lambda reason: None,
                ready: Callable[[], bool] | None = None) -> Subscription:
         """
-        Hand the messages on a topic to a callback.
+        Subscribe to a topic.
 
-        batch: how many at most before it is the turn of other topics; garbage: is told of each
-        sample that is no such message, and why; ready: see ``Middleware.listen``.
+        batch: messages taken before other topics get their turn; garbage: called with the reason
+        for each sample that cannot be deserialised; ready: see ``Middleware.listen``.
         """
         def take(data: bytes, _: Any) -> None:
             try:
@@ -245,7 +248,7 @@ class Graph:
     def listen_raw(self, dds_topic: str, dds_type: str, callback: Callable[[Any, Any], None],
                    profile: Profile, user_data: str, batch: int = 100,
                    ready: Callable[[], bool] | None = None) -> Subscription:
-        """Hand CDR and sample information on a topic, under its DDS names, to a callback."""
+        """Subscribe by DDS names; the callback gets CDR bytes and sample information."""
         reader = DataReader(self._participant,
                             Topic(self._participant, dds_topic, sample_type(dds_type)),
                             _qos(profile, user_data))
@@ -254,7 +257,7 @@ class Graph:
         return subscription
 
     def spin(self, seconds: float) -> None:
-        """Wait for messages, at most for some time, and hand them out in order of listening."""
+        """Wait for messages for at most some seconds; call callbacks in order of subscription."""
         for subscription in self._subscriptions:
             self._wait_for(subscription, wanted=subscription.ready)
         self._waiting.wait(duration(seconds=seconds))
@@ -262,25 +265,25 @@ class Graph:
             subscription.dispatch()
 
     def _wait_for(self, subscription: Subscription, *, wanted: bool) -> None:
-        """Be woken up by messages, or not: those that are not taken would do so at once."""
+        """Attach or detach a subscription: messages that are not taken would wake up at once."""
         if wanted != subscription.waited_for:
             subscription.waited_for = wanted
             change = self._waiting.attach if wanted else self._waiting.detach
             change(subscription.condition)
 
     def offers(self, topic: str) -> list[Offer]:
-        """Give who publishes a topic."""
+        """Return the publishers of a topic."""
         return [Offer(f'participant {one.participant_key}', _ros_type(one.type_name),
                       _profile(one.qos)) for one in _alive(self._publications)
                 if one.topic_name == f'rt{topic}']
 
     def listeners_without(self, dds_topic: str, user_data: str) -> set[str]:
-        """Give who subscribes to a topic, by its DDS name, and does not say this of itself."""
+        """Return the subscriptions to a DDS topic that lack a text in their user data."""
         return {str(one.key) for one in _alive(self._listeners)
                 if one.topic_name == dds_topic and user_data not in _user_data(one)}
 
     def published(self, ros_type: str) -> list[str]:
-        """Give the topics over which somebody sends messages of a ROS type."""
+        """Return the topics of a ROS type that have a publisher."""
         return sorted({one.topic_name.removeprefix('rt') for one in _alive(self._publications)
                        if one.topic_name.startswith('rt/')
                        and one.type_name == dds_type_name(ros_type)})
@@ -294,12 +297,12 @@ def _alive(reader: BuiltinDataReader) -> list[Any]:
 def _domain_id(environment: Mapping[str, str]) -> int:
     text = environment.get('ROS_DOMAIN_ID') or '0'
     if not text.isdecimal() or int(text) > 232:
-        raise DjetError(f"ROS_DOMAIN_ID is '{text}'; it must be a number from 0 to 232")
+        raise DjetError(f"ROS_DOMAIN_ID is '{text}'; it must be an integer from 0 to 232")
     return int(text)
 
 
 def _configuration(environment: Mapping[str, str]) -> str:
-    # ROS before Iron knew this one alone. Later ones still take it, and it prevails.
+    # The variable of ROS before Iron; later versions still read it, and it takes precedence.
     only = environment.get('ROS_LOCALHOST_ONLY', '').startswith('1')
     name = 'LOCALHOST' if only else environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
     if name not in _RANGES:
@@ -307,21 +310,22 @@ def _configuration(environment: Mapping[str, str]) -> str:
                         f'{", ".join(_RANGES)}')
     named = '' if only else environment.get('ROS_STATIC_PEERS', '')
     peers = ''.join(f'<Peer address="{peer}"/>' for peer in named.split(';') if peer)
-    # What the user says comes last and counts; but interfaces add up, and none may come twice.
+    # The user's configuration comes last and overrides; but interfaces accumulate, and none may
+    # be given twice.
     uri = environment.get('CYCLONEDDS_URI', '')
     interfaces = '' if _chooses_interfaces(uri) else _LOOPBACK
     return _RANGES[name].format(interfaces=interfaces, peers=peers, pid=os.getpid()) + uri
 
 
 def _chooses_interfaces(uri: str) -> bool:
-    """Tell whether a Cyclone configuration, which is XML or names of files, chooses interfaces."""
+    """Return whether a Cyclone configuration (XML or file names) chooses interfaces."""
     files = [Path(name) for name in re.findall('file://([^,]+)', uri)]
     texts = [uri, *(file.read_text('utf-8', 'replace') for file in files if file.is_file())]
     return any('<NetworkInterface' in text for text in texts)
 
 
 def _ros_type(dds_name: str) -> str:
-    """Give the ROS type such as 'sensor_msgs/msg/Image' of a DDS type."""
+    """Return the ROS type, such as 'sensor_msgs/msg/Image', of a DDS type."""
     return dds_name.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
 
 
@@ -330,14 +334,14 @@ def _type_hash(ros_type: str) -> str:
 
 
 def _qos(profile: Profile, user_data: str = '') -> Qos:
-    """Quality of service in DDS's words; user_data is what ROS tells its peers in addition."""
+    """Return the DDS QoS of a profile; user_data: what ROS adds for its peers."""
     return Qos(
         Policy.Reliability.Reliable(_MAX_BLOCKING) if profile.reliable
         else Policy.Reliability.BestEffort,
         Policy.History.KeepAll if profile.depth is None
         else Policy.History.KeepLast(profile.depth),
         Policy.Durability.TransientLocal if profile.latched else Policy.Durability.Volatile,
-        Policy.ResourceLimits(max_samples=-1 if profile.depth else _KEEP_ALL_ROOM),
+        Policy.ResourceLimits(max_samples=-1 if profile.depth else _KEEP_ALL_SAMPLES),
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Userdata(user_data.encode()))
 

@@ -1,4 +1,4 @@
-"""Plain DDS as a live node's middleware."""
+"""The middleware of a live node on plain DDS."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from djet_ros.recordings.decoding import message_type
 
 _GARBAGE_LOG_PERIOD = 5.0
 
-# Seconds between two looks for clients that can't be answered.
-_LOOK_PERIOD = 1.0
+# Seconds between two checks for service clients that cannot be answered.
+_CLIENT_CHECK_PERIOD = 1.0
 
-# Messages of static frames that may wait; each robot_state_publisher has one.
+# History depth of /tf_static: one message for each robot_state_publisher.
 _FRAMES_DEPTH = 100
 
 _LEVELS = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}
@@ -29,9 +29,9 @@ _LEVELS = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}
 
 class DdsMiddleware:
     """
-    The ROS graph as a node sees it that is none to ROS: topics and services alone.
+    The ROS graph as seen by a participant with topics and services, but no ROS node.
 
-    use_sim_time: stamps of now are those of /clock.
+    use_sim_time: the current time is that of /clock.
     """
 
     qos_remedy = ''
@@ -44,7 +44,7 @@ class DdsMiddleware:
         self._clock: int | None = None
         self._frames = StaticFrames()
         self._follows_frames = False
-        self._last_garbage = self._last_look = -float('inf')
+        self._last_garbage = self._last_client_check = -float('inf')
         self._services: list[TriggerServer] = []
         if use_sim_time:
             self._clock = 0
@@ -52,74 +52,74 @@ class DdsMiddleware:
 
     @property
     def node(self) -> str:
-        """Give the name of the node with its namespace."""
+        """Fully qualified node name."""
         return self._names.full_node
 
     def resolve(self, name: str) -> str:
-        """Give the full name of a topic or service, remapped."""
+        """Return the fully qualified name of a topic or service, with remappings."""
         return self._names.resolve(name)
 
     def is_remapped(self, name: str) -> bool:
-        """Tell whether a rule says what a topic is called."""
+        """Return whether a remapping for a topic is given."""
         return self._names.is_remapped(name)
 
     def now_ns(self) -> int:
-        """Time of the system, or of /clock."""
+        """Return the time of the system, or of /clock, in nanoseconds."""
         return time_ns() if self._clock is None else self._clock
 
     def log(self, level: str, text: str) -> None:
-        """Log a line, in the form of ROS's log."""
+        """Log a line in ROS's format."""
         seconds, rest = seconds_and_rest(time_ns())
         print(f'[{_LEVELS[level]}] [{seconds}.{rest:09d}] [{self._names.node}]: {text}',
               file=sys.stderr, flush=True)
 
     def advertise(self, topic: str, kind: str) -> Publisher:
-        """Publish on a topic."""
+        """Create a publisher on a topic."""
         return self._graph.advertise(topic, kind)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
-        """Hand the messages on a topic to a callback."""
-        # One at a time, where another may have to wait.
+        """Subscribe to a topic."""
+        # One message at a time if the next one may have to wait.
         return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
                                   batch=100 if ready is None else 1, ready=ready)
 
     def offers(self, topic: str) -> list[Offer]:
-        """Give who publishes a topic."""
+        """Return the publishers of a topic."""
         return self._graph.offers(topic)
 
     def published(self, kind: str) -> list[str]:
-        """Give the topics over which somebody sends messages of a ROS type."""
+        """Return the topics of a ROS type that have a publisher."""
         return self._graph.published(kind)
 
     def follow_frames(self) -> None:
-        """Hear what /tf_static says from now on; frames that move are for tf2, which ROS has."""
+        """Subscribe to /tf_static; moving frames need tf2, which is part of ROS."""
         if not self._follows_frames:
-            # Whoever publishes there latches its newest message.
+            # Publishers of /tf_static latch their newest message.
             self._graph.listen(TOPIC, TYPE, self._frames.add,
                                Profile(depth=_FRAMES_DEPTH, latched=True),
                                garbage=self._note_garbage)
         self._follows_frames = True
 
     def forget_frames(self) -> None:
-        """Stay as it is: /tf_static costs nothing where nothing new is told."""
+        """Do nothing: /tf_static has no traffic once its messages have been received."""
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Give a frame in another (4, 4), or None where /tf_static has not told it."""
+        """Return the pose (4, 4) of frame child in parent, or None if /tf_static lacks it."""
         return self._frames.transform(parent, child)
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
-        """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
+        """Create a std_srvs/srv/Trigger service; action returns the message of the response."""
         self._services.append(TriggerServer(self._graph, self.resolve(name), action,
                                             self._note_garbage))
 
     def spin(self, seconds: float) -> None:
-        """Wait for messages, at most for some time, and hand them out."""
+        """Wait for messages for at most some seconds, and call the callbacks."""
         self._graph.spin(seconds)
-        if monotonic() - self._last_look >= _LOOK_PERIOD:
-            self._last_look = monotonic()
+        if monotonic() - self._last_client_check >= _CLIENT_CHECK_PERIOD:
+            self._last_client_check = monotonic()
             for service in self._services:
-                service.look_for_strangers()
+                service.report_unsupported_clients()
 
     def _take_clock(self, message: Any) -> None:
         self._clock = ns_of_time(message.clock)

@@ -1,4 +1,4 @@
-"""Names of topics and services, resolved and remapped as ROS does for a node."""
+"""Resolution and remapping of topic and service names, as in ROS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 
 from djet_ros.errors import DjetError
 
-# What ROS takes as the name of a node, and of anything.
+# Valid node names, and valid names in remapping rules.
 _TOKEN = r'[A-Za-z_][A-Za-z0-9_]*'
 _NAME = re.compile(rf'(~?/)?{_TOKEN}(/{_TOKEN})*|/')
 
@@ -16,8 +16,8 @@ class Names:
     """
     Resolves the names that one node uses.
 
-    rules: remappings 'from:=to', of which the first that fits counts; __node and __ns name the
-    node and its namespace. Raises DjetError on what is no such rule.
+    rules: remappings 'from:=to', of which the first match applies; __node and __ns set the node
+    name and namespace. Raises DjetError on an invalid rule.
     """
 
     def __init__(self, node: str, rules: Sequence[str] = ()) -> None:
@@ -25,20 +25,20 @@ class Names:
         special = dict(pairs)
         self.node = special.get('__node', node)
         if not re.fullmatch(_TOKEN, self.node):
-            raise DjetError(f"'{self.node}' is no name of a node; give letters, digits and _, as "
-                            'in left_vo, and its namespace by -r __ns:=/NAMESPACE')
+            raise DjetError(f"'{self.node}' is not a valid node name; use letters, digits and _, "
+                            'as in left_vo, and set the namespace with -r __ns:=/NAMESPACE')
         self.namespace = '/' + special.get('__ns', '').strip('/')
-        # What a launch file hands on as it stands says nothing.
+        # Launch files pass on unchanged names, which are no remappings.
         self._rules = [(self.expand(old), self.expand(new)) for old, new in pairs
                        if not old.startswith('__') and old != new]
 
     @property
     def full_node(self) -> str:
-        """Name of the node with its namespace."""
+        """Fully qualified node name."""
         return f'{self.namespace.rstrip("/")}/{self.node}'
 
     def expand(self, name: str) -> str:
-        """Give the full name, without remapping."""
+        """Return the fully qualified name, without remapping."""
         if name.startswith('/'):
             return name
         if name.startswith('~'):
@@ -46,17 +46,17 @@ class Names:
         return f'{self.namespace.rstrip("/")}/{name}'
 
     def resolve(self, name: str) -> str:
-        """Give the full name, remapped."""
+        """Return the fully qualified name, with remapping."""
         full = self.expand(name)
         return next((new for old, new in self._rules if old == full), full)
 
     def is_remapped(self, name: str) -> bool:
-        """Tell whether a rule says what a name stands for, be it what it would be anyway."""
+        """Return whether a rule remaps a name, even to its default."""
         return self.expand(name) in (old for old, _ in self._rules)
 
 
 def _parse(rule: str) -> tuple[str, str]:
     old, mark, new = rule.partition(':=')
     if not (mark and _NAME.fullmatch(old) and _NAME.fullmatch(new)):
-        raise DjetError(f"'{rule}' is no remapping; write it as image:=/camera/image_raw")
+        raise DjetError(f"'{rule}' is not a remapping; use the form image:=/camera/image_raw")
     return old, new

@@ -1,4 +1,4 @@
-"""Plays a recording onto the graph, as fast as it was recorded."""
+"""A bag player: publishes a recording on the graph at its recorded pace."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import MAKE, message_type
 from djet_ros.recordings.recording import Recording
 
-# All that is sent waits for reliable subscriptions; best-effort ones take what they get.
+# Waits for reliable subscriptions, and never for best-effort ones.
 _STREAM = Profile(depth=None)
-# A CameraInfo is also for who comes late.
+# CameraInfo, also for late subscribers.
 _LATCHED = Profile(depth=1, latched=True)
-# So are frames, of which each message has some.
+# Static frames, of which each message has only some.
 _FRAMES = Profile(depth=100, latched=True)
 
-# Seconds between a subscription's appearance here and this publisher's appearance there.
-_SETTLE = 0.5
+# Seconds from the discovery of a subscription here to the discovery of this publisher there.
+_DISCOVERY_TIME = 0.5
 
 
 @dataclass
 class Played:
-    """What was sent; late: seconds by which the last message was behind its time."""
+    """What was published; late: seconds by which the last message was behind schedule."""
 
     images: int = 0
     messages: int = 0
@@ -35,11 +35,11 @@ class Played:
 
 
 class Player:
-    """Publishes the messages of a recording, at rate times their recorded pace."""
+    """Publishes the messages of a recording at rate times its pace; clock: publish /clock."""
 
     def __init__(self, graph: Graph, recording: Recording, names: Names, rate: float = 1.0,
                  clock: bool = False) -> None:
-        """Advertise the images at once; other topics once they have a message."""
+        """Advertise all topics, and publish the static frames."""
         self._graph = graph
         self._recording = recording
         self._names = names
@@ -48,7 +48,7 @@ class Player:
         self._clock = graph.advertise('/clock', 'rosgraph_msgs/msg/Clock') if clock else None
         self.played = Played()
         self._advertise()
-        self._tell_static_frames()
+        self._publish_static_frames()
 
     def _advertise(self) -> None:
         """Advertise all topics before the first message, so that none is lost."""
@@ -65,8 +65,8 @@ class Player:
             if not missing:
                 return
 
-    def _tell_static_frames(self) -> None:
-        """Publish the newest of each static frame at once, and for who comes late."""
+    def _publish_static_frames(self) -> None:
+        """Publish the newest of each static frame, latched."""
         newest = {one.child_frame_id: one for message in self._recording.static_frames()
                   for one in message.transforms}
         if newest:
@@ -75,19 +75,19 @@ class Player:
 
     @property
     def image_topic(self) -> str:
-        """Give the resolved name of the topic of the images."""
+        """Resolved image topic."""
         return self._names.resolve(self._recording.image_topic)
 
     def wait_for_listener(self, stop: Event) -> None:
-        """Wait until somebody subscribes to the images."""
+        """Wait until the images have a subscriber."""
         images = self._publishers[self._recording.image_topic]
         while not images.listeners:
             if stop.wait(0.05):
                 return
-        stop.wait(_SETTLE)
+        stop.wait(_DISCOVERY_TIME)
 
     def play(self, stop: Event) -> None:
-        """Play once, and wait until reliable subscriptions have everything."""
+        """Play once, and wait until reliable subscriptions have received everything."""
         start: float | None = None
         first = 0
         for one in self._recording.messages():

@@ -1,10 +1,10 @@
 """
-ROS's messages as DDS carries them.
+ROS messages on DDS.
 
-The topic /camera/image_raw of type sensor_msgs/msg/Image is on the wire the DDS topic
-rt/camera/image_raw of type sensor_msgs::msg::dds_::Image_, and its samples are plain CDR. rosbags
-reads and writes that CDR, so that messages are the same objects as in a replay; to Cyclone they
-are bytes. Its own reading of a uint8[] goes byte by byte in Python.
+The ROS topic /camera/image_raw of type sensor_msgs/msg/Image is the DDS topic rt/camera/image_raw
+of type sensor_msgs::msg::dds_::Image_, with samples in CDR. rosbags (de)serialises them, so that
+messages are the same objects as in a replay; to Cyclone they are bytes, as its own reading of
+uint8[] is byte by byte in Python.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from djet_ros.recordings.decoding import jazzy
 @cache
 def sample_type(dds_name: str) -> Any:
     """
-    Make the class of samples of a DDS type: ``data`` is CDR with its encapsulation header.
+    Return the sample class of a DDS type; ``data`` is CDR with its encapsulation header.
 
-    Cyclone checks samples against the type that it is told. It is told of a single octet, which
-    all samples begin with: whether the rest is right is for rosbags to judge, which can tell.
+    Cyclone validates samples against their declared type. The type is declared as a single octet,
+    which every sample has, and rosbags validates the rest.
     """
     class Sample(IdlStruct, typename=dds_name):  # type: ignore[call-arg]
         octet: uint8
@@ -39,27 +39,28 @@ def sample_type(dds_name: str) -> Any:
         def deserialize(cls, data: bytes, **_: Any) -> Self:
             return cls(data)
 
-        # What comes where a publisher has gone; ROS's topics have no keys.
+        # Called when a publisher is disposed; ROS topics have no keys.
         deserialize_key = deserialize
 
     return Sample
 
 
 def dds_type_name(ros_name: str) -> str:
-    """Give the DDS type name of a ROS type such as 'sensor_msgs/msg/Image'."""
+    """Return the DDS type name of a ROS type such as 'sensor_msgs/msg/Image'."""
     package, kind, name = ros_name.split('/')
     return f'{package}::{kind}::dds_::{name}_'
 
 
 def encode(message: Any) -> bytes:
-    """Write a message of rosbags as CDR."""
+    """Serialise a rosbags message to CDR."""
     return bytes(jazzy().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, ros_name: str) -> Any:
-    """Read CDR as a message of rosbags; DjetError where it is none."""
-    # rosbags reads by generated code, which fails on rubbish in as many ways as there are types.
+    """Deserialise CDR to a rosbags message; DjetError if it is not one."""
+    # The generated code of rosbags raises exceptions of any kind on invalid data.
     try:
         return jazzy().deserialize_cdr(data, ros_name)
     except Exception as error:
-        raise DjetError(f'{len(data)} bytes are no {ros_name}: {one_line(error)[:120]}') from error
+        raise DjetError(f'{len(data)} bytes are not a valid {ros_name}: '
+                        f'{one_line(error)[:120]}') from error

@@ -1,1 +1,1 @@
-"""What both live faces share, without ROS or DDS: sessions, their queue, topics, wiring."""
+"""The live nodes without their middleware: sessions, image queue, topics, QoS."""

@@ -1,4 +1,4 @@
-"""The wiring of a live node, whatever carries its messages."""
+"""The part common to all live nodes: topics, QoS checks and the main loop, on any middleware."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 from djet_ros.odometry.messages import seconds_and_rest
 from djet_ros.odometry.tracker import Outgoing
 
-_TICK = 1.0
+# Seconds between two calls of the periodic checks.
+_TICK_PERIOD = 1.0
 
-# Seconds to wait for messages at most: with room for images, and until there is.
-_PAUSE, _MOMENT = 0.1, 0.005
+# Longest wait for messages in seconds: normally, and while the image queue is full.
+_SPIN_TIMEOUT, _FULL_QUEUE_SPIN_TIMEOUT = 0.1, 0.005
 
 _IMAGE = IMAGE_TYPES['raw']
 
 
 class LiveSession(Protocol):
-    """What a node has its work done by, in a thread of its own."""
+    """The worker of a node, which processes messages in its own thread."""
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start the worker thread."""
 
     def stop(self) -> None:
-        """Publish nothing more."""
+        """Stop publishing."""
 
     @property
     def failed(self) -> bool:
-        """Whether the work ended by an error."""
+        """Whether the worker thread ended with an error."""
 
     def tick(self) -> None:
-        """Say what no message makes it say; called once a second."""
+        """Log and publish what is due without a message; called once a second."""
 
     @property
     def wants_frames(self) -> bool:
-        """Whether tf is still to be asked how anything is mounted."""
+        """Whether a mounting still has to be looked up on tf."""
 
     @property
     def has_room(self) -> bool:
-        """Whether an image would be taken at once."""
+        """Whether the queue accepts an image."""
 
     def image(self, message: Any) -> None:
         """Take an Image or a CompressedImage."""
@@ -54,16 +55,16 @@ class LiveSession(Protocol):
         """Take a CameraInfo."""
 
     def count_lost(self, number: int) -> None:
-        """Count images that were sent and never came."""
+        """Count images that were sent and did not arrive."""
 
 
 class Face:
-    """A node around a session, to which it is the wiring: it publishes from its thread."""
+    """Base class of the live nodes: connects a session with the middleware."""
 
-    # To be made by a subclass, before it listens.
+    # Set by the subclass, before it subscribes.
     session: LiveSession
 
-    # To be had by ``listen_to_camera``, before it runs.
+    # Set by ``listen_to_camera``, before ``run``.
     _info_topic: str
     _images: Subscription
 
@@ -71,102 +72,104 @@ class Face:
         self._middleware = middleware
         self._outputs: dict[str, Publisher] = {}
         self._inputs: list[Subscription] = []
-        # ROS types of what is heard, by topic.
+        # ROS types of the subscriptions, by topic.
         self._kinds: dict[str, str] = {}
         self._refused: list[Subscription] = []
-        # Topics whose quality of service is as our parameters say.
+        # Topics whose QoS is that of the parameters.
         self._as_configured: set[str] = set()
         self._latched = self._follows_frames = False
         self._remedy = 'ros.qos_reliability to best_effort'
         self._last_tick = -float('inf')
 
     def run(self, stop: Event) -> int:
-        """Work until stop is set; 1 where the work ended by an error."""
+        """Run until stop is set; return the exit code, 1 if the session failed."""
         self.session.start()
         try:
             while not stop.is_set():
-                # Nothing wakes it up where an image has been worked on, and others wait for room.
-                self._middleware.spin(_PAUSE if self._takes_images() else _MOMENT)
+                # While the image queue is full, nothing signals that it has room again.
+                self._middleware.spin(_SPIN_TIMEOUT if self._takes_images()
+                                      else _FULL_QUEUE_SPIN_TIMEOUT)
                 if self.session.failed:
                     return 1
-                if monotonic() - self._last_tick >= _TICK:
+                if monotonic() - self._last_tick >= _TICK_PERIOD:
                     self._last_tick = monotonic()
                     self._tick()
             return 0
         finally:
             self.session.stop()
 
-    # What a session asks for
+    # What a session needs (Wiring)
 
     def publish(self, outgoing: Sequence[Outgoing]) -> None:
-        """Publish messages; diagnostics are of now, all others of their image's time."""
+        """Publish messages; diagnostics are stamped now, all others as their image."""
         for topic, message in outgoing:
             if topic == '/diagnostics':
                 stamp = message.header.stamp
                 stamp.sec, stamp.nanosec = seconds_and_rest(self._middleware.now_ns())
             if not self._outputs[topic].publish(message):
-                self.log('warning', f'a message on {topic} was not sent: a subscription does not '
-                                    'keep up')
+                self.log('warning', f'a message on {topic} was dropped: a subscriber does not '
+                                    'keep up; have it subscribe with best_effort')
 
     def log(self, level: str, text: str) -> None:
         """Log a line."""
         self._middleware.log(level, text)
 
     def why_silent(self, topic: str) -> str:
-        """Say what is seen of a topic over which nothing comes, and what may help."""
+        """Return why no messages may be arriving on a topic, and what to do about it."""
         wanted = self._kinds[topic]
         offers = self._middleware.offers(topic)
         if kinds := {offer.kind for offer in offers} - {wanted}:
-            return f'it is published as {", ".join(sorted(kinds))}, and not as {wanted}' + (
+            return f'its type is {", ".join(sorted(kinds))}, not {wanted}' + (
                 _transport_remedy(kinds))
         if offers:
-            return f'{len(offers)} publish it, none sends{self._loss_remedy(topic, offers)}'
+            return (f'{len(offers)} publisher{"s" if len(offers) > 1 else ""}, but no messages '
+                    f'arrive{self._loss_remedy(topic, offers)}')
         if _IMAGE in (wanted, *kinds) and self._middleware.offers(f'{topic}/compressed'):
-            return (f'nobody publishes it, but {topic}/compressed; set '
+            return (f'it has no publisher, but {topic}/compressed has; set '
                     'ros.image_transport:=compressed')
         own = {self._middleware.resolve(full_name(output)) for output in self._outputs}
-        # What an odometry draws for people is no camera.
+        # The debug image of another odometry is not a camera.
         elsewhere = sorted(name for name in set(self._middleware.published(wanted)).difference(
             self._kinds, own) if not name.endswith('/debug_image'))
         near = get_close_matches(topic, elsewhere, n=1, cutoff=0.0)
         if not near:
-            return 'nobody publishes it'
-        # By the image's name alone only compressed images with the usual ending can be had.
+            return 'it has no publisher'
+        # Remapping image alone works only for compressed topics that end in /compressed.
         how = ('' if wanted != IMAGE_TYPES['compressed'] or near[0].endswith('/compressed')
                else f' remap {topic}:={near[0]}')
-        return f'nobody publishes it; did you mean {near[0]}?{how}'
+        return f'it has no publisher; did you mean {near[0]}?{how}'
 
     def _loss_remedy(self, topic: str, offers: Sequence[Offer]) -> str:
-        """Say what helps images that do not come whole, of which middlewares tell nothing."""
+        """Return the remedy for large images that lose fragments, which no event reports."""
         images = self._images
         if topic != images.topic or images.profile.reliable:
             return ''
         reliable = all(offer.profile.reliable for offer in offers)
-        return (', or its images are too large to come whole by best effort: '
+        return ('; large images may be lost with best-effort QoS: '
                 + 'set ros.qos_reliability to reliable, or ' * reliable
-                + 'give the middleware larger socket buffers')
+                + 'increase the socket buffers of the middleware')
 
     def wants(self, topic: str) -> bool:
-        """Tell whether anybody subscribes to an output."""
+        """Return whether an output has subscribers."""
         output = self._outputs.get(topic)
         return output is not None and bool(output.listeners)
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Give a frame in another (4, 4), or None where tf does not know it yet."""
+        """Return the pose (4, 4) of frame child in parent, or None if tf does not have it yet."""
         return self._middleware.transform(parent, child)
 
     # Inputs and outputs
 
     def image_topics(self, config: NodeConfig) -> tuple[str, str]:
-        """Resolve the names of the images and of their CameraInfo."""
+        """Return the resolved topics of the images and of their CameraInfo."""
         if config.queue_policy == 'every':
-            # It subscribes reliably, whatever the other one says.
+            # It subscribes reliably, whatever ros.qos_reliability is.
             self._remedy = 'ros.queue_policy to latest'
         return image_topics(self._middleware.resolve, self._middleware.is_remapped,
                             config.image_transport)
 
     def advertise(self, outputs: Mapping[str, str]) -> None:
-        """Make the publishers of topics with their types that are not there yet."""
+        """Create publishers for the topics, given with their types, that have none yet."""
         for topic in outputs.keys() - self._outputs.keys():
             self._outputs[topic] = self._middleware.advertise(
                 self._middleware.resolve(full_name(topic)), outputs[topic])
@@ -175,9 +178,9 @@ class Face:
                profile: Profile, ready: Callable[[], bool] | None = None, *,
                as_configured: bool = True) -> Subscription:
         """
-        Subscribe to a resolved topic; a publisher that does not fit is reported.
+        Subscribe to a resolved topic; publishers with incompatible QoS are reported.
 
-        as_configured: whether its profile is that of ``input_profile``, which a parameter mends.
+        as_configured: whether the profile is that of ``input_profile``, which parameters set.
         """
         self._kinds[topic] = kind
         if as_configured:
@@ -186,20 +189,20 @@ class Face:
         return self._inputs[-1]
 
     def listen_to_camera(self, image: str, info: str, transport: str, profile: Profile) -> None:
-        """Subscribe to images and their CameraInfo, which may be latched; the last inputs."""
+        """Subscribe to images and their CameraInfo; to be called after all other subscriptions."""
         self._info_topic = info
-        # CameraInfo first: of two that wait, it is to be taken before its image; and none that
-        # belongs to an image that has to wait. What comes beside them must not wait.
+        # CameraInfo first, so that it is taken before an image that arrived together with it.
+        # Both wait while the image queue is full; other inputs never do.
         self.listen(info, INFO_TYPE, self.session.camera_info, profile, self._takes_images)
         self._images = self.listen(image, IMAGE_TYPES[transport], self.session.image, profile,
                                    self._takes_images)
 
     def _takes_images(self) -> bool:
-        """Tell whether images are to come now: always, where none waits without being lost."""
+        """Return whether to take images now: always, if publishers cannot be made to wait."""
         return not self._middleware.senders_wait or self.session.has_room
 
     def follow_frames_while_wanted(self) -> None:
-        """Hear tf until what is asked of it is known: all that robots send there costs time."""
+        """Subscribe to tf only while a mounting is unknown: a robot's tf traffic costs time."""
         wanted = self.session.wants_frames
         if wanted == self._follows_frames:
             return
@@ -214,7 +217,7 @@ class Face:
     def _tick(self) -> None:
         self.follow_frames_while_wanted()
         self.session.count_lost(self._images.new_losses())
-        # Who publishes is known by name a little after it is refused.
+        # Report on the next tick: the name of a publisher is known a little later than its QoS.
         refused = [one for one in self._inputs if one.new_refusals()]
         for subscription in self._refused:
             self._report_mismatch(subscription)
@@ -223,8 +226,8 @@ class Face:
         self.session.tick()
 
     def _listen_for_latched(self) -> None:
-        """Hear a CameraInfo that was sent before this node was there, where it was latched."""
-        # To ask everybody for it would keep those away that do not latch.
+        """Subscribe to a latched CameraInfo, which may have been sent before this node started."""
+        # Requesting transient_local always would be incompatible with volatile publishers.
         if self._latched:
             return
         for _, _, offered in self._middleware.offers(self._info_topic):
@@ -239,26 +242,26 @@ class Face:
         for who, _, offered in self._middleware.offers(topic):
             if ours.incompatible_with(offered):
                 self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
-                         f'{self._middleware.node} asks for {ours}. Nothing is received from it; '
-                         + self._qos_remedy(topic, ours))
+                         f'{self._middleware.node} requests {ours}; no messages are received from '
+                         f'it; {self._qos_remedy(topic, ours)}')
 
     def _qos_remedy(self, topic: str, ours: Profile) -> str:
         overrides = self._middleware.qos_remedy.format(topic=topic)
         if topic in self._as_configured:
             return ' or '.join(filter(None, [f'set {self._remedy}', overrides]))
-        # What is latched is asked for as it is offered, whatever overrides say.
-        return f'have it offer {ours}' + (
+        # Overrides do not apply to latched subscriptions.
+        return f'configure the publisher to offer {ours}' + (
             f', or set {overrides}' if overrides and not ours.latched else '')
 
 
 def _transport_remedy(kinds: Collection[str]) -> str:
-    """Name the parameter by which images are heard that come in another transport."""
+    """Return the parameter to set for images of another transport, if it is one."""
     found = [transport for transport, kind in IMAGE_TYPES.items() if kind in kinds]
     return f'; set ros.image_transport:={found[0]}' if found else ''
 
 
 def input_profile(config: NodeConfig) -> Profile:
-    """Profile of the inputs; to lose nothing takes a sender that repeats, and one that waits."""
+    """Return the QoS of the inputs; queue_policy 'every' needs reliable and keep-all."""
     every = config.queue_policy == 'every'
     return Profile(reliable=every or config.qos_reliability == 'reliable',
                    depth=None if every else config.qos_depth)

@@ -1,4 +1,4 @@
-"""A bounded queue between the thread that receives frames and the one that works on them."""
+"""A bounded queue between the thread that receives frames and the one that processes them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ Item = TypeVar('Item')
 
 class FrameQueue(Generic[Item]):
     """
-    First in, first out, for any number of threads; whoever puts something in never waits.
+    Thread-safe FIFO queue; ``put`` never blocks.
 
-    Policy 'latest': where ``size`` items wait already, the oldest is dropped and counted.
-    Policy 'every': all wait, however many.
-    Where those that wait weigh ``room`` or more, one is dropped and counted with either policy:
-    the oldest with 'latest', with 'every' the one that comes.
+    Policy 'latest': if ``size`` items are queued, the oldest is dropped and counted.
+    Policy 'every': the number of items is not limited.
+    If the queued items weigh ``room`` or more, one is dropped and counted with either policy: the
+    oldest with 'latest', the new one with 'every'.
     """
 
     def __init__(self, policy: str, size: int, room: float = inf) -> None:
-        """Make an empty queue; ValueError for an unknown policy or a size below one."""
+        """Create an empty queue; ValueError for an unknown policy or a size below one."""
         if policy not in ('latest', 'every') or size < 1:
             raise ValueError(f"queue policy '{policy}' with size {size}; it must be latest or "
                              'every, with at least 1')
@@ -36,12 +36,12 @@ class FrameQueue(Generic[Item]):
 
     @property
     def dropped(self) -> int:
-        """Count the items dropped so far to make room."""
+        """Number of items dropped so far."""
         with self._changed:
             return self._dropped
 
     def put(self, item: Item, weight: float = 0.0) -> bool:
-        """Append an item of some weight; False where the queue is closed or does not take it."""
+        """Append an item with a weight; return False if it is dropped or the queue is closed."""
         with self._changed:
             if self._closed:
                 return False
@@ -57,7 +57,7 @@ class FrameQueue(Generic[Item]):
             return True
 
     def get(self, timeout: float | None = None) -> Item | None:
-        """Take the oldest item, waiting for one; None after timeout, or if closed and empty."""
+        """Remove and return the oldest item; None after timeout, or if closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._closed, timeout)
             if not self._items:
@@ -65,37 +65,37 @@ class FrameQueue(Generic[Item]):
             return self._pop()
 
     def peek(self, timeout: float = 0.0) -> Item | None:
-        """Give the oldest item without taking it; None where none comes in time, or if closed."""
+        """Return the oldest item without removing it; None after timeout, or if closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._closed, timeout)
             return self._items[0][0] if self._items else None
 
     @property
     def has_room(self) -> bool:
-        """Whether an item would be taken now; with policy 'latest' any is."""
+        """Whether ``put`` would keep a new item; always with policy 'latest'."""
         with self._changed:
             return self._drops or self._closed or self._weight < self._room
 
     @property
     def weight(self) -> float:
-        """Weigh the items that wait."""
+        """Total weight of the queued items."""
         with self._changed:
             return self._weight
 
     def clear(self) -> None:
-        """Throw away what waits."""
+        """Remove all items."""
         with self._changed:
             self._items.clear()
             self._weight = 0.0
 
     def close(self) -> None:
-        """Take no more items and wake up who waits; what waits in the queue can still be got."""
+        """Accept no more items and wake up waiting threads; queued items can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def __len__(self) -> int:
-        """Count the items that wait."""
+        """Return the number of queued items."""
         with self._changed:
             return len(self._items)
 

@@ -1,4 +1,4 @@
-"""The pose graph as a live node: its topics and its service, whatever carries them."""
+"""The live pose graph node: its topics and service, on any middleware."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from djet_ros.live.topics import BESIDE_TYPES, graph_input_type, GRAPH_INPUTS, g
 from djet_ros.posegraph.live_slam import LiveSlam
 from djet_ros.recordings.mask_files import still_mask
 
-# Messages that the middleware keeps while Python is in a long optimisation.
+# History depth of the odometry's topics, for long optimisations.
 _DEPTH = 1000
 
 
 class GraphFace(Face):
-    """The live SLAM on a graph."""
+    """The live pose graph on a middleware."""
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
         super().__init__(middleware)

@@ -1,7 +1,7 @@
 """
-A pose graph at work on a live odometry: its queue, its thread, and what happens around them.
+The pose graph on a live odometry: message queue, worker thread, service, log and diagnostics.
 
-As with the odometry's session, the wiring alone is left to the faces.
+Like the odometry's session it is independent of the middleware, which live nodes add.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from time import monotonic, time_ns
 from typing import Any, NamedTuple
 
 from djet_ros.live.frame_queue import FrameQueue
-from djet_ros.live.session import Latencies, SILENCE, Throttle, Wiring
+from djet_ros.live.session import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.live_slam import LiveSlam
 import numpy as np
 
-# Messages of the odometry that may wait while a graph is optimised.
+# Messages of the odometry that may be queued while a graph is optimised.
 _WAITING = 1000
 
 
 class _Task(NamedTuple):
-    """What is to be done with the graph, in its thread, and since when (monotonic seconds)."""
+    """A task for the worker thread, and the time of its arrival (monotonic seconds)."""
 
     do: Callable[[], list[Outgoing]]
     since: float
@@ -31,10 +31,10 @@ class _Task(NamedTuple):
 
 class GraphSession:
     """
-    Works on the odometry's messages in a thread of its own, and on loops while none waits.
+    Processes the odometry's messages in a worker thread, and loops while none is queued.
 
     topics: resolved names of 'odometry', 'relative_pose_cov', 'relative_pose_status', 'image' and
-    'camera_info', for people. Everything may be called from any one thread; nothing of it waits.
+    'camera_info', for log messages. All methods are called from one thread and never block it.
     """
 
     def __init__(self, slam: LiveSlam, wiring: Wiring, topics: Mapping[str, str]) -> None:
@@ -43,7 +43,7 @@ class GraphSession:
         self._topics = topics
         self._log = Throttle(wiring)
         self._queue: FrameQueue[_Task] = FrameQueue('latest', _WAITING)
-        # Taken by the thread before anything else: what waits here costs it nothing.
+        # The worker thread takes these before each task.
         self._images: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._masks: deque[Any] = deque(maxlen=slam.slam.image_buffer)
         self._infos: deque[Any] = deque(maxlen=1)
@@ -54,12 +54,12 @@ class GraphSession:
         self._worker = Thread(target=self._work, name='pose_graph', daemon=True)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start the worker thread."""
         self._heard = dict.fromkeys(self._topics, monotonic())
         self._worker.start()
 
     def stop(self, timeout: float = 0.5) -> None:
-        """Publish nothing more, and wait up to timeout seconds for what is in work."""
+        """Stop publishing, and wait up to timeout seconds for the current task."""
         self._stopping = True
         self._queue.close()
         if self._worker.is_alive():
@@ -67,14 +67,14 @@ class GraphSession:
 
     @property
     def failed(self) -> bool:
-        """Whether the work ended by an error; Python has printed its traceback."""
+        """Whether the worker thread ended with an error; Python has printed its traceback."""
         return not (self._worker.is_alive() or self._stopping)
 
-    # What comes in
+    # Inputs
 
     @property
     def has_room(self) -> bool:
-        """Whether an image would be taken at once, as all are."""
+        """Whether the queue accepts an image: always."""
         return True
 
     def odometry(self, message: Any) -> None:
@@ -84,11 +84,11 @@ class GraphSession:
     def relative_pose(self, message: Any) -> None:
         """Take a PoseWithCovarianceStamped."""
         self._take('relative_pose_cov', lambda: self._slam.relative_pose(message))
-        # There is none while the odometry is lost, and its other topics tell of that.
+        # There is none while the odometry is lost: do not report it as missing.
         self._heard['relative_pose_cov'] = np.inf
 
     def relative_pose_status(self, message: Any) -> None:
-        """Take the DiagnosticArray that says of a frame what its poses do not."""
+        """Take the DiagnosticArray with the status of a frame."""
         self._take('relative_pose_status', lambda: self._slam.relative_pose_status(message))
 
     def image(self, message: Any) -> None:
@@ -106,42 +106,42 @@ class GraphSession:
         self._infos.append(message)
 
     def count_lost(self, number: int) -> None:
-        """Count images that were sent and never came."""
+        """Count images that were sent and did not arrive."""
         self._lost += number
 
     def reset(self) -> str:
-        """Forget the map and what waits, as soon as what is in work is done; says so."""
+        """Discard the map and queued messages after the current task; return a report."""
         self._queue.clear()
         self._images.clear()
         self._put(self._forget)
-        text = 'reset: the map is forgotten; a new one begins at the next frame'
+        text = 'reset: map discarded; a new map starts at the next frame'
         self._wiring.log('info', text)
         return text
 
     @property
     def wants_frames(self) -> bool:
-        """Whether tf is still to be asked where the camera is on base_frame."""
+        """Whether the mounting of the camera on base_frame still has to be looked up on tf."""
         return not self._slam.mounted
 
     def tick(self) -> None:
-        """Say what no message makes the graph say; to be called about once a second."""
-        silent = monotonic() - self._heard['odometry'] > SILENCE
+        """Log missing inputs, and optimise while the odometry is silent; about once a second."""
+        silent = monotonic() - self._heard['odometry'] > SILENCE_TIMEOUT
         for what in self._topics:
-            if monotonic() - self._heard[what] > SILENCE:
-                self._log.warn_of_missing(what, self._topics[what])
+            if monotonic() - self._heard[what] > SILENCE_TIMEOUT:
+                self._log.warn_missing(what, self._topics[what])
         if silent and not len(self._queue):
             self._put(self._settle)
 
-    # In the thread
+    # In the worker thread
 
     def _take(self, what: str, do: Callable[[], list[Outgoing]]) -> None:
         self._heard[what] = monotonic()
         self._put(lambda: do() if self._mounted() else [])
 
     def _mounted(self) -> bool:
-        """Tell whether the mounting of the camera is known, where one is needed."""
+        """Return whether the mounting of the camera is known, or not needed."""
         if not self._slam.mounted and (missing := self._slam.mount(self._wiring.transform)):
-            self._log.warn('mounting', f'{missing}; until then the odometry is not used')
+            self._log.warn('mounting', f'{missing}; until then the odometry is ignored')
         return self._slam.mounted
 
     def _put(self, do: Callable[[], list[Outgoing]]) -> None:
@@ -155,7 +155,7 @@ class GraphSession:
                 self._publish(self._slam.work())
                 self._log_loops()
                 continue
-            self._slam.face_values = self._face_values()
+            self._slam.face_values = self._node_values()
             self._publish(task.do())
             self._latencies.add(task.since)
             if self._slam.problem is not None:
@@ -164,8 +164,8 @@ class GraphSession:
     def _log_loops(self) -> None:
         loops = self._slam.map.count('loop')
         if loops > self._loops:
-            self._wiring.log('info', f'loops closed: {loops - self._loops} more, {loops} in all, '
-                             f'among {len(self._slam.map.keyframes)} keyframes')
+            self._wiring.log('info', f'loops closed: {loops - self._loops} new, {loops} in total, '
+                             f'with {len(self._slam.map.keyframes)} keyframes')
         self._loops = loops
 
     def _take_images(self) -> None:
@@ -182,10 +182,10 @@ class GraphSession:
         return [self._slam.diagnostics(time_ns())]
 
     def _settle(self) -> list[Outgoing]:
-        """Use the silence: optimise what is left to optimise."""
+        """Optimise at once, as no messages are waiting."""
         return [*self._slam.work(at_once=True), self._slam.diagnostics(time_ns())]
 
-    def _face_values(self) -> dict[str, str]:
+    def _node_values(self) -> dict[str, str]:
         return {'messages dropped': str(self._queue.dropped),
                 'images lost on the way': str(self._lost), **self._latencies.values()}
 

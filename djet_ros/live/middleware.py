@@ -1,4 +1,4 @@
-"""What a live node asks of its middleware; ROS 2 and plain DDS each answer in their own way."""
+"""The interface of a live node to its middleware, implemented for ROS 2 and for plain DDS."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from djet_ros.odometry.messages import MessageType
 @dataclass(frozen=True)
 class Profile:
     """
-    Quality of service; depth None keeps what comes until it is taken.
+    A QoS profile; depth None is history keep-all.
 
-    Where it is not taken, that makes reliable publishers wait which keep all, too, or it loses
-    the oldest: see ``Middleware.senders_wait``.
+    If messages are not taken, keep-all blocks reliable keep-all publishers, or loses the oldest:
+    see ``Middleware.senders_wait``.
     """
 
     reliable: bool = True
@@ -24,12 +24,12 @@ class Profile:
     latched: bool = False
 
     def __str__(self) -> str:
-        """Say it in ROS's words."""
+        """Return the profile in ROS's terms."""
         return (f'{"reliable" if self.reliable else "best_effort"}, '
                 f'{"transient_local" if self.latched else "volatile"}')
 
     def incompatible_with(self, offered: Profile) -> bool:
-        """Tell whether a subscription of this profile refuses a publisher."""
+        """Return whether a subscription with this profile is incompatible with a publisher."""
         return self.reliable > offered.reliable or self.latched > offered.latched
 
 
@@ -37,7 +37,7 @@ DEFAULT_PROFILE = Profile()
 
 
 class Offer(NamedTuple):
-    """A publisher of a topic: who it is, for people, its ROS type and its quality of service."""
+    """A publisher of a topic: its name for log messages, its ROS type and its QoS."""
 
     who: str
     kind: str
@@ -45,90 +45,90 @@ class Offer(NamedTuple):
 
 
 class Publisher(Protocol):
-    """Sends messages of one topic; may be used from any thread."""
+    """Publishes on one topic; may be used from any thread."""
 
     def publish(self, message: Any) -> bool:
-        """Send a message; False where the subscriptions left no room for it."""
+        """Publish a message; return False if a subscription has no room for it."""
 
     @property
     def listeners(self) -> int:
-        """Count the subscriptions."""
+        """Number of subscriptions."""
 
 
 class Subscription(Protocol):
-    """Hears one topic; profile is what it asks for, after overrides by the user."""
+    """A subscription to one topic."""
 
     topic: str
 
     @property
     def profile(self) -> Profile:
-        """Give the quality of service that it asks for."""
+        """Requested QoS, after overrides by the user."""
 
     def new_losses(self) -> int:
-        """Count the messages that were lost on the way since the last call."""
+        """Return the number of messages lost in transport since the last call."""
 
     def new_refusals(self) -> int:
-        """Count the publishers that turned up since the last call and do not fit."""
+        """Return the number of publishers with incompatible QoS since the last call."""
 
 
 class Middleware(Protocol):
-    """The graph as one node sees it. Callbacks come from the thread that calls ``spin``."""
+    """The ROS graph as seen by one node. Callbacks run in the thread that calls ``spin``."""
 
-    # What else can be set where a publisher's quality of service does not fit; {topic} in it.
+    # Parameters, with {topic}, that override the QoS of a topic; '' if there are none.
     qos_remedy: str
 
-    # Whether publishers can be made to wait for a subscription that does not take messages.
+    # Whether reliable publishers block while a subscription does not take messages.
     senders_wait: bool
 
     @property
     def node(self) -> str:
-        """Give the name of the node with its namespace, as in '/left/vo_node'."""
+        """Fully qualified node name, such as '/left/vo_node'."""
 
     @property
     def message_type(self) -> MessageType:
-        """Give the class of messages by the name of its type."""
+        """Function from a type name to the message class."""
 
     def resolve(self, name: str) -> str:
-        """Give the full name of a topic or service, remapped."""
+        """Return the fully qualified name of a topic or service, with remappings."""
 
     def is_remapped(self, name: str) -> bool:
-        """Tell whether a rule says what a topic is called, be it as it would be anyway."""
+        """Return whether a remapping for a topic is given, even one to its default name."""
 
     def now_ns(self) -> int:
-        """Time for stamps, in nanoseconds; simulated where the user asked for it."""
+        """Return the time for stamps in nanoseconds; simulated with use_sim_time."""
 
     def log(self, level: str, text: str) -> None:
         """Log a line; level is 'info', 'warning' or 'error'."""
 
     def advertise(self, topic: str, kind: str) -> Publisher:
-        """Publish messages of a ROS type on a topic, by its resolved name."""
+        """Create a publisher of a ROS type on a topic, by its resolved name."""
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
         """
-        Hand the messages on a topic, by its resolved name, to a callback.
+        Subscribe to a topic, by its resolved name.
 
-        ready: asked before each message; while it says no, messages wait in the middleware, and
-        those of other topics go on. Only to be asked where senders wait.
+        ready: called before each message; while it returns False, messages of this topic stay in
+        the middleware, and other topics continue. Used only if ``senders_wait``.
         """
 
     def offers(self, topic: str) -> Sequence[Offer]:
-        """Give who publishes a topic, by its resolved name."""
+        """Return the publishers of a topic, by its resolved name."""
 
     def published(self, kind: str) -> Sequence[str]:
-        """Give the topics over which somebody sends messages of a ROS type."""
+        """Return the topics of a ROS type that have a publisher."""
 
     def follow_frames(self) -> None:
-        """Hear what tf says from now on."""
+        """Subscribe to tf."""
 
     def forget_frames(self) -> None:
-        """Hear no more of it, until it is asked for again."""
+        """Unsubscribe from tf."""
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Give a frame in another (4, 4), or None where tf does not know it."""
+        """Return the pose (4, 4) of frame child in parent, or None if tf does not have it."""
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
-        """Serve std_srvs/srv/Trigger: an action that succeeds and says what it did."""
+        """Create a std_srvs/srv/Trigger service; action returns the message of the response."""
 
     def spin(self, seconds: float) -> None:
-        """Wait for messages, at most for some time, and hand them out."""
+        """Wait for messages for at most some seconds, and call the callbacks."""

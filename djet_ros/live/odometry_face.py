@@ -1,4 +1,4 @@
-"""The odometry as a live node: its topics and services, whatever carries them."""
+"""The live odometry node: its topics and services, on any middleware."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.mask_files import still_mask
 
-# Messages beside the images that the middleware keeps while Python does not get to run: seconds of
-# the fastest IMU. Masks are as large as images, and as many.
+# History depths for the time in which Python does not get to run: of imu, guess and tf (seconds of
+# the fastest IMU), and of masks, which are as large and as frequent as images.
 _DEPTH, _MASKS_DEPTH = 2000, 100
 
-# Those of /tf_static, of which each robot_state_publisher has one.
+# History depth of /tf_static: one message for each robot_state_publisher.
 _FRAMES_DEPTH = 100
 
 
 class OdometryFace(Face):
     """
-    The odometry on a graph.
+    The live odometry on a middleware.
 
-    Raises DjetError where the configuration asks for what a live graph does not have.
+    Raises DjetError if the configuration needs what only a recording has.
     """
 
     def __init__(self, middleware: Middleware, config: Config) -> None:
@@ -49,11 +49,11 @@ class OdometryFace(Face):
                          f'{config.ros.queue_policy}')
 
     def configure(self, config: Config) -> None:
-        """Take other parameters, which it is connected for, from the next image on."""
+        """Change parameters from the next image on; ``connect`` must have accepted them."""
         self.session.configure(config)
 
     def connect(self, config: Config) -> None:
-        """Make what a configuration asks for of publishers and subscriptions; may be refused."""
+        """Create the publishers and subscriptions of a configuration; may raise DjetError."""
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
         wanted = {'imu': odometry.imu, 'mask': odometry.mask,

@@ -1,4 +1,4 @@
-"""What a live node makes of its parameters, before ROS or a command line declares them."""
+"""Which parameters a live node has, and how it restricts their values."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from djet_ros.config.flat import FlatParameter, section, with_values
 from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.errors import DjetError
 
-# What a subscription or the queue was made with holds for its life; and nobody who knows the odom
-# frame could follow it to other names or axes. A mask is read once.
+# Read-only parameters: those of subscriptions and the queue, the frames and axes of published
+# poses, on which other nodes rely, and the mask file, which is read once.
 FIXED = ('ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
          'ros.queue_size', 'odometry.frame_convention', 'odometry.camera_frame',
          'odometry.odom_frame', 'odometry.base_frame', 'odometry.mask_file')
 
-# Of the odometry's parameters, those that a pose graph goes by too, beside the estimator's.
+# Parameters of the odometry that the pose graph node also uses, besides estimator.*.
 SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
           'odometry.residual_k1', 'odometry.gray_range', 'odometry.frame_convention',
           'odometry.camera_frame', 'odometry.base_frame', 'odometry.mask', 'odometry.mask_file',
           'ros.image_transport', 'ros.qos_reliability', 'ros.queue_policy')
 
-# What the odometry goes by; what belongs to another node is no unknown name.
+# Parameters of the odometry node.
 ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')
                      for item in section(Config(), part))
 
 
 def why_frames(config: OdometryConfig) -> str:
-    """Say what asks tf how something is mounted; nothing where nothing does."""
+    """Return which setting needs a mounting from tf, or '' if none does."""
     if config.base_frame:
         return f'odometry.base_frame is {config.base_frame}'
     if config.imu and config.imu_quaternion() is None:
@@ -37,20 +37,20 @@ def why_frames(config: OdometryConfig) -> str:
     return ''
 
 
-# Values that only a recording has, by parameter.
+# Choices that are available only for recordings, by parameter.
 _OFFLINE = {'odometry.scale': 'ground_truth'}
 
 
 def live_choices(item: FlatParameter) -> tuple[str, ...]:
-    """Give the values to choose from on a live graph; none where there is nothing to choose."""
+    """Return the choices of a parameter on a live graph; empty if it has none."""
     return tuple(one for one in item.description.choices if one != _OFFLINE.get(item.name))
 
 
 def with_live_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """Give the configuration with values changed as ``with_values`` does, for a live graph."""
+    """Return the configuration with values changed as by ``with_values``, for a live graph."""
     for item in section(config, 'odometry'):
         offered, value = live_choices(item), values.get(item.name)
         if offered and isinstance(value, str) and value not in offered:
-            why = ', which only a recording has' if value == _OFFLINE.get(item.name) else ''
+            why = ', which is available offline only' if value == _OFFLINE.get(item.name) else ''
             raise DjetError(f"{item.name} is '{value}'{why}; choose from {', '.join(offered)}")
     return with_values(config, values)

@@ -1,4 +1,4 @@
-"""Fewer images than come, chosen by their stamps alone: the same images, the same choice."""
+"""Rate limit of the images, by their stamps alone, so that it is deterministic."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from djet_ros.odometry.order import Order
 
 class RateLimit:
     """
-    Takes at most so many images a second of their stamps, on the average; all where hertz is 0.
+    A token bucket: accepts at most hertz images per second on average; all if hertz is 0.
 
-    Time that passes is saved up, an image costs a period. As one and a half periods can be saved,
-    a camera of just this rate may be early by half a period at times, and loses nothing.
+    Time between stamps fills the bucket, each accepted image takes one period. The bucket holds
+    one and a half periods, so that a camera of exactly this rate loses no image if its stamps
+    are early by up to half a period.
 
-    max_backwards, max_gap: by which stamps are late, as for the odometry; where they are not, and
-    older than the newest one, all begins anew.
+    max_backwards, max_gap: limits of late stamps, as for the odometry; stamps that go back
+    further reset the bucket.
     """
 
     def __init__(self, hertz: float, max_backwards: float = 0.0, max_gap: float = 0.0) -> None:
@@ -24,16 +25,16 @@ class RateLimit:
         self._took = True
 
     def takes(self, stamp_ns: int) -> bool:
-        """Tell of the next image whether it is taken."""
+        """Return whether the next image is accepted."""
         order = self._order
-        # Stamps that stand still are a fault that others report, so they share one fate.
+        # Repeated stamps are a fault that is reported elsewhere: treat them as the first.
         if stamp_ns == order.newest:
             return self._took
         if order.newest is None or order.goes_back(stamp_ns):
             order.take(stamp_ns)
             self._saved = self._most
         elif stamp_ns > order.newest:
-            # A late image brings no time with it.
+            # A late image adds no time.
             self._saved = min(self._saved + stamp_ns - order.newest, self._most)
             order.take(stamp_ns)
         self._took = self._saved >= self._period

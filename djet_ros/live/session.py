@@ -1,7 +1,7 @@
 """
-A tracker at work on a live stream: its queue, its thread, and what happens around the frames.
+The odometry on a live stream: image queue, worker thread, services, log and diagnostics.
 
-Every live face shares this and adds the wiring alone: how messages come and go.
+It is independent of the middleware, which live nodes add.
 """
 
 from __future__ import annotations
@@ -24,69 +24,69 @@ from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
-# Seconds without an image after which a camera counts as gone.
-SILENCE = 2.0
+# Seconds without an image after which the camera is reported as silent.
+SILENCE_TIMEOUT = 2.0
 
-# Seconds before the same is said in the log again.
+# Seconds before the same warning is logged again.
 _LOG_PERIOD = 5.0
 
-# Seconds after which diagnostics come also where no image makes the tracker say them.
+# Seconds after which diagnostics are published even if no image triggers them.
 _DIAGNOSTICS_PERIOD = 1.0
 
-# Messages of what comes beside the images that may wait for them: minutes of an IMU.
-_WAITING_BESIDE = 100_000
+# Queued messages of side inputs (IMU, guess, mask, speed, tf): minutes of a fast IMU.
+_MAX_SIDE_INPUTS = 100_000
 
-# Bytes of images that may wait, and of what came beside them. By bytes, as a thousand small images
-# are a short delay, and a thousand large ones more memory than a robot has.
-ROOM = 500_000_000
+# Limit in bytes for the queued images, and for the queued side inputs: a thousand small images are
+# a short delay, and a thousand large ones more memory than a robot has.
+MAX_QUEUE_BYTES = 500_000_000
 
-# Bytes that a message takes beside its pixels, about.
-_MESSAGE = 4_000
+# Approximate size of a message in bytes without its pixels.
+_MESSAGE_OVERHEAD = 4_000
 
-# Seconds for which an image waits for what belongs to it: the gyro's rates, its mask.
-_PATIENCE = 0.1
+# Seconds for which an image waits for its side inputs, such as gyro rates and mask.
+_SIDE_INPUT_TIMEOUT = 0.1
 
-# With the queue policy 'every': from the last message beside the images, and this in all.
-_LONGEST_PATIENCE = 2.0
+# With queue_policy 'every' that wait restarts with each side input, up to this in total.
+_MAX_SIDE_INPUT_TIMEOUT = 2.0
 
-# Seconds for which an image after a gap waits for the one after it, which tells a wrong stamp.
-_NEXT_PATIENCE = 1.0
+# Seconds for which an image after a gap waits for the next one, which shows a wrong stamp.
+_NEXT_IMAGE_TIMEOUT = 1.0
 
 _LATENCIES = 100
 
-# States that somebody asked for, or that are logged with the names of topics.
-_SAID_ELSEWHERE = (State.PAUSED, State.WAITING_FOR_IMAGE, State.WAITING_FOR_CAMERA_INFO)
+# States that a user requested, or that are logged with topic names by ``_log_missing_inputs``.
+_LOGGED_ELSEWHERE = (State.PAUSED, State.WAITING_FOR_IMAGE, State.WAITING_FOR_CAMERA_INFO)
 
 
 class Wiring(Protocol):
-    """What a session needs of the graph; all but ``publish`` is asked from any thread."""
+    """What a session needs from its node; all but ``publish`` is called from any thread."""
 
     def publish(self, outgoing: Sequence[Outgoing]) -> None:
         """Send messages, from the session's thread or from the one that calls it."""
 
     def log(self, level: str, text: str) -> None:
-        """Say something to people; level is 'info' or 'warning'."""
+        """Log a line; level is 'info' or 'warning'."""
 
     def why_silent(self, topic: str) -> str:
-        """Say what is seen of a topic over which nothing comes."""
+        """Return why no messages may be arriving on a topic."""
 
     def wants(self, topic: str) -> bool:
-        """Tell whether anybody listens to an output that is made for listeners alone."""
+        """Return whether an output that is made on demand has subscribers."""
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Give a frame in another (4, 4), or None where tf does not know it yet."""
+        """Return the pose (4, 4) of frame child in parent, or None if tf does not have it yet."""
 
 
 class _Received(NamedTuple):
-    """An image, the CameraInfo that was the newest when it came, and when (monotonic seconds)."""
+    """An image with the newest CameraInfo and the time (monotonic seconds) at its arrival."""
 
     image: Any
     info: Any
     at: float
 
 
-class _Beside(NamedTuple):
-    """A message beside the images, the tracker's method that takes it, and when it came."""
+class _SideInput(NamedTuple):
+    """A message other than an image, the tracker's method for it, and its time of arrival."""
 
     what: str
     message: Any
@@ -94,44 +94,44 @@ class _Beside(NamedTuple):
 
 
 class Throttle:
-    """A log that says the same only now and then; for one thread at a time."""
+    """A throttled log; for one thread at a time."""
 
     def __init__(self, wiring: Wiring) -> None:
         self._wiring = wiring
-        self._said: dict[str, float] = {}
+        self._logged: dict[str, float] = {}
 
     def warn(self, key: str, text: str) -> None:
-        """Say something, unless what goes by the same key was said a short while ago."""
+        """Log a warning, unless one with the same key was logged within _LOG_PERIOD."""
         now = monotonic()
-        if now - self._said.get(key, -np.inf) >= _LOG_PERIOD:
-            self._said[key] = now
+        if now - self._logged.get(key, -np.inf) >= _LOG_PERIOD:
+            self._logged[key] = now
             self._wiring.log('warning', text)
 
-    def warn_of_missing(self, what: str, topic: str) -> None:
-        """Say that nothing comes over a topic."""
+    def warn_missing(self, what: str, topic: str) -> None:
+        """Warn that no messages arrive on a topic."""
         self.warn(what, f'waiting for {what} on {topic}: {self._wiring.why_silent(topic)}')
 
     def clear(self) -> None:
-        """Forget what was said."""
-        self._said.clear()
+        """Forget all earlier warnings."""
+        self._logged.clear()
 
 
 class Latencies:
-    """How long the newest pieces of work took, from receipt to publication."""
+    """Latencies of the newest messages, from receipt to publication."""
 
     def __init__(self) -> None:
         self._seconds: deque[float] = deque(maxlen=_LATENCIES)
 
     def add(self, since: float) -> None:
-        """Take a piece of work that came in at a moment (monotonic seconds) and is done now."""
+        """Add the latency of a message received at a time (monotonic seconds) and done now."""
         self._seconds.append(monotonic() - since)
 
     def clear(self) -> None:
-        """Forget what was taken."""
+        """Remove all latencies."""
         self._seconds.clear()
 
     def values(self) -> dict[str, str]:
-        """Give what diagnostics say of them; nothing where there are none."""
+        """Return the values for the diagnostics; empty if there are none yet."""
         if not self._seconds:
             return {}
         median, high = np.percentile(self._seconds, (50, 95)) * 1e3
@@ -140,12 +140,12 @@ class Latencies:
 
 class Session:
     """
-    Works on images in a thread of its own, in the order in which they come.
+    Processes images in a worker thread, in the order of arrival.
 
-    topics: resolved names of 'image' and 'camera_info', for people. Messages may come from any
-    one thread, and never have to wait: images beyond ROOM are dropped and counted. Everything else
-    may be called from any thread. What is published for one image is published as a whole or not
-    at all, and nothing of before a reset or a stop after it.
+    topics: resolved names of 'image' and 'camera_info', for log messages. Messages are passed in
+    from one thread and never block it: images beyond MAX_QUEUE_BYTES are dropped and counted. All
+    other methods may be called from any thread. The messages for one image are published all or
+    none, and nothing from before a reset or stop is published after it.
     """
 
     def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
@@ -153,38 +153,40 @@ class Session:
         self._tracker = tracker
         self._wiring = wiring
         self._topics = topics
-        self._queue: FrameQueue[_Received] = FrameQueue(node.queue_policy, node.queue_size, ROOM)
+        self._queue: FrameQueue[_Received] = FrameQueue(
+            node.queue_policy, node.queue_size, MAX_QUEUE_BYTES)
         self._limit = _limit(tracker.config)
-        # Held while an image is worked on and published, and by what happens in between.
+        # Held while an image is processed and published, and by calls between two images.
         self._lock = Lock()
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        self._beside: FrameQueue[_Beside] = FrameQueue('latest', _WAITING_BESIDE, ROOM)
-        self._came = Event()
-        self._came_at = -np.inf
-        self._counted_drops = self._lost = self._counted_lost = self._left_out = 0
-        self._said_drops = False
+        self._side_inputs: FrameQueue[_SideInput] = FrameQueue(
+            'latest', _MAX_SIDE_INPUTS, MAX_QUEUE_BYTES)
+        self._side_input_arrived = Event()
+        self._last_side_input = -np.inf
+        self._counted_drops = self._lost = self._counted_lost = self._skipped = 0
+        self._drops_logged = False
         self._latencies = Latencies()
         self._started = self._forgotten = self._last_image = self._last_diagnostics = -np.inf
         self._log = Throttle(wiring)
-        self._complained: set[str] = set()
+        self._logged_complaints: set[str] = set()
         self._stopping = False
         self._worker = Thread(target=self._work, name='odometry', daemon=True)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start the worker thread."""
         self._started = self._last_image = monotonic()
         self._worker.start()
 
     def stop(self, timeout: float = 0.5) -> None:
         """
-        Publish nothing more, and wait up to timeout seconds for the image in work.
+        Stop publishing, and wait up to timeout seconds for the image being processed.
 
-        An image whose messages are being published at this moment is published as a whole.
+        If its messages are being published already, all of them are.
         """
         self._stopping = True
-        self._came.set()
+        self._side_input_arrived.set()
         self._queue.close()
         self._queue.clear()
         if self._worker.is_alive():
@@ -192,31 +194,31 @@ class Session:
 
     @property
     def failed(self) -> bool:
-        """Whether the work ended by an error; Python has printed its traceback."""
+        """Whether the worker thread ended with an error; Python has printed its traceback."""
         return not (self._worker.is_alive() or self._stopping)
 
-    # What comes in
+    # Inputs
 
     @property
     def wants_frames(self) -> bool:
-        """Whether tf is still to be asked how anything is mounted."""
+        """Whether a mounting still has to be looked up on tf."""
         return self._tracker.wants_frames
 
     @property
     def has_room(self) -> bool:
-        """Whether an image would be taken; with the policy 'every' it may be better to wait."""
+        """Whether the queue accepts an image; with queue_policy 'every' publishers can wait."""
         return self._queue.has_room
 
     def image(self, message: Any) -> None:
-        """Take an Image or a CompressedImage, unless they come faster than is asked for."""
+        """Queue an Image or CompressedImage, unless ros.max_rate skips it."""
         self._last_image = monotonic()
         if not self._limit.takes(stamp_ns(message.header)):
-            self._left_out += 1
+            self._skipped += 1
             return
         self._queue.put(_Received(message, self._newest_info, self._last_image), _bytes(message))
 
     def camera_info(self, message: Any) -> None:
-        """Take a CameraInfo; it holds for the images that come after it."""
+        """Take a CameraInfo for the images that arrive after it."""
         self._newest_info = message
 
     def speed(self, message: Any) -> None:
@@ -228,7 +230,7 @@ class Session:
         self._take('imu', message)
 
     def guess(self, message: Any) -> None:
-        """Take an Odometry as a guess of where the camera went."""
+        """Take an Odometry for the initial motion."""
         self._take('guess', message)
 
     def tf(self, message: Any) -> None:
@@ -244,54 +246,56 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._came_at = monotonic()
-        self._beside.put(_Beside(what, message, self._came_at), _bytes(message))
-        self._came.set()
+        self._last_side_input = monotonic()
+        self._side_inputs.put(_SideInput(what, message, self._last_side_input), _bytes(message))
+        self._side_input_arrived.set()
 
     def count_lost(self, number: int) -> None:
-        """Count images that were sent and never came."""
+        """Count images that were sent and did not arrive."""
         self._lost += number
 
-    # What is asked for between two images
+    # Services and parameters, between two images
 
     def reset(self) -> str:
-        """Forget all images, poses, speeds and counts, those that wait included; says so."""
+        """Discard all images, poses, speeds and counts, queued ones included; return a report."""
         with self._between_images():
             processed = self._tracker.counts.processed
-            # An image that has left the queue may wait for the lock just now.
+            # An image that has left the queue may be waiting for the lock.
             self._forgotten = monotonic()
             self._queue.clear()
-            self._beside.clear()
+            self._side_inputs.clear()
             self._latencies.clear()
             self._log.clear()
             self._counted_drops = self._queue.dropped
-            self._lost = self._counted_lost = self._left_out = 0
+            self._lost = self._counted_lost = self._skipped = 0
             self._limit = _limit(self._tracker.config)
-            self._said_drops = False
+            self._drops_logged = False
             self._tracker.reset()
-            self._say()
-        return self._note(f'reset: forgot {processed} images and their poses; '
-                          f'{self._tracker.config.odometry.odom_frame} begins at the next image')
+            self._publish_diagnostics()
+        return self._log_and_return(
+            f'reset: {processed} images and their poses discarded; '
+            f'{self._tracker.config.odometry.odom_frame} starts at the next image')
 
     def pause(self) -> str:
-        """Drop and count all images until ``resume``; says so."""
+        """Drop and count all images until ``resume``; return a report."""
         with self._between_images():
             before = self._tracker.state is State.PAUSED
             self._tracker.pause()
-            self._say()
-        return self._note('was paused already' if before
-                          else 'paused: images are dropped and counted until a resume')
+            self._publish_diagnostics()
+        return self._log_and_return('already paused' if before
+                                    else 'paused: images are dropped and counted until ~/resume')
 
     def resume(self) -> str:
-        """Work on images again; says so."""
+        """Process images again; return a report."""
         with self._between_images():
             before = self._tracker.state is State.PAUSED
             self._tracker.resume()
-            self._say()
-        return self._note('resumed: images are worked on again' if before else 'was not paused')
+            self._publish_diagnostics()
+        return self._log_and_return('resumed: images are processed again' if before
+                                    else 'not paused')
 
     def configure(self, config: Config) -> None:
-        """Take other parameters from the next image on; the queue stays as it was made."""
+        """Change parameters from the next image on; those of the queue cannot change."""
         with self._between_images():
             before = flat(self._tracker.config)
             same = all(before[name].value == flat(config)[name].value
@@ -302,17 +306,17 @@ class Session:
         changed = [f'{item.name} = {item.value}' for item in flat(config).values()
                    if item.value != before[item.name].value]
         if changed:
-            self._note(f'from the next image on: {", ".join(changed)}')
+            self._log_and_return(f'parameters from the next image on: {", ".join(changed)}')
 
-    def _note(self, text: str) -> str:
-        """Log what somebody asked for and got, and give it back."""
+    def _log_and_return(self, text: str) -> str:
+        """Log the result of a request, and return it as the answer."""
         self._wiring.log('info', text)
         return text
 
     @contextmanager
     def _between_images(self) -> Iterator[None]:
-        # Who waits for the lock holds the turnstile meanwhile: the thread, which wants the lock
-        # again as soon as it has released it, has to queue up.
+        # A caller waiting for the lock holds the turnstile, so that the worker thread cannot
+        # reacquire the lock first.
         with self._turnstile, self._lock:
             yield
 
@@ -320,121 +324,123 @@ class Session:
 
     def tick(self) -> None:
         """
-        Say what no image makes the tracker say; to be called about once a second.
+        Log missing inputs, and publish diagnostics while no images arrive.
 
-        That is: which topic is still waited for, and diagnostics while no images come.
+        To be called about once a second.
         """
         if not self._lock.acquire(blocking=False):
-            # An image is in work, and says everything by itself.
+            # An image is being processed, which does all of this.
             return
         try:
-            silent = monotonic() - self._last_image > SILENCE
+            silent = monotonic() - self._last_image > SILENCE_TIMEOUT
             if not len(self._queue):
-                self._hand_on(np.inf)
+                self._feed_side_inputs(np.inf)
             if silent:
-                # No image waits that came before this CameraInfo.
+                # No image is queued that arrived before this CameraInfo.
                 self._take_info(self._newest_info)
                 self._tracker.no_image_comes()
             if self._tracker.state is not State.PAUSED:
-                self._log_what_is_missing(silent)
+                self._log_missing_inputs(silent)
             if monotonic() - self._last_diagnostics > _DIAGNOSTICS_PERIOD:
-                self._say()
+                self._publish_diagnostics()
         finally:
             self._lock.release()
 
-    def _log_what_is_missing(self, silent: bool) -> None:
-        without_info = self._newest_info is None and monotonic() - self._started > SILENCE
+    def _log_missing_inputs(self, silent: bool) -> None:
+        without_info = self._newest_info is None and monotonic() - self._started > SILENCE_TIMEOUT
         for what in ['image'] * silent + ['camera_info'] * without_info:
-            self._log.warn_of_missing(what, self._topics[what])
+            self._log.warn_missing(what, self._topics[what])
 
-    # In the thread
+    # In the worker thread
 
     def _work(self) -> None:
         try:
             while (received := self._queue.get()) is not None:
-                self._await_what_belongs_to(received)
-                self._await_the_next_if_it_leaps(received)
+                self._wait_for_side_inputs(received)
+                self._wait_for_next_if_ahead(received)
                 with self._turnstile:
                     pass
                 with self._lock:
                     if received.at > self._forgotten:
                         self._process(received)
         finally:
-            # What comes from now on is kept for nobody.
+            # Nothing processes what arrives from now on.
             self._queue.close()
-            self._beside.close()
+            self._side_inputs.close()
 
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
-        self._tell_of_the_face()
+        self._update_node_diagnostics()
         self._take_info(received.info)
-        self._hand_on(self._present(received))
+        self._feed_side_inputs(self._side_input_cutoff(received))
         frame = frame_of(received.image.header)
         if not tracker.mounted:
             self._mount(frame)
-        self._mount_beside(frame)
+        self._mount_side_inputs(frame)
         waiting = self._queue.peek()
         following = None if waiting is None else waiting.image
         if following is not None:
             tracker.expect(following)
         self._publish(tracker.image(received.image, following))
         self._latencies.add(received.at)
-        self._log_trouble()
+        self._log_problem()
         for topic, make in (('debug_image', tracker.debug_image),
                             ('landmarks', tracker.landmarks)):
             if self._wiring.wants(topic) and (made := make()):
                 self._publish([made])
 
-    def _await_what_belongs_to(self, received: _Received) -> None:
-        """Wait a moment for what an image is to be worked on with, if it has not come yet."""
-        # Where nothing may be lost, on a slow machine what belongs to it comes late, but comes on.
+    def _wait_for_side_inputs(self, received: _Received) -> None:
+        """Wait briefly for the side inputs of an image that have not arrived yet."""
+        # With 'every' on a slow machine, side inputs arrive late, but keep arriving.
         patient = self._tracker.config.ros.queue_policy == 'every'
-        latest = monotonic() + _LONGEST_PATIENCE
+        latest = monotonic() + _MAX_SIDE_INPUT_TIMEOUT
         while not self._stopping and received.at > self._forgotten:
-            self._came.clear()
+            self._side_input_arrived.clear()
             with self._lock:
-                self._hand_on(self._present(received))
-                while (lacking := self._tracker.lacks(received.image)) and self._hand_on_next(
-                        received.at + _LONGEST_PATIENCE):
+                self._feed_side_inputs(self._side_input_cutoff(received))
+                while (lacking := self._tracker.lacks(received.image)) and \
+                        self._feed_next_side_input(received.at + _MAX_SIDE_INPUT_TIMEOUT):
                     pass
-            since = max(received.at, self._came_at) if patient else received.at
-            left = min(since + _PATIENCE, latest) - monotonic()
+            since = max(received.at, self._last_side_input) if patient else received.at
+            left = min(since + _SIDE_INPUT_TIMEOUT, latest) - monotonic()
             if not lacking or left <= 0:
                 return
-            self._came.wait(left)
+            self._side_input_arrived.wait(left)
 
-    def _await_the_next_if_it_leaps(self, received: _Received) -> None:
+    def _wait_for_next_if_ahead(self, received: _Received) -> None:
         with self._lock:
             leaps = self._tracker.leaps(received.image)
         if leaps and received.at > self._forgotten:
-            self._queue.peek(timeout=_NEXT_PATIENCE)
+            self._queue.peek(timeout=_NEXT_IMAGE_TIMEOUT)
 
-    def _present(self, received: _Received) -> float:
-        """Tell until when messages count for an image: what came later is for those that wait."""
+    def _side_input_cutoff(self, received: _Received) -> float:
+        """Return the arrival time up to which side inputs are used: later ones are for others."""
         return received.at if len(self._queue) else np.inf
 
-    def _hand_on(self, until: float) -> None:
-        """Give the tracker what came beside the images until a moment; it keeps but some of it."""
-        while self._hand_on_next(until):
+    def _feed_side_inputs(self, until: float) -> None:
+        """Pass the side inputs that arrived until a time to the tracker, which keeps a few."""
+        while self._feed_next_side_input(until):
             pass
 
-    def _hand_on_next(self, until: float) -> bool:
-        waiting = self._beside.peek()
-        if waiting is None or waiting.at > until or (one := self._beside.get(timeout=0)) is None:
+    def _feed_next_side_input(self, until: float) -> bool:
+        waiting = self._side_inputs.peek()
+        if waiting is None or waiting.at > until:
+            return False
+        if (one := self._side_inputs.get(timeout=0)) is None:
             return False
         getattr(self._tracker, one.what)(one.message)
         return True
 
-    def _mount_beside(self, image_frame: str) -> None:
+    def _mount_side_inputs(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.wanted_mountings(image_frame).items():
             if (mounting := self._wiring.transform(parent, child)) is not None:
                 self._tracker.mount_beside(what, mounting)
-                self._note(f'{child} is on {parent} as tf says')
+                self._log_and_return(f'mounting of {child} on {parent} received from tf')
 
     def _mount(self, image_frame: str) -> None:
         if found := self._tracker.mount(self._wiring.transform, image_frame):
-            self._note(found)
+            self._log_and_return(found)
 
     def _count_drops(self) -> None:
         if lost := self._lost - self._counted_lost:
@@ -445,31 +451,33 @@ class Session:
             self._counted_drops += new
             counts = self._tracker.counts
             self._tracker.count_dropped('queue_full', new)
-            if not self._said_drops:
-                self._said_drops = True
+            if not self._drops_logged:
+                self._drops_logged = True
                 self._wiring.log('warning', f'{counts.dropped["queue_full"]} of {counts.received} '
-                                 'images dropped: they come faster than they are worked on; the '
-                                 'diagnostics count them')
+                                 'images dropped: they arrive faster than they are processed; '
+                                 'lower the rate, the image size or estimator.max_features; '
+                                 'further drops are counted in the diagnostics')
 
     def _take_info(self, info: Any) -> None:
         if info is not self._taken_info:
             self._taken_info = info
             self._publish(self._tracker.camera_info(info))
-            self._log_trouble()
+            self._log_problem()
 
-    def _tell_of_the_face(self) -> None:
-        self._tracker.face_values = self._face_values()
+    def _update_node_diagnostics(self) -> None:
+        self._tracker.face_values = self._node_values()
         waiting = self._queue.weight
-        # To be said before anything is lost.
-        self._tracker.face_complaints = [] if waiting < ROOM / 2 else [Complaint(
+        # Warn before anything is lost.
+        self._tracker.face_complaints = [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint(
             'images pile up', 'WARN', (
-                f'{waiting * 1e-6:.0f} MB of images wait to be worked on; from {ROOM * 1e-6:.0f} '
-                'MB on senders wait that can, and what others send is lost; lower their rate '
-                '(that of a player, too), their size or estimator.max_features'))]
+                f'{waiting * 1e-6:.0f} MB of images are queued; from '
+                f'{MAX_QUEUE_BYTES * 1e-6:.0f} MB on images are dropped, unless their publisher '
+                'can wait; lower the rate (that of a bag player, too), the image size or '
+                'estimator.max_features'))]
 
-    def _face_values(self) -> dict[str, str]:
+    def _node_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
-                'frames beyond ros.max_rate': str(self._left_out),
+                'frames beyond ros.max_rate': str(self._skipped),
                 'queue policy': self._tracker.config.ros.queue_policy,
                 **self._latencies.values()}
 
@@ -480,28 +488,28 @@ class Session:
             self._last_diagnostics = monotonic()
         self._wiring.publish(outgoing)
 
-    def _say(self) -> None:
-        self._tell_of_the_face()
+    def _publish_diagnostics(self) -> None:
+        self._update_node_diagnostics()
         self._publish([self._tracker.diagnostics(time_ns())])
 
-    def _log_trouble(self) -> None:
-        """Put into the log, now and then, what is wrong for as long as it is."""
+    def _log_problem(self) -> None:
+        """Log what is wrong, throttled, for as long as it is."""
         self._log_complaints()
         tracker = self._tracker
-        if tracker.state in _SAID_ELSEWHERE or LEVELS[tracker.state] == 'OK':
+        if tracker.state in _LOGGED_ELSEWHERE or LEVELS[tracker.state] == 'OK':
             return
-        said = ': '.join(filter(None, [tracker.state.value, tracker.detail,
+        text = ': '.join(filter(None, [tracker.state.value, tracker.detail,
                                        str(tracker.problem or tracker.remark)]))
-        # That odom is at the origin again is no more of what a gap said just before.
-        self._log.warn(f'{tracker.state} {tracker.detail} {tracker.went_back}', said)
+        # A reset of odom to the origin must not be throttled by a gap just before it.
+        self._log.warn(f'{tracker.state} {tracker.detail} {tracker.went_back}', text)
 
     def _log_complaints(self) -> None:
-        """Put what there is to mend into the log, once for as long as it is."""
+        """Log each complaint once, until it has gone and comes again."""
         complaints = self._tracker.complaints
         for one in complaints:
-            if one.name not in self._complained:
+            if one.name not in self._logged_complaints:
                 self._log.warn(one.name, f'{one.name}: {one.text}')
-        self._complained = {one.name for one in complaints}
+        self._logged_complaints = {one.name for one in complaints}
 
 
 def _limit(config: Config) -> RateLimit:
@@ -510,5 +518,5 @@ def _limit(config: Config) -> RateLimit:
 
 
 def _bytes(message: Any) -> int:
-    """Tell about how much memory a message takes; of those that come, images alone are large."""
-    return _MESSAGE + len(getattr(message, 'data', ()))
+    """Return about how much memory a message takes; only images are large."""
+    return _MESSAGE_OVERHEAD + len(getattr(message, 'data', ()))

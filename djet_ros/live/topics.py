@@ -1,4 +1,4 @@
-"""The topics of the live faces: what they are called and what goes over them."""
+"""The topics of the live nodes: their names and types."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from djet_ros.config.sections import NodeConfig
 IMAGE_TYPES = {'raw': 'sensor_msgs/msg/Image', 'compressed': 'sensor_msgs/msg/CompressedImage'}
 INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 
-# Of the odometry, with odometry.scale 'speed'.
+# Inputs of the odometry with odometry.scale 'speed'.
 SPEED_TYPES = {
     'speed': 'geometry_msgs/msg/TwistStamped',
     'speed_odometry': 'nav_msgs/msg/Odometry',
 }
 
-# Of the odometry, with the parameter odometry.<topic>.
+# Inputs of the odometry with the parameter odometry.<topic>.
 BESIDE_TYPES = {
     'imu': 'sensor_msgs/msg/Imu',
     'guess': 'nav_msgs/msg/Odometry',
     'mask': IMAGE_TYPES['raw'],
 }
 
-# Those without a leading slash are below the node's name.
+# Names without a leading slash are private (~/).
 _ODOMETRY_OUTPUTS = {
     'relative_pose': 'geometry_msgs/msg/PoseStamped',
     'relative_pose_cov': 'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -35,40 +35,40 @@ _ODOMETRY_OUTPUTS = {
     '/tf': 'tf2_msgs/msg/TFMessage',
 }
 
-# What the pose graph takes of the odometry, by the name of the latter's output.
+# Outputs of the odometry that the pose graph subscribes to.
 GRAPH_INPUTS = ('odometry', 'relative_pose_cov', 'relative_pose_status')
 
 _GRAPH_OUTPUTS = ('path', '/tf', '/diagnostics')
 
 
 def odometry_outputs(config: NodeConfig) -> dict[str, str]:
-    """Give the types of what an odometry publishes, by topic."""
+    """Return the output topics of the odometry with their types."""
     left_out = {'path': not config.publish_path, '/tf': not config.publish_tf}
     return {topic: kind for topic, kind in _ODOMETRY_OUTPUTS.items() if not left_out.get(topic)}
 
 
 def graph_outputs(*, tf: bool) -> dict[str, str]:
-    """Give the types of what a pose graph publishes, by topic."""
+    """Return the output topics of the pose graph with their types."""
     return {topic: _ODOMETRY_OUTPUTS[topic] for topic in _GRAPH_OUTPUTS if tf or topic != '/tf'}
 
 
 def graph_input_type(topic: str) -> str:
-    """Give the type of one of GRAPH_INPUTS."""
+    """Return the type of one of GRAPH_INPUTS."""
     return _ODOMETRY_OUTPUTS[topic]
 
 
 def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], bool],
                  transport: str) -> tuple[str, str]:
     """
-    Resolve the names of the images and of their CameraInfo.
+    Return the resolved topics of the images and of their CameraInfo.
 
-    resolve gives the full name with remappings, is_remapped tells whether there is one. As with
-    image_transport, only the image's name needs to be remapped: camera_info is taken beside it,
-    and the compressed images below it.
+    resolve applies remappings, is_remapped returns whether there is one. As with image_transport,
+    only image needs to be remapped: camera_info is in the same namespace, and compressed images
+    are on <image>/compressed.
     """
     image = topic = resolve('image').removesuffix('/compressed')
     if transport == 'compressed':
-        # Many remap this one, as ROS 2's republish asks for. It may be called anything.
+        # This one may be remapped instead, as ROS 2's republish requires, to any name.
         topic = resolve(f'{image}/compressed')
         image = topic.removesuffix('/compressed')
     if is_remapped('camera_info'):
@@ -79,5 +79,5 @@ def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], boo
 
 
 def full_name(topic: str) -> str:
-    """Give the name under which an output is asked for: below the node, or as it stands."""
+    """Return the name of an output for ``resolve``: private, unless it is absolute."""
     return topic if topic.startswith('/') else f'~/{topic}'

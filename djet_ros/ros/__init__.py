@@ -1,1 +1,1 @@
-"""The live nodes on ROS 2: wiring alone; nothing here can be imported without rclpy."""
+"""The live nodes on ROS 2 (rclpy), and what their launch files share."""

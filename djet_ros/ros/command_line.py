@@ -1,4 +1,4 @@
-"""What a command line has for ROS, which rclpy reads and does not show."""
+"""ROS arguments of the command line, which rclpy parses but does not expose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import pairwise
 
 
 def values_after(words: Sequence[str], *options: str) -> Iterator[str]:
-    """Give the values of options such as --params-file that are meant for ROS."""
+    """Yield the values of ROS options such as --params-file, after --ros-args."""
     for_ros = False
     for word, following in pairwise(words):
         for_ros = word == '--ros-args' or (for_ros and word != '--')
@@ -16,7 +16,7 @@ def values_after(words: Sequence[str], *options: str) -> Iterator[str]:
 
 
 def topic_rules(words: Sequence[str], node: str) -> Iterator[tuple[str, str]]:
-    """Give the remappings (from, to) of topics that hold for a node, as they are written."""
+    """Yield the topic remappings (from, to) that apply to a node, as given."""
     for rule in values_after(words, '-r', '--remap'):
         old, _, new = rule.partition(':=')
         whose, _, old = old.replace('rostopic://', '').rpartition(':')

@@ -1,4 +1,4 @@
-"""What the launch files of the nodes share: their arguments, and how a node is started."""
+"""Launch arguments and node descriptions that the launch files share."""
 
 from __future__ import annotations
 
@@ -19,62 +19,67 @@ from launch_ros.substitutions import FindPackageShare
 
 CONFIG = PathJoinSubstitution([FindPackageShare('djet_ros'), 'config'])
 
-# Arguments by which parameters are set on top of files, where they are not empty.
-_SAID = {'base_frame': ('odometry.base_frame', str), 'publish_tf': ('ros.publish_tf', bool),
-         'image_transport': ('ros.image_transport', str)}
+# Arguments that override a parameter of the files unless they are empty: parameter and type.
+_OVERRIDES = {'base_frame': ('odometry.base_frame', str), 'publish_tf': ('ros.publish_tf', bool),
+              'image_transport': ('ros.image_transport', str)}
 
-_TRUTH = {'choices': ['true', 'false'], 'default_value': 'false'}
+_BOOLEAN = {'choices': ['true', 'false'], 'default_value': 'false'}
 
-# By name: the description, and what else DeclareLaunchArgument is told.
+# By name: the description, and further arguments of DeclareLaunchArgument.
 _ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
-    'image': ('topic of the images, relative to the namespace',
+    'image': ('image topic, relative to the namespace',
               {'default_value': 'camera/image_raw'}),
-    'camera_info': ('topic of their CameraInfo; as it stands, beside the images',
+    'camera_info': ('CameraInfo topic; default: camera_info in the namespace of the image topic',
                     {'default_value': 'camera_info'}),
-    'params_file': ('YAML file with parameters of vo_node; pose_graph_node takes from it what '
-                    'both have to agree on',
+    'params_file': ('YAML file with parameters of vo_node; pose_graph_node also reads the '
+                    'parameters that both nodes share from it',
                     {'default_value': PathJoinSubstitution([CONFIG, 'vo.yaml'])}),
     'slam_params_file': ('YAML file with parameters of pose_graph_node',
                          {'default_value': PathJoinSubstitution([CONFIG, 'slam.yaml'])}),
-    'base_frame': ('frame of the vehicle whose pose is wanted, such as base_link; tf knows the '
-                   'camera on it; empty: as the parameters say', {'default_value': ''}),
+    'base_frame': ('frame of the vehicle whose pose is estimated, such as base_link; needs its '
+                   'transform to the camera on tf; empty: value of the parameter file',
+                   {'default_value': ''}),
     'namespace': ('namespace of nodes and topics, such as the name of a camera',
                   {'default_value': ''}),
     'name': ('name of the odometry node', {'default_value': 'vo_node'}),
-    'log_level': ('from which level on the nodes log', {
+    'log_level': ('minimum severity of log messages', {
         'default_value': 'info', 'choices': ['debug', 'info', 'warn', 'error', 'fatal']}),
-    'respawn': ('start a node again that has ended by an error', _TRUTH),
-    'publish_tf': ("whether the odometry's pose goes to tf; empty: as the parameters say",
+    'respawn': ('whether to restart a node that ended with an error', _BOOLEAN),
+    'publish_tf': ('whether to publish the pose of the odometry on tf; empty: value of the '
+                   'parameter file',
                    {'choices': ['true', 'false', ''], 'default_value': ''}),
-    'image_transport': ('raw, or compressed for <image>/compressed; empty: as the parameters say',
+    'image_transport': ('raw, or compressed for <image>/compressed; empty: value of the parameter '
+                        'file',
                         {'choices': ['raw', 'compressed', ''], 'default_value': ''}),
-    'use_sim_time': ('take the time from /clock; empty: as the parameters or an outer launch file '
-                     'say', {'choices': ['true', 'false', ''], 'default_value': ''}),
-    'rviz': ('show it in RViz (package rviz2), for the names as they stand', _TRUTH),
+    'use_sim_time': ('whether to use the time of /clock; empty: value of the parameter file or of '
+                     'an including launch file',
+                     {'choices': ['true', 'false', ''], 'default_value': ''}),
+    'rviz': ('whether to start RViz (package rviz2), configured for the default topic names',
+             _BOOLEAN),
 }
 
 
 def arguments(*names: str, **defaults: str | Substitution) -> list[DeclareLaunchArgument]:
-    """Declare arguments by name; defaults: other default values than usual."""
+    """Declare arguments by name; defaults: values that replace the usual defaults."""
     return [DeclareLaunchArgument(name, description=text, **{
         **more, **({'default_value': defaults[name]} if name in defaults else {})})
             for name in names for text, more in [_ARGUMENTS[name]]]
 
 
 def _sim_time(context: LaunchContext) -> dict[str, ParameterValue]:
-    """Give the parameter use_sim_time where it was asked for, as files may say it too."""
+    """Return the parameter use_sim_time if the argument is set, as files may set it too."""
     given = LaunchConfiguration('use_sim_time')
     return ({'use_sim_time': ParameterValue(given, value_type=bool)} if given.perform(context)
             else {})
 
 
 def rviz() -> OpaqueFunction:
-    """Describe RViz, which the odometry itself does not need."""
+    """Describe RViz, which is optional; DjetError at launch if it is not installed."""
     def describe(context: LaunchContext) -> list[Node]:
         try:
             get_package_prefix('rviz2')
         except PackageNotFoundError:
-            raise DjetError('rviz:=true needs rviz2, which is not installed: '
+            raise DjetError('rviz:=true needs rviz2, which is not installed: sudo '
                             'apt install ros-$ROS_DISTRO-rviz2') from None
         return [Node(package='rviz2', executable='rviz2', name='rviz_of_vo',
                      parameters=[_sim_time(context)],
@@ -84,21 +89,22 @@ def rviz() -> OpaqueFunction:
 
 
 def node(executable: str, name: str | Substitution, *files: str,
-         says: Sequence[str] = ('base_frame', 'image_transport')) -> OpaqueFunction:
+         overrides: Sequence[str] = ('base_frame', 'image_transport')) -> OpaqueFunction:
     """
-    Describe a node of ours on the camera that the arguments name.
+    Describe a node of this package on the camera given by the arguments.
 
-    files: arguments that hold a parameter file; says: those that say more on top of these.
+    files: arguments that are parameter files; overrides: arguments that override them.
     """
     def describe(context: LaunchContext) -> list[Node]:
         for file in files:
-            # ROS would say it in passing and start the node without.
+            # ROS would only warn, and start the node without the file.
             if not (path := Path(LaunchConfiguration(file).perform(context))).is_file():
-                raise DjetError(f'{file}:={path} is no file')
+                raise DjetError(f'{file}:={path} does not exist or is not a file; give the path '
+                                'of a YAML parameter file')
         values = _sim_time(context)
-        for argument in says:
-            parameter, kind = _SAID[argument]
-            # An empty one would take away what a file says.
+        for argument in overrides:
+            parameter, kind = _OVERRIDES[argument]
+            # An empty argument must not override a file.
             given = LaunchConfiguration(argument)
             if given.perform(context):
                 values[parameter] = ParameterValue(given, value_type=kind)

@@ -1,4 +1,4 @@
-"""ROS 2 as a live node's middleware."""
+"""The middleware of a live node on ROS 2 (rclpy)."""
 
 from __future__ import annotations
 
@@ -31,21 +31,20 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
-# Seconds between two looks for events of publishers, which rclpy logs. Each publisher has two, and
-# to wait for all of them took as long as all else that is waited for.
+# Seconds between two checks for publisher events, which rclpy logs. Each publisher has two event
+# handlers, and waiting for all of them took as long as everything else in the wait set.
 _EVENTS_PERIOD = 1.0
 
-# Messages in the middleware of who keeps what comes. To ROS, KEEP_ALL has no bound that could be
-# set: Cyclone DDS takes gigabytes, and no publisher waits. All are taken as soon as Python gets to
-# run, for which this is enough.
-_KEPT = 50
+# History depth for queue_policy 'every'. ROS cannot bound KEEP_ALL: Cyclone DDS takes gigabytes,
+# and no publisher waits. It is enough until Python gets to run and takes the messages.
+_EVERY_DEPTH = 50
 
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 
 
 def message_type(name: str) -> Any:
-    """Give the class of a message type such as 'sensor_msgs/msg/Image'."""
+    """Return the class of a message type such as 'sensor_msgs/msg/Image'."""
     return _message_type(name)
 
 
@@ -62,55 +61,55 @@ class RosPublisher:
         self._publisher = publisher
 
     def publish(self, message: Any) -> bool:
-        """Hand a message to the middleware, which never refuses one."""
+        """Publish a message; return True, as rclpy accepts all."""
         self._publisher.publish(message)
         return True
 
     @property
     def listeners(self) -> int:
-        """Count the subscriptions."""
+        """Number of subscriptions."""
         return int(self._publisher.get_subscription_count())
 
 
 class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
-    """Leaves events in the middleware for as long as nobody is ready for them."""
+    """A callback group whose events stay in the middleware until ready() is true."""
 
     def __init__(self, ready: Callable[[], bool]) -> None:
         super().__init__()
         self._ready = ready
 
     def can_execute(self, entity: Any) -> bool:
-        """Tell the executor whether to look for events, and to hand one out."""
+        """Return whether the executor may wait for an entity and call it."""
         return self._ready() and bool(super().can_execute(entity))
 
 
 class RosSubscription:
-    """Hears one topic, and counts what its events tell."""
+    """Subscribes to one topic, and counts its QoS events."""
 
     def __init__(self, node: Node, topic: str, kind: str, callback: Callable[[Any], None],
                  profile: Profile) -> None:
         self.topic = topic
         self._lost = self._refused = 0
-        with _asked_for(node, topic):
+        with _report_bad_overrides(node, topic):
             self._subscription = node.create_subscription(
                 message_type(kind), topic, callback, _qos(profile),
                 event_callbacks=SubscriptionEventCallbacks(
                     incompatible_qos=self._note_refusal, message_lost=self._note_loss),
-                # Overrides are by topic; a latched subscription takes after the publisher.
+                # Overrides are by topic, and a latched subscription must match its publisher.
                 qos_overriding_options=None if profile.latched else _OVERRIDES)
 
     @property
     def profile(self) -> Profile:
-        """Give the quality of service that it asks for, after overrides."""
+        """Requested QoS, after overrides."""
         return _profile(self._subscription.qos_profile)
 
     def new_losses(self) -> int:
-        """Count the messages that were lost on the way since the last call."""
+        """Return the number of messages lost in transport since the last call."""
         number, self._lost = self._lost, 0
         return number
 
     def new_refusals(self) -> int:
-        """Count the publishers that turned up since the last call and do not fit."""
+        """Return the number of publishers with incompatible QoS since the last call."""
         number, self._refused = self._refused, 0
         return number
 
@@ -122,7 +121,7 @@ class RosSubscription:
 
 
 class RosMiddleware:
-    """The ROS graph as a node sees it."""
+    """The ROS graph as seen by a node; see ``Middleware``."""
 
     qos_remedy = 'qos_overrides.{topic}.subscription.*'
     senders_wait = False
@@ -139,15 +138,15 @@ class RosMiddleware:
 
     @property
     def node(self) -> str:
-        """Give the name of the node with its namespace."""
+        """Fully qualified node name."""
         return str(self._node.get_fully_qualified_name())
 
     def resolve(self, name: str) -> str:
-        """Give the full name of a topic or service, remapped."""
+        """Return the fully qualified name of a topic or service, with remappings."""
         return str(self._node.resolve_topic_name(name))
 
     def is_remapped(self, name: str) -> bool:
-        """Tell whether a rule of the command line says what a topic is called."""
+        """Return whether the command line remaps a topic, even to its default name."""
         full = self._expand(name)
         return any(old != new and self._expand(old) == full
                    for old, new in topic_rules(sys.argv, self._node.get_name()))
@@ -156,13 +155,13 @@ class RosMiddleware:
         return str(self._node.resolve_topic_name(name, only_expand=True))
 
     def now_ns(self) -> int:
-        """Time of the node's clock, which may be simulated."""
+        """Return the time of the node's clock in nanoseconds, which may be simulated."""
         return int(self._node.get_clock().now().nanoseconds)
 
     def log(self, level: str, text: str) -> None:
-        """Log a line by the node's logger."""
+        """Log a line with the node's logger."""
         logger = self._node.get_logger()
-        # rclpy wants each place in a program to log at one level.
+        # rclpy requires one severity for each call site.
         if level == 'info':
             logger.info(text)
         elif level == 'warning':
@@ -171,49 +170,49 @@ class RosMiddleware:
             logger.error(text)
 
     def advertise(self, topic: str, kind: str) -> RosPublisher:
-        """Publish on a topic; its quality of service can be overridden by parameters."""
-        with _asked_for(self._node, topic):
+        """Create a publisher; parameters can override its QoS."""
+        with _report_bad_overrides(self._node, topic):
             return RosPublisher(self._node.create_publisher(
                 message_type(kind), topic, _qos(DEFAULT_PROFILE), callback_group=self._events,
                 qos_overriding_options=_OVERRIDES))
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None) -> RosSubscription:
-        """Hand the messages on a topic to a callback, at once; overrides as for ``advertise``."""
+        """Subscribe to a topic; ready is not used; overrides as for ``advertise``."""
         return RosSubscription(self._node, topic, kind, callback, profile)
 
     def offers(self, topic: str) -> list[Offer]:
-        """Give who publishes a topic."""
+        """Return the publishers of a topic."""
         return [Offer(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
                       _profile(one.qos_profile))
                 for one in self._node.get_publishers_info_by_topic(topic)]
 
     def published(self, kind: str) -> list[str]:
-        """Give the topics over which somebody sends messages of a ROS type."""
+        """Return the topics of a ROS type that have a publisher."""
         return [name for name, kinds in self._node.get_topic_names_and_types()
                 if kind in kinds and self._node.count_publishers(name)]
 
     def follow_frames(self) -> None:
-        """Hear what tf says from now on; that tf2_ros is there, the parameters have seen to."""
+        """Subscribe to tf; the parameters were checked to require tf2_ros."""
         tf2 = import_module('tf2_ros')
         self._frames = tf2.Buffer()
         self._listener = tf2.TransformListener(self._frames, self._node)
 
     def forget_frames(self) -> None:
-        """Hear no more of tf."""
+        """Unsubscribe from tf."""
         self._listener.unregister()
         self._listener = self._frames = None
 
     def transform(self, parent: str, child: str) -> Array | None:
-        """Give a frame in another (4, 4), the newest that is known, or None."""
-        # Asked from another thread than lets go of it.
+        """Return the newest pose (4, 4) of frame child in parent, or None."""
+        # Called from another thread than forget_frames.
         frames = self._frames
         if frames is None or not frames.can_transform(parent, child, Time()):
             return None
         return pose_of(frames.lookup_transform(parent, child, Time()))[1]
 
     def serve(self, name: str, action: Callable[[], str]) -> None:
-        """Serve std_srvs/srv/Trigger by an action that succeeds and says what it did."""
+        """Create a std_srvs/srv/Trigger service; action returns the message of the response."""
         def answer(_: Any, response: Any) -> Any:
             response.message = action()
             response.success = True
@@ -222,7 +221,7 @@ class RosMiddleware:
         self._node.create_service(Trigger, name, answer)
 
     def spin(self, seconds: float) -> None:
-        """Wait for something to do, at most for some time, and do it."""
+        """Wait for messages and services for at most some seconds, and handle them."""
         self._looks = monotonic() - self._last_look >= _EVENTS_PERIOD
         if self._looks:
             self._last_look = monotonic()
@@ -230,20 +229,20 @@ class RosMiddleware:
 
 
 @contextmanager
-def _asked_for(node: Node, topic: str) -> Iterator[None]:
-    """Say what was asked for a topic where rclpy can't make anything of it."""
+def _report_bad_overrides(node: Node, topic: str) -> Iterator[None]:
+    """Raise DjetError with the QoS overrides of a topic if rclpy rejects them."""
     try:
         yield
     except (AssertionError, RuntimeError, TypeError, ValueError) as error:
-        asked = {name: one.value for name, one
-                 in node.get_parameters_by_prefix(f'qos_overrides.{topic}').items()}
-        raise DjetError(f'{topic} can not be had with qos_overrides.{topic}.* = {asked}: '
-                        f'{one_line(error) or "a value is of another type"}') from error
+        overrides = {name: one.value for name, one
+                     in node.get_parameters_by_prefix(f'qos_overrides.{topic}').items()}
+        raise DjetError(f'{topic} does not accept qos_overrides.{topic}.* = {overrides}: '
+                        f'{one_line(error) or "a value has the wrong type"}') from error
 
 
 def _qos(profile: Profile) -> QoSProfile:
     return QoSProfile(
-        history=QoSHistoryPolicy.KEEP_LAST, depth=profile.depth or _KEPT,
+        history=QoSHistoryPolicy.KEEP_LAST, depth=profile.depth or _EVERY_DEPTH,
         reliability=(QoSReliabilityPolicy.RELIABLE if profile.reliable
                      else QoSReliabilityPolicy.BEST_EFFORT),
         durability=(QoSDurabilityPolicy.TRANSIENT_LOCAL if profile.latched

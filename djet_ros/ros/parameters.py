@@ -1,4 +1,4 @@
-"""The node's parameters: declared from the one configuration, and changed only as it allows."""
+"""ROS parameters of the nodes: declared from the schema, and validated on each change."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from rclpy.parameter import Parameter
 
 class Parameters:
     """
-    Parameters of a node that declares them automatically from overrides.
+    Parameters of the odometry node, which must declare parameters from overrides automatically.
 
-    config: what they say. Raises DjetError where a value given at the start can't be used;
-    unknown names are only warned of, because a file may serve several nodes.
+    config: their values. Raises DjetError if a value given at the start is invalid; unknown names
+    only give a warning, because a file may serve several nodes.
     """
 
     def __init__(self, node: Node) -> None:
@@ -50,9 +50,10 @@ class Parameters:
     def call_on_change(self, prepare: Callable[[Config], None],
                        apply: Callable[[Config], None]) -> None:
         """
-        Accept changes from now on; apply is called with each new configuration.
+        Accept changes from now on.
 
-        prepare is called with it before, and refuses what can't be had by a DjetError.
+        prepare: called with a new configuration, raises DjetError to reject it; apply: called
+        with each accepted configuration.
         """
         self._prepare, self._apply = prepare, apply
         self._node.add_pre_set_parameters_callback(self._complete)
@@ -60,12 +61,12 @@ class Parameters:
         self._node.add_post_set_parameters_callback(self._take)
 
     def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
-        """Make integers floats where those belong, and let a preset set its values."""
+        """Convert integers to floats, and add the values that a preset sets."""
         values = _values(parameters)
         try:
             config = self._with(values)
         except DjetError:
-            # To be refused by _check, which can say why.
+            # _check rejects them with the reason.
             return parameters
         before = flat(self.config)
         return [Parameter(item.name, value=item.value) for item in flat(config).values()
@@ -76,7 +77,7 @@ class Parameters:
         values = _values(parameters)
         try:
             config = _possible(self._with(values))
-            # What topics declare of their own, as qos_overrides, asks for none.
+            # Not for parameters that topics declare, such as qos_overrides.
             if values:
                 self._prepare(config)
         except DjetError as error:
@@ -91,9 +92,9 @@ class Parameters:
 
     def _with(self, values: Mapping[str, Any]) -> Config:
         """
-        Give the configuration with values changed; the preset that it has changes nothing.
+        Return the configuration with values changed; the current preset is not applied again.
 
-        ``ros2 param load`` sets what ``dump`` wrote one by one, the preset after the estimator.
+        ``ros2 param load`` sets the parameters one by one, the preset after the estimator.
         """
         return with_live_values(self.config, {
             name: value for name, value in values.items()
@@ -102,10 +103,10 @@ class Parameters:
 
 def graph_parameters(node: Node) -> Config:
     """
-    Declare the parameters of a pose graph, which hold for the node's life, and read them.
+    Declare the parameters of the pose graph node, all read-only, and return their values.
 
-    Those that it shares with the odometry may come from the same file. Raises DjetError where a
-    value can't be used; unknown names are only warned of.
+    Those that it shares with the odometry may come from the same file. Raises DjetError if a
+    value is invalid; unknown names only give a warning.
     """
     given = _given(node)
     config = from_flat(given)
@@ -119,7 +120,7 @@ def graph_parameters(node: Node) -> Config:
 
 
 def _given(node: Node) -> dict[str, Any]:
-    """Values that came with the start, by names that some node of ours has."""
+    """Return the values given at the start, for the names in the schema; warn about others."""
     known = flat(Config())
     for path in map(Path, values_after(sys.argv, '--params-file')):
         if why := why_unused(path, node.get_fully_qualified_name()):
@@ -133,7 +134,7 @@ def _given(node: Node) -> dict[str, Any]:
 
 def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any], *,
              read_only: bool = False) -> None:
-    """Declare anew with the types, ranges and texts that the overrides do not know."""
+    """Declare parameters with the types, ranges and descriptions that overrides lack."""
     for item in items:
         if item.name in given:
             node.undeclare_parameter(item.name)
@@ -142,7 +143,7 @@ def _declare(node: Node, items: Iterable[FlatParameter], given: Mapping[str, Any
 
 
 def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDescriptor:
-    """Describe a parameter to ROS: text, range, choices, and whether it can change."""
+    """Return the ROS descriptor of a parameter: text, range, choices, read-only."""
     says, choices = item.description, live_choices(item)
     result = ParameterDescriptor(
         description=says.text, read_only=read_only or item.name in FIXED,
@@ -159,7 +160,7 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
 
 
 def _possible(config: Config) -> Config:
-    """Refuse what can't be had in this ROS, and a scale that lacks its length."""
+    """Raise DjetError for a missing ROS package, and for a scale without its length."""
     check_scale(config.odometry)
     if config.ros.publish_tf:
         _require('tf2_msgs', 'tf2-msgs', 'ros.publish_tf is true')
@@ -176,11 +177,11 @@ def _require_frames(config: Config) -> None:
 
 
 def _require(module: str, package: str, asked: str) -> None:
-    """Refuse what is asked for where a Python module of ROS is missing or does not work."""
+    """Raise DjetError if a Python module of ROS that a setting needs cannot be imported."""
     try:
         import_module(module)
     except ImportError as error:
-        raise DjetError(f'{asked}, which needs the Python module {module}: apt install '
+        raise DjetError(f'{asked}, which needs the Python module {module}: sudo apt install '
                         f'ros-$ROS_DISTRO-{package} ({one_line(error)})') from error
 
 

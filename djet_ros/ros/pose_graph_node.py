@@ -10,5 +10,5 @@ from rclpy.node import Node
 
 
 def make(node: Node) -> Face:
-    """Make the pose graph of a node's parameters, which hold for its life."""
+    """Create the pose graph from the parameters of a node, which are read-only."""
     return GraphFace(RosMiddleware(node), graph_parameters(node))

@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 
 def make(node: Node) -> Face:
-    """Make the odometry of a node's parameters; they can be changed while it runs."""
+    """Create the odometry from the parameters of a node, which may change at run time."""
     parameters = Parameters(node)
     face = OdometryFace(RosMiddleware(node), parameters.config)
     parameters.call_on_change(face.connect, face.configure)
