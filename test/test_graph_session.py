@@ -79,7 +79,7 @@ def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
     stamps = [stamp_ns(message.transforms[0].header) for message in one.graph.heard('/tf')]
     assert stamps == [START + i * 100_000_000 for i in range(len(WAYS))]
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
-    assert one.slam.map.imageless == 0
+    assert one.slam.map.without_image == 0
 
 
 def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):

@@ -190,7 +190,7 @@ def test_a_step_says_how_sure_the_rotation_of_its_pose_is(convention):
     odometry, steps = Odometry(convention), StepMessages(convention)
     told(steps, *odometry.start())
     step, = told(steps, *odometry.move(pose(z=1.0), np.diag(np.arange(1.0, 7)**2) * 1e-6))
-    assert np.allclose(step.turn, odometry.covariance[3:, 3:], atol=2e-9)
+    assert np.allclose(step.rotation_covariance, odometry.covariance[3:, 3:], atol=2e-9)
 
 
 def test_a_bad_frame_that_is_bridged_is_no_step():
@@ -489,13 +489,13 @@ def test_the_memory_is_bounded(live):
 def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target):
     """With the forgotten one held relative to its heir, an edge costs what it cost before."""
     from djet_ros.posegraph.backend import factor_graph, initial_values
-    from djet_ros.posegraph.keyframe_map import inherited
+    from djet_ros.posegraph.keyframe_map import transferred
     rng = np.random.default_rng(3)
     poses = np.array([pose(), pose(x=0.3, z=2.0, yaw=0.4), pose(x=-1.0, z=3.0, yaw=-0.7)])
     spread = rng.normal(size=(6, 6)) * 0.1
     told = Edge(source, target, np.linalg.inv(poses[source]) @ poses[target],
                 spread @ spread.T + np.eye(6) * 1e-3, 'loop')
-    ours = inherited(told, 0, np.linalg.inv(poses[0]) @ poses[1])
+    ours = transferred(told, 0, np.linalg.inv(poses[0]) @ poses[1])
     assert {ours.source, ours.target} == {1, 2}
     for _ in range(5):
         moved = poses.copy()

@@ -67,7 +67,7 @@ def test_results_that_can_not_be_begun_leave_the_place_as_it_was(
     # As on a full disk.
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
     try:
-        with pytest.raises(DjetError, match='results could not be begun: File too large'):
+        with pytest.raises(DjetError, match='results could not be created: File too large'):
             ResultsFolder(place, Config())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -185,7 +185,7 @@ def test_a_hole_in_time_is_an_edge_about_which_nothing_is_known(tmp_path):
 
 
 def test_other_folders_and_damaged_results_are_refused(results, tmp_path):
-    with pytest.raises(DjetError, match='holds no results'):
+    with pytest.raises(DjetError, match='is not a results folder'):
         read_results(tmp_path)
     for name, damage, said in (
             ('frames.csv', lambda text: text.replace('OK', 'SPLENDID', 1), 'line 3'),
@@ -265,7 +265,7 @@ SPOILT = [(lambda C, _: C * np.nan, 'is not a finite 6x6 matrix'),
           (lambda C, _: np.zeros((6, 6)), 'has the variance 0'),
           (lambda C, _: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
           (asymmetric, 'is not symmetric'),
-          (no_orientation, 'is no pose of finite numbers')]
+          (no_orientation, 'is not a finite pose')]
 
 
 @pytest.mark.parametrize(('spoil', 'said'), SPOILT)
@@ -304,7 +304,7 @@ def test_results_of_a_killed_replay_give_the_graph_up_to_the_break(results, tmp_
     assert 2 <= len(graph.poses) < FRAMES
     assert np.array_equal(graph.stamps_ns, whole.stamps_ns[:len(graph.poses)])
     assert np.array_equal(graph.poses, whole.poses[:len(graph.poses)])
-    assert f'of {FRAMES} frames the first {len(graph.poses)} are taken' in said[0]
+    assert f'only the first {len(graph.poses)} of {FRAMES} frames are used' in said[0]
     done = djet('export', killed, '--output', tmp_path / 'graph.g2o')
     assert done.stderr == f'djet: warning: {said[0]}\n'
     assert f'{len(graph.poses)} poses' in done.stdout
@@ -346,7 +346,7 @@ def test_in_a_graph_steps_are_as_unsure_as_long_chains_of_them_are(results, tmp_
     for row, edge in zip(csv.DictReader(out.open()), graph.edges, strict=True):
         assert float(row['cov_y_rz']) == pytest.approx(factor * edge.covariance[1, 5], rel=0.02)
     unknown = replace(graph.edges[0], kind='unknown')
-    assert unknown.in_graph() is unknown
+    assert unknown.inflated() is unknown
 
 
 def test_the_command_refuses_to_overwrite_and_says_of_lengths_that_are_unknown(

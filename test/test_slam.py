@@ -87,7 +87,7 @@ def keyframes():
         kept, offsets = KeyframeMap(Config(slam=SlamConfig(**slam))), []
         for step in steps:
             kept.extend(step, lambda stamp: Frame(np.zeros((64, 64), np.uint8), K, stamp))
-            assert not kept.seek()
+            assert not kept.search_loops()
             offsets.append(kept.newest)
         return kept, offsets
     return grown
@@ -120,7 +120,7 @@ def test_where_the_image_of_a_keyframe_is_missing_the_next_frame_takes_its_place
         kept.extend(replace(step, keyframe=i in {0, 2}), lambda stamp: None if stamp == lost
                     else Frame(np.zeros((64, 64), np.uint8), K, stamp))
     assert [one.stamp_ns for one in kept.keyframes] == [10**9, lost + 10**8]
-    assert kept.imageless == 1
+    assert kept.without_image == 1
 
 
 def test_all_frames_have_offsets_from_their_keyframes(keyframes):
@@ -160,17 +160,18 @@ def test_an_error_common_to_all_lengths_is_no_freedom_of_each():
         length = np.pad(motion[:3, 3], (0, 3))
         return Edge(0, 1, motion, np.diag(SIGMAS**2 * 1e-4) + share**2 * np.outer(length, length))
 
-    firm = replace(known_to(0.05), covariance=known_to(0.05).own_covariance(0.05, 0.01))
+    firm = replace(known_to(0.05), covariance=known_to(0.05).independent_covariance(0.05, 0.01))
     assert np.allclose(firm.covariance, known_to(0.01).covariance, atol=1e-15)
     firm.information()
-    assert np.array_equal(known_to(0.01).own_covariance(0.01, 0.02), known_to(0.01).covariance)
+    assert np.array_equal(known_to(0.01).independent_covariance(0.01, 0.02),
+                          known_to(0.01).covariance)
 
 
 def test_a_length_that_nobody_knows_may_be_another_but_not_any():
     """Its standard deviation is itself, and that of what is known beside it stays."""
     motion, direction = pose(z=2.0), np.diag([0, 0, 1.0, 0, 0, 0])
     edge = Edge(0, 1, motion, np.diag(SIGMAS**2) + 1e6 * direction, scale_known=False)
-    assert np.allclose(edge.own_covariance(0.05, 0.01),
+    assert np.allclose(edge.independent_covariance(0.05, 0.01),
                        np.diag([*SIGMAS[:2]**2, 2.0**2, *SIGMAS[3:]**2]))
 
 
@@ -199,12 +200,12 @@ def test_where_no_way_is_known_a_turn_is_known_as_well_as_the_odometry_knows_it(
     before, turned = pose(z=9.0, yaw=0.4), pose(z=9.0, yaw=1.4)
     told, known, own = steps(np.array([pose(), before, turned])), np.eye(3) * 0.5, np.diag(
         [1e-8, 4e-8, 9e-8])
-    told[1] = replace(told[1], turn=known)
+    told[1] = replace(told[1], rotation_covariance=known)
 
     def covariance(turn, status=Status.AMBIGUOUS):
+        last = Step(told[2].stamp_ns, status, turned, rotation_covariance=turn)
         edges = [edges[1].covariance for edges in (
-            keyframes([*told[:2], Step(told[2].stamp_ns, status, turned, turn=turn)])[0].edges,
-            graph_of([*told[:2], Step(told[2].stamp_ns, status, turned, turn=turn)]).edges)]
+            keyframes([*told[:2], last])[0].edges, graph_of([*told[:2], last]).edges)]
         assert np.allclose(*edges)
         return edges[1]
 

@@ -6,10 +6,10 @@ from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.frame import Frame
-from djet_ros.posegraph.loops import unit_change
+from djet_ros.posegraph.loops import log_scale_ratio
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.steps import Step
-from djet_ros.posegraph.units import log_units, scaled, with_one_unit
+from djet_ros.posegraph.units import log_units, rescaled_edge, to_common_unit
 import numpy as np
 import pytest
 
@@ -68,14 +68,14 @@ def test_a_loop_that_contradicts_the_others_has_no_say():
 def test_without_a_loop_that_tells_nothing_changes():
     edges, _ = drifting(circles())
     graph = PoseGraph(np.arange(N), circles(), tuple(edges[:N - 1]))
-    same, factors = with_one_unit(graph)
+    same, factors = to_common_unit(graph)
     assert np.array_equal(factors, np.ones(N))
     assert all(one is other for one, other in zip(same.edges, graph.edges))
 
 
 def test_in_another_unit_an_edge_is_longer_and_as_sure_and_turns_as_before():
     errors, motion = np.random.default_rng(5).normal(size=(6, 20)), circles()[7]
-    edge = scaled(Edge(0, 1, motion, errors @ errors.T / 20), 3.0)
+    edge = rescaled_edge(Edge(0, 1, motion, errors @ errors.T / 20), 3.0)
     assert np.array_equal(edge.motion[:3, :3], motion[:3, :3])
     assert np.array_equal(edge.motion[:3, 3], 3 * motion[:3, 3])
     errors[:3] *= 3
@@ -132,8 +132,8 @@ def test_the_units_at_both_ends_are_compared_where_no_point_is_seen_by_all():
         other, _ = pair(there[100:], still, ways[2], K)
         noisy = [replace(one, y_opt=one.y + noise * rng.normal(size=one.y.shape))
                  for one in (step, loop, other)]
-        ratio, sigma = unit_change(noisy[0], lengths[0] / near, noisy[1], lengths[1] / near,
-                                   noisy[2], lengths[2] / far, K)
+        ratio, sigma = log_scale_ratio(noisy[0], lengths[0] / near, noisy[1], lengths[1] / near,
+                                       noisy[2], lengths[2] / far, K)
         if noise:
             errors.append((ratio - np.log(far / near)) / sigma)
         else:
@@ -152,13 +152,13 @@ def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():
     other, _ = pair(there, rotation_exp(np.array([0.01, 0, 0])), np.array([-0.1, 0, 1.2]), K)
     near, far = 0.5, 0.6  # metres in a unit
     lengths = [np.linalg.norm(way) for way in ([0.1, 0, 1.0], [0.4, 0.1, -0.3], [-0.1, 0, 1.2])]
-    ratio, sigma = unit_change(step, lengths[0] / near, loop, lengths[1] / near, other,
-                               lengths[2] / far, K)
+    ratio, sigma = log_scale_ratio(step, lengths[0] / near, loop, lengths[1] / near, other,
+                                   lengths[2] / far, K)
     assert ratio == pytest.approx(np.log(far / near), abs=1e-6)
     assert sigma == pytest.approx(1e-3)
     few = RelativePose(Status.OK, x=other.x[:9], y=other.y[:9], y_opt=other.y_opt[:9],
                        inliers=np.ones(9, bool), R=other.R, t=other.t)
-    assert unit_change(step, 1.0, loop, 1.0, few, 1.0, K) is None
+    assert log_scale_ratio(step, 1.0, loop, 1.0, few, 1.0, K) is None
 
 
 def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypatch):
@@ -181,7 +181,7 @@ def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypa
             pass
 
         def links(self, current):
-            return [replace(edge, kind='link', source=current - 2, motion=scaled(
+            return [replace(edge, kind='link', source=current - 2, motion=rescaled_edge(
                 Edge(0, 1, np.linalg.inv(truth[current - 2]) @ truth[current], edge.covariance),
                 np.exp(-units[current - 2])).motion) for edge in edges[:N - 1]
                 if edge.target == current and current % 7 == 3]
@@ -196,23 +196,23 @@ def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypa
                     metric=False, keyframe=True)
         graph.extend(step if i else Step(0, Status.FIRST_FRAME, place, keyframe=True),
                      lambda stamp: Frame(np.zeros((4, 4), np.uint8), np.eye(3), stamp))
-        graph.seek()
+        graph.search_loops()
         newest = graph.keyframes[-1]
         newest.pose, newest.factor = truth[i], float(np.exp(units[i]))
     assert (graph.first, graph.count('loop'), graph.count('odometry')) == (N - 40, 6, 39)
     assert graph.count('link') > 3
     for edge in graph.edges:
         source, target = (graph.keyframes[end - graph.first] for end in (edge.source, edge.target))
-        assert np.allclose(scaled(edge, source.factor).motion,
+        assert np.allclose(rescaled_edge(edge, source.factor).motion,
                            np.linalg.inv(source.pose) @ target.pose)
         if edge.kind == 'loop':
-            assert edge.stretch[0] == pytest.approx(np.log(target.factor / source.factor))
+            assert edge.log_scale_ratio[0] == pytest.approx(np.log(target.factor / source.factor))
 
 
 def test_the_first_keyframe_that_is_left_keeps_its_unit():
     edges, _ = drifting(circles())
     graph = PoseGraph(np.arange(N), circles(), tuple(edges))
-    one, ours = with_one_unit(graph), with_one_unit(graph, 1.5)
+    one, ours = to_common_unit(graph), to_common_unit(graph, 1.5)
     assert ours[1] == pytest.approx(1.5 * one[1])
     for mine, theirs in zip(ours[0].edges, one[0].edges):
         assert np.allclose(mine.motion[:3, 3], 1.5 * theirs.motion[:3, 3])

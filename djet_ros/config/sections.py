@@ -88,7 +88,7 @@ class OdometryConfig:
         'excluded, such as those of the bonnet of the vehicle')
     rectified: str = parameter(
         'auto', 'whether the images are rectified: true (camera matrix from P), false (K and D), '
-        "auto (true if the last part of the image topic, or otherwise the part before it, has the "
+        'auto (true if the last part of the image topic, or otherwise the part before it, has the '
         "word 'rect' or 'rectified', such as image_rect_color and rect/image; else false)",
         choices=('auto', 'true', 'false'))
     residual_k1: float = parameter(

@@ -100,7 +100,7 @@ class Publisher:
 
     @property
     def listeners(self) -> int:
-        """Number of subscriptions; 0 once the graph is closed."""
+        """Return the number of subscriptions; 0 once the graph is closed."""
         try:
             return len(self._writer.get_matched_subscriptions())
         except DDSException as error:

@@ -52,7 +52,7 @@ class DdsMiddleware:
 
     @property
     def node(self) -> str:
-        """Fully qualified node name."""
+        """Return the fully qualified node name."""
         return self._names.full_node
 
     def resolve(self, name: str) -> str:

@@ -34,7 +34,7 @@ class Names:
 
     @property
     def full_node(self) -> str:
-        """Fully qualified node name."""
+        """Return the fully qualified node name."""
         return f'{self.namespace.rstrip("/")}/{self.node}'
 
     def expand(self, name: str) -> str:

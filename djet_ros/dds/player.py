@@ -75,7 +75,7 @@ class Player:
 
     @property
     def image_topic(self) -> str:
-        """Resolved image topic."""
+        """Return the resolved image topic."""
         return self._names.resolve(self._recording.image_topic)
 
     def wait_for_listener(self, stop: Event) -> None:

@@ -36,7 +36,7 @@ class FrameQueue(Generic[Item]):
 
     @property
     def dropped(self) -> int:
-        """Number of items dropped so far."""
+        """Return the number of items dropped so far."""
         with self._changed:
             return self._dropped
 
@@ -78,7 +78,7 @@ class FrameQueue(Generic[Item]):
 
     @property
     def weight(self) -> float:
-        """Total weight of the queued items."""
+        """Return the total weight of the queued items."""
         with self._changed:
             return self._weight
 

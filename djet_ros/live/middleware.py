@@ -52,7 +52,7 @@ class Publisher(Protocol):
 
     @property
     def listeners(self) -> int:
-        """Number of subscriptions."""
+        """Return the number of subscriptions."""
 
 
 class Subscription(Protocol):
@@ -62,7 +62,7 @@ class Subscription(Protocol):
 
     @property
     def profile(self) -> Profile:
-        """Requested QoS, after overrides by the user."""
+        """Return the requested QoS, after overrides by the user."""
 
     def new_losses(self) -> int:
         """Return the number of messages lost in transport since the last call."""
@@ -82,11 +82,11 @@ class Middleware(Protocol):
 
     @property
     def node(self) -> str:
-        """Fully qualified node name, such as '/left/vo_node'."""
+        """Return the fully qualified node name, such as '/left/vo_node'."""
 
     @property
     def message_type(self) -> MessageType:
-        """Function from a type name to the message class."""
+        """Return the function from a type name to the message class."""
 
     def resolve(self, name: str) -> str:
         """Return the fully qualified name of a topic or service, with remappings."""

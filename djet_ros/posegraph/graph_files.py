@@ -1,11 +1,11 @@
 """
-Pose graphs as files that other programs read.
+Export of pose graphs to files of other programs.
 
 * g2o: VERTEX_SE3:QUAT and EDGE_SE3:QUAT. The information matrices are over (translation in the
   unit of the trajectory, rotation vector in rad) in the frame of the edge's target, as GTSAM reads
-  them. g2o itself takes the vector part of a quaternion, half the angle.
-* tum, kitti: the poses alone
-* csv: one row per edge with its covariance in ROS order, along the axes of the source
+  them. g2o itself uses the vector part of the quaternion, half the angle.
+* tum, kitti: poses only
+* csv: one row per edge with its covariance in ROS order, in the axes of the source
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _COLUMNS = ('source_stamp_ns', 'target_stamp_ns', 'kind', 'scale_known',
 
 def write_graph(graph: PoseGraph, path: Path, kind: str, overwrite: bool = False) -> None:
     """
-    Write a graph as 'g2o', 'tum', 'kitti' or 'csv', all or nothing.
+    Write a graph as 'g2o', 'tum', 'kitti' or 'csv', atomically.
 
-    Raises DjetError, also for an edge whose covariance can't be inverted.
+    Raises DjetError, also for an edge whose covariance cannot be inverted.
     """
     check_file(path, overwrite)
     graph.check()
@@ -66,7 +66,7 @@ def _csv(graph: PoseGraph) -> Iterator[str]:
 
 
 def _poses(writer: type[TrajectoryWriter]) -> Callable[[PoseGraph], Iterator[str]]:
-    """Make the format of a trajectory file: one line for each pose."""
+    """Return the format of a trajectory file: one line per pose."""
     return lambda graph: (writer.line(stamp, pose)
                           for stamp, pose in zip(graph.stamps_ns.tolist(), graph.poses))
 

@@ -1,4 +1,4 @@
-"""The images of keyframes, and where they are kept."""
+"""Storage of the images and features of keyframes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.recordings.closing import Closing
 import numpy as np
 
-# What is kept of them.
+# Feature arrays that are stored.
 _FEATURES = 'points', 'octaves', 'angles', 'responses', 'descriptors'
 
 
 class KeyframeImage(NamedTuple):
-    """A keyframe's image and its features."""
+    """The image and features of a keyframe."""
 
     frame: Frame
     features: Features
@@ -27,21 +27,21 @@ class KeyframeImage(NamedTuple):
 
 class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
     """
-    Keyframes in a file without a name, so that thousands of them take no memory.
+    Keyframes in an unnamed temporary file, so that thousands of them take no memory.
 
-    folder: where the file is made, None for the system's temporary one. It is gone when it is
-    closed or the process ends, however that ends. DjetError where the disk is full.
+    folder: folder of the file, None for the system's temporary folder. The file disappears when
+    it is closed or the process ends in any way. Raises DjetError if the disk is full.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        """Make the file."""
-        # What is no array is small, and stays in memory.
+        """Create the file."""
+        # Everything but the arrays is small and stays in memory.
         self._kept: dict[int, _Kept] = {}
         try:
             self._file = TemporaryFile(dir=folder)  # noqa: SIM115 (closed by close)
         except OSError as error:
-            raise DjetError(f'no temporary file could be made in {folder}: '
-                            f'{error.strerror}') from error
+            raise DjetError(f'no temporary file for keyframe images could be created in '
+                            f'{folder or "the temporary folder"}: {error.strerror}') from error
 
     def __setitem__(self, number: int, image: KeyframeImage) -> None:
         """Write a keyframe at the end of the file."""
@@ -54,7 +54,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
                 np.save(self._file, array, allow_pickle=False)
         except OSError as error:
             raise DjetError('the images of keyframes could not be written to a temporary file: '
-                            f'{error.strerror}; make room, or take fewer keyframes '
+                            f'{error.strerror}; free disk space, or select fewer keyframes '
                             '(--keyframes distance --keyframe-distance)') from error
         nothing = np.empty((0, 0), np.uint8)
         self._kept[number] = _Kept(offset, replace(frame, gray=nothing, left_out=None))
@@ -70,28 +70,28 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
                              Features.described(**dict(zip(_FEATURES, features))))
 
     def __contains__(self, number: object) -> bool:
-        """Tell whether there is such a keyframe, without reading it."""
+        """Return whether there is such a keyframe, without reading it."""
         return number in self._kept
 
     def __delitem__(self, number: int) -> None:
-        """Forget a keyframe; the file keeps its place."""
+        """Remove a keyframe; its space in the file is not reused."""
         del self._kept[number]
 
     def __iter__(self) -> Iterator[int]:
-        """Give the numbers of all keyframes."""
+        """Iterate over the numbers of the keyframes."""
         return iter(self._kept)
 
     def __len__(self) -> int:
-        """Count the keyframes."""
+        """Return the number of keyframes."""
         return len(self._kept)
 
     def close(self) -> None:
-        """Close the file, which is its end."""
+        """Close the file, which deletes it."""
         self._file.close()
 
 
 class _Kept(NamedTuple):
-    """Where the arrays of a keyframe begin, and the frame without its image."""
+    """The file offset of a keyframe's arrays, and its frame without the image."""
 
     offset: int
     frame: Frame

@@ -1,4 +1,4 @@
-"""A map of keyframes that grows step by step, live or from results, and closes loops."""
+"""An incremental map of keyframes with loop closure, for live and offline use."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
-from djet_ros.posegraph.steps import Step, untold_motion
-from djet_ros.posegraph.units import in_unit, scaled
+from djet_ros.posegraph.steps import Step, unobserved_motion
+from djet_ros.posegraph.units import rescaled_edge, rescaled_motion
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-# Keyframes that may wait for their loops to be sought; until then frames make no more of them.
-_WAITING = 20
+# Keyframes that may be queued for the loop search; while it is full no keyframes are added.
+_MAX_PENDING = 20
 
 
 @dataclass
 class Keyframe:
     """
-    A keyframe of the map: its stamp and its pose (4, 4) in the map, as it is known now.
+    A keyframe of the map: its stamp and its current pose (4, 4) in the map.
 
-    factor: by which lengths in the odometry's unit there are in the map's, which is that of the
-    first keyframe that there was.
+    factor: scale factor from the odometry's unit of length at this keyframe to that of the map,
+    which is the unit at the very first keyframe.
     """
 
     stamp_ns: int
@@ -41,10 +41,10 @@ class Keyframe:
 @dataclass(frozen=True)
 class KeyframeOffset(Motion):
     """
-    Where a frame is in its keyframe.
+    The pose of a frame in its keyframe, with covariance.
 
-    keyframe: its number; known: whether it is known how the camera came from there, otherwise the
-    motion is a guess.
+    keyframe: number of the keyframe; known: whether the whole motion from there was estimated,
+    otherwise it is a guess.
     """
 
     keyframe: int
@@ -55,28 +55,28 @@ class KeyframeOffset(Motion):
 
     def then(self, motion: Array, covariance: Array, scale_known: bool = False,
              known: bool = True) -> KeyframeOffset:
-        """Give the offset of the next frame: its motion (4, 4), with covariance (6, 6)."""
+        """Return the offset of the next frame, from its motion (4, 4) with covariance (6, 6)."""
         return KeyframeOffset(self.keyframe, self.motion @ motion,
                               compose(self.motion, self.covariance, motion, covariance),
                               self.scale_known and scale_known, self.known and known)
 
     def is_far(self, config: SlamConfig) -> bool:
-        """Tell whether the frame is so far away that it should be a keyframe itself."""
+        """Return whether the frame is far enough away to be a keyframe itself."""
         turn = np.degrees(Rotation.from_matrix(self.motion[:3, :3]).magnitude())
         length = np.linalg.norm(self.motion[:3, 3])
         return bool(length >= config.keyframe_distance or turn >= config.keyframe_turn)
 
     def edge(self, target: int) -> Edge:
-        """Give the edge to the frame, as the keyframe with a number."""
+        """Return the edge to the frame as keyframe number target."""
         return Edge(self.keyframe, target, self.motion, self.covariance,
                     'odometry' if self.known else 'unknown', self.scale_known)
 
 
-class _Unsought(NamedTuple):
+class _Pending(NamedTuple):
     """
-    A keyframe whose loops have not been sought yet, and the edge from its neighbour.
+    A keyframe that is queued for the loop search, and the edge from its predecessor.
 
-    k1: radial distortion without which the odometry saw it.
+    k1: radial distortion that the odometry had corrected in it.
     """
 
     frame: Frame
@@ -86,16 +86,16 @@ class _Unsought(NamedTuple):
 
 class KeyframeMap:
     """
-    Keyframes, the edges between them, and where the odometry's frame lies among them.
+    Keyframes, the edges between them, and the pose of the odometry's frame in the map.
 
-    keyframes: those that are kept; first: the number of the oldest of them, by which edges go;
-    newest: the offset of the newest frame; correction (4, 4): the odometry's frame in the map, so
-    that ``correction @ pose`` is the optimised pose of a frame; imageless: frames that would have
-    been keyframes, had their image been there; distrusted: loops that the last optimisation did
-    not believe.
+    keyframes: the current keyframes; first: number of the oldest of them, as used in edges;
+    newest: offset of the newest frame; correction: (4, 4) pose of the odometry's frame in the
+    map, so that ``correction @ pose`` is the optimised pose of a frame; without_image: number of
+    frames that could not become keyframes for lack of an image; rejected_loops: number of loops
+    that the last optimisation rejected.
 
-    kept: where images of keyframes are kept, in memory unless said otherwise; max_keyframes: what
-    bounds the memory, see ``_forget_oldest``; None for no bound.
+    kept: storage of the keyframe images, in memory by default; max_keyframes: limit of the number
+    of keyframes, see ``_forget_oldest``; None for no limit.
     """
 
     def __init__(self, config: Config, kept: MutableMapping[int, KeyframeImage] | None = None,
@@ -105,49 +105,49 @@ class KeyframeMap:
         self._max_keyframes = max_keyframes
         self._finder = EdgeFinder(config.estimator, config.slam, kept)
         self.keyframes: deque[Keyframe] = deque()
-        self.first = self.optimisations = self.imageless = self.distrusted = 0
+        self.first = self.optimisations = self.without_image = self.rejected_loops = 0
         self.correction = np.eye(4)
         self.newest: KeyframeOffset | None = None
         self._newest_step: Step | None = None
-        # Of the frames that may be the next step's previous one, by stamp.
+        # Of the frames that may be the reference of the next step, by stamp.
         self._offsets: dict[int | None, KeyframeOffset] = {}
         self._chain: list[Edge] = []
         self._found: list[Edge] = []
-        # Whether a frame that should have been a keyframe could not be.
+        # Whether a keyframe is overdue, as an earlier frame could not become one.
         self._due = False
-        self._unsought: deque[_Unsought] = deque()
-        self._sought = 0
-        # Whether all lengths so far are in metres, so that no unit of them drifts.
+        self._pending: deque[_Pending] = deque()
+        self._searched = 0
+        # Whether all lengths so far are in metres, so that there is no scale drift.
         self._metric = True
 
     @property
     def edges(self) -> list[Edge]:
-        """Edges by the numbers in which keyframes came: of neighbours, then links and loops."""
+        """Return all edges by keyframe numbers: of consecutive ones, then links and loops."""
         return [*self._chain, *self._found]
 
     @property
     def waiting(self) -> int:
-        """Count the keyframes whose loops have not been sought yet."""
-        return len(self._unsought)
+        """Return the number of keyframes queued for the loop search."""
+        return len(self._pending)
 
     def count(self, kind: str) -> int:
-        """Count the edges of a kind."""
+        """Return the number of edges of a kind."""
         return sum(edge.kind == kind for edge in self.edges)
 
     def extend(self, step: Step, image: Callable[[int], Frame | None]) -> None:
         """
-        Take the next step, whose frame may become a keyframe.
+        Add the next step of the odometry; its frame may become a keyframe.
 
-        image: gives the frame of a stamp, or None where its image has not come. A frame without
-        one is no keyframe; the next one may be.
+        image: function from a stamp to its frame, or None if its image is missing. Such a frame
+        cannot be a keyframe, and the next frame is tried.
         """
         offset = self._offset(step)
         self._metric = self._metric and (step.metric or not step.scale_known)
         frame = None
         self._due = self._due or self._is_keyframe(step, offset)
-        if self._due and len(self._unsought) < _WAITING:
+        if self._due and len(self._pending) < _MAX_PENDING:
             frame = image(step.stamp_ns)
-            self.imageless += frame is None
+            self.without_image += frame is None
         if frame is not None:
             self._due = False
             offset = self._add(step, frame, offset)
@@ -156,14 +156,14 @@ class KeyframeMap:
         reference = self._offsets.get(step.previous_stamp_ns)
         self._offsets = {step.stamp_ns: offset}
         if step.tracked and reference is not None:
-            # It may be the next step's previous frame again: then the camera was stationary, and
-            # this keyframe is as good for both.
+            # The reference may remain that of the next step: then the camera was stationary, and
+            # this keyframe serves both frames.
             self._offsets[step.previous_stamp_ns] = reference if frame is None else \
                 KeyframeOffset(offset.keyframe, np.asarray(np.linalg.inv(step.motion)))
         self.newest, self._newest_step = offset, step
 
     def _is_keyframe(self, step: Step, offset: KeyframeOffset | None) -> bool:
-        """Tell whether a step's frame should be a keyframe."""
+        """Return whether the frame of a step should become a keyframe."""
         if offset is None or not offset.known:
             return True
         if step.keyframe is None or self._slam.keyframes == 'distance':
@@ -171,16 +171,16 @@ class KeyframeMap:
         return step.keyframe
 
     def _offset(self, step: Step) -> KeyframeOffset | None:
-        """Offset of a step's frame; if the odometry began anew, its frame moves in the map."""
+        """Return the offset of a step's frame; after a reset of the odometry, move its frame."""
         if self.newest is None or self._newest_step is None:
             return None
         reference = self._offsets.get(step.previous_stamp_ns)
         if step.tracked and reference is not None:
-            covariance = step.own_covariance(self._uncertainty, self._slam.length_noise)
+            covariance = step.independent_covariance(self._uncertainty, self._slam.length_noise)
             return reference.then(step.motion, covariance, step.scale_known)
-        guess, covariance = untold_motion(self._newest_step, step)
+        guess, covariance = unobserved_motion(self._newest_step, step)
         if not step.in_frame_of(self._newest_step):
-            # Where the camera was last is as good a guess as any.
+            # The best guess is the last pose.
             self.correction = (self.correction @ self._newest_step.pose
                                @ np.linalg.inv(step.pose))
             guess = np.eye(4)
@@ -193,22 +193,22 @@ class KeyframeMap:
             self._chain.append(before)
         factor = self.keyframes[-1].factor if self.keyframes else 1.0
         self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose, factor))
-        self._unsought.append(_Unsought(frame, before, step.k1))
+        self._pending.append(_Pending(frame, before, step.k1))
         if self._max_keyframes is not None and len(self.keyframes) > self._max_keyframes:
             self._forget_oldest()
         return KeyframeOffset(number)
 
-    def seek(self) -> bool:
-        """Seek the loops of one keyframe that waits; tells whether edges were found."""
-        if not self._unsought:
+    def search_loops(self) -> bool:
+        """Search loops and links of one queued keyframe; return whether edges were found."""
+        if not self._pending:
             return False
-        number = self._sought
-        frame, before, k1 = self._unsought.popleft()
+        number = self._searched
+        frame, before, k1 = self._pending.popleft()
         self._finder.add(frame, before, k1)
-        self._sought += 1
-        self._finder.forget(min(self.first, self._sought))
-        # Without a step before it a loop has no length, nor anything that bears it out: the next
-        # keyframe will have one.
+        self._searched += 1
+        self._finder.forget(min(self.first, self._searched))
+        # Without an odometry edge to its predecessor, the length of a loop cannot be determined:
+        # the next keyframe will have one.
         if number < self.first or before is None or before.kind != 'odometry':
             return False
         found = [*self._finder.links(number), *self._finder.loops(number, units=not self._metric)]
@@ -216,11 +216,11 @@ class KeyframeMap:
         return bool(found)
 
     def optimise(self) -> OptimisedGraph:
-        """Move the keyframes, at least one, to where the edges want them; see ``optimise``."""
+        """Optimise the poses of the keyframes, of which there is at least one."""
         assert self.newest is not None
         assert self._newest_step is not None
         edges = tuple(replace(
-            edge.in_graph(), source=edge.source - self.first, target=edge.target - self.first)
+            edge.inflated(), source=edge.source - self.first, target=edge.target - self.first)
             for edge in self.edges)
         optimised = optimise(PoseGraph(
             np.array([one.stamp_ns for one in self.keyframes]),
@@ -228,9 +228,9 @@ class KeyframeMap:
         for keyframe, pose, factor in zip(self.keyframes, optimised.graph.poses,
                                           optimised.factors.tolist()):
             keyframe.pose, keyframe.factor = pose, factor
-        self.distrusted = optimised.rejected('loop')
+        self.rejected_loops = optimised.rejected('loop')
         newest = self.newest.keyframe - self.first
-        here = self.keyframes[newest].pose @ in_unit(
+        here = self.keyframes[newest].pose @ rescaled_motion(
             self.newest.motion, float(optimised.factors[newest]))
         self.correction = here @ np.linalg.inv(self._newest_step.pose)
         self.optimisations += 1
@@ -238,41 +238,41 @@ class KeyframeMap:
 
     def _forget_oldest(self) -> None:
         """
-        Hold the oldest keyframe where it is now, relative to the one after it, and forget it.
+        Remove the oldest keyframe, and transfer its edges to the next one.
 
-        That one is then the first, which every optimisation holds. What was known by the
-        forgotten one is known by it from now on.
+        The relative pose of the two is fixed at its current value. The next keyframe becomes the
+        first one, which every optimisation keeps fixed.
         """
-        oldest, heir = self.first, self.first + 1
+        oldest, successor = self.first, self.first + 1
         self._chain, self._found = (
-            [self._left_to_heir(edge) if oldest in (edge.source, edge.target) else edge
-             for edge in edges if {edge.source, edge.target} != {oldest, heir}]
+            [self._transfer(edge) if oldest in (edge.source, edge.target) else edge
+             for edge in edges if {edge.source, edge.target} != {oldest, successor}]
             for edges in (self._chain, self._found))
         self.keyframes.popleft()
-        self.first = heir
+        self.first = successor
 
-    def _left_to_heir(self, edge: Edge) -> Edge:
-        """Hang an edge, which has the unit of its source, on the keyframe after the oldest."""
-        oldest, heir = self.keyframes[0], self.keyframes[1]
-        change = heir.factor / oldest.factor
+    def _transfer(self, edge: Edge) -> Edge:
+        """Transfer an edge, which is in the unit of its source, from the oldest keyframe."""
+        oldest, successor = self.keyframes[0], self.keyframes[1]
+        change = successor.factor / oldest.factor
         if edge.source == self.first:
-            edge = scaled(edge, 1 / change)
+            edge = rescaled_edge(edge, 1 / change)
         source = self.keyframes[max(edge.source - self.first, 1)]
-        between = np.asarray(np.linalg.inv(oldest.pose) @ heir.pose)
-        return inherited(edge, self.first, in_unit(between, 1 / source.factor), change)
+        between = np.asarray(np.linalg.inv(oldest.pose) @ successor.pose)
+        return transferred(edge, self.first, rescaled_motion(between, 1 / source.factor), change)
 
 
-def inherited(edge: Edge, oldest: int, between: Array, change: float = 1.0) -> Edge:
+def transferred(edge: Edge, oldest: int, between: Array, change: float = 1.0) -> Edge:
     """
-    Hang an edge of a keyframe on the one after it, ``between`` (4, 4) in the former.
+    Transfer an edge of a keyframe to the next one, whose pose in it is ``between`` (4, 4).
 
-    Wherever the edge's other end is, the edge finds it as likely as before. change: the unit of
-    lengths at the one after over that at the keyframe; motions are in that of the edge's source.
+    The likelihood of the pose at the other end does not change. change: unit of length at the
+    next keyframe relative to that at the keyframe; motions are in the unit of the edge's source.
     """
     sign = 1 if edge.target == oldest else -1
-    if edge.stretch is not None:
-        edge = replace(edge, stretch=(edge.stretch[0] + sign * float(np.log(change)),
-                                      edge.stretch[1]))
+    if edge.log_scale_ratio is not None:
+        ratio, sigma = edge.log_scale_ratio
+        edge = replace(edge, log_scale_ratio=(ratio + sign * float(np.log(change)), sigma))
     if edge.target == oldest:
         return replace(edge, target=oldest + 1, motion=edge.motion @ between,
                        covariance=compose(edge.motion, edge.covariance, between,

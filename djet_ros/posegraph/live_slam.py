@@ -1,7 +1,7 @@
 """
-Messages in, messages out: the SLAM beside a live odometry, without clock, thread or socket.
+The live pose graph, from messages to messages, without clock, thread or socket.
 
-Its poses come from the odometry, its loops from the images of keyframes.
+Its motions come from the odometry, its loops from the images of keyframes.
 """
 
 from __future__ import annotations
@@ -37,51 +37,49 @@ _DIAGNOSTICS_PERIOD_NS = 10**9
 
 class LiveSlam:
     """
-    Closes loops while the odometry goes on.
+    Closes loops on a running odometry.
 
-    config: slam, estimator, and what else it shares with the odometry (listed as SHARED in
-    live/parameters.py);
-    still_mask is what odometry.mask_file leaves out of all images, (H, W) bool;
-    message_type gives the class for a type name; image_topic is the resolved name of the images'
-    topic, by which odometry.rectified 'auto' goes; node is the name by which the diagnostics are
-    told from those of others.
+    config: sections slam and estimator, and the parameters shared with the odometry (SHARED in
+    live/parameters.py); still_mask: (H, W) bool, pixels that odometry.mask_file excludes from all
+    images; message_type: function from a type name to its class; image_topic: resolved image
+    topic, for odometry.rectified 'auto'; node: node name in the diagnostics.
 
-    Outgoing topics: /tf (the odometry's frame in the map, for each frame that was tracked), path
-    (the optimised poses of the keyframes and of the newest frame), /diagnostics.
+    Outgoing topics: /tf (map to odometry frame, for each step), path (optimised poses of the
+    keyframes and of the newest frame), /diagnostics.
     """
 
     def __init__(self, config: Config, message_type: MessageType, image_topic: str = '',
                  node: str = 'pose_graph_node',
                  still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config, self.slam = config, config.slam
-        # What a face adds to each diagnostics message.
+        # Values that the live node adds to each diagnostics message.
         self.face_values: dict[str, str] = {}
         self._messages = MessageFactory(message_type)
         self._node = node
         self._rectified = means_rectified(config.odometry.rectified, image_topic)
-        # The camera's optical frame in the frame that poses are of.
+        # Pose of the camera's optical frame in the frame whose poses are published.
         self._mounting = np.eye(4)
         if config.odometry.frame_convention == 'body':
             self._mounting[:3, :3] = OPTICAL_TO_BODY
         self.mounted = not config.odometry.base_frame
         self._info: Any = None
         self._camera: Camera | None = None
-        # Each with the camera that took it; None where no CameraInfo had come yet.
+        # Images with their cameras by stamp; None before the first CameraInfo.
         self._images: OrderedDict[int, tuple[Any, Camera | None]] = OrderedDict()
         self._masks = Masks(still_mask)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the map and everything that waits; the CameraInfo stays."""
+        """Discard the map and all waiting messages, but not the CameraInfo."""
         self._images.clear()
         self._masks.reset()
         self._begin()
 
     def _begin(self) -> None:
         self.map = KeyframeMap(self.config, max_keyframes=self.slam.max_keyframes)
-        # When it was optimised last (ns), and whether edges were found since.
+        # Stamp of the last optimisation (ns), and whether edges were found since.
         self._optimised_ns, self._changed = 0, False
-        # Why the newest message could not be used, for a log; None when it could.
+        # Why the newest message was rejected, for the log; None if it was accepted.
         self.problem: DjetError | None = None
         self.rejected: Counter[str] = Counter()
         self._steps = self._new_steps()
@@ -96,26 +94,27 @@ class LiveSlam:
 
     def mount(self, transform: Transform) -> str:
         """
-        Ask where the camera is on base_frame; no odometry can be used until that is known.
+        Look up the pose of the camera in base_frame, without which no odometry can be used.
 
-        Gives, in words, what is missing for it, or nothing.
+        Returns what is missing for it, or ''.
         """
         if not self._images:
-            return 'no image has come that tells the frame of the camera'
+            return 'no image received yet, whose frame_id is the frame of the camera'
         config = self.config.odometry
         newest, _ = next(reversed(self._images.values()))
         camera, axes = mounted_frame(config, frame_of(newest.header))
         found = transform(config.base_frame, camera)
         if found is None:
-            return f"tf does not know where '{camera}' is on '{config.base_frame}'"
+            return (f"tf has no transform from '{config.base_frame}' (odometry.base_frame) to "
+                    f"'{camera}'; publish it on /tf_static")
         self._mounting, self.mounted = np.asarray(found @ axes), True
         self._steps = self._new_steps()
         return ''
 
-    # What comes in
+    # Inputs
 
     def camera_info(self, message: Any) -> None:
-        """Take a CameraInfo; it holds for the images that come from now on."""
+        """Take a CameraInfo for the images that arrive after it."""
         if self._info is None or not same_camera(self._info, message):
             self._info = message
             try:
@@ -127,7 +126,7 @@ class LiveSlam:
                 self._reject('camera_info', problem)
 
     def image(self, message: Any) -> None:
-        """Take an Image or a CompressedImage; it waits for the odometry of its stamp."""
+        """Take an Image or CompressedImage; it waits for the odometry of its stamp."""
         stamp = stamp_ns(message.header)
         self._images[stamp] = message, self._camera
         self._images.move_to_end(stamp)
@@ -135,7 +134,7 @@ class LiveSlam:
             self._images.popitem(last=False)
 
     def mask(self, message: Any) -> None:
-        """Take the mask of an image, for odometry.mask."""
+        """Take the mask of an image (odometry.mask)."""
         self._masks.add(message)
 
     def relative_pose(self, message: Any) -> list[Outgoing]:
@@ -147,7 +146,7 @@ class LiveSlam:
             return []
 
     def relative_pose_status(self, message: Any) -> list[Outgoing]:
-        """Take what the odometry says of a frame beside its poses."""
+        """Take the status that the odometry publishes for a frame."""
         try:
             return self._take(self._steps.status(message))
         except DjetError as problem:
@@ -155,9 +154,9 @@ class LiveSlam:
             return []
 
     def odometry(self, message: Any) -> list[Outgoing]:
-        """Take an Odometry; a step back in time begins everything anew."""
+        """Take an Odometry; a step back in time starts a new map."""
         if self._steps.goes_back(message):
-            # Its image has come already, and perhaps what else belongs to it.
+            # Its image, and perhaps its other messages, have arrived already: keep them.
             steps = self._steps
             self._begin()
             steps.go_back(stamp_ns(message.header))
@@ -168,15 +167,15 @@ class LiveSlam:
             self._reject('odometry', problem)
             return []
 
-    # What comes of it
+    # Outputs
 
     def work(self, *, at_once: bool = False) -> list[Outgoing]:
         """
-        Do one piece of what takes long: seek a keyframe's loops, and optimise if it is time.
+        Search the loops of one keyframe, and optimise if slam.optimise_period has passed.
 
-        To be called when nothing else waits. at_once: also where it is not yet time.
+        To be called while no messages are waiting. at_once: optimise without regard to the period.
         """
-        self._changed |= self.map.seek()
+        self._changed |= self.map.search_loops()
         if not self._changed or self._last is None:
             return []
         waited = self._last.stamp_ns - self._optimised_ns
@@ -188,12 +187,12 @@ class LiveSlam:
 
     @property
     def idle(self) -> bool:
-        """Whether no keyframe waits for its loops."""
+        """Whether no keyframe is queued for the loop search."""
         return not self.map.waiting
 
     @property
     def state(self) -> tuple[str, str]:
-        """Level (OK, WARN, ERROR) and words for what it is doing."""
+        """Return the level (OK, WARN, ERROR) and summary for the diagnostics."""
         if self.problem is not None:
             return 'ERROR', 'message rejected'
         if not self.mounted:
@@ -206,16 +205,16 @@ class LiveSlam:
         return 'OK', 'mapping'
 
     def diagnostics(self, stamp: int) -> Outgoing:
-        """Give the diagnostics message of this moment, in nanoseconds."""
+        """Return the diagnostics message with a stamp in nanoseconds."""
         graph, (level, summary) = self.map, self.state
         values = {
             'state': summary,
             'keyframes': str(len(graph.keyframes)),
             'keyframes forgotten': str(graph.first),
             'keyframes waiting': str(graph.waiting),
-            'keyframes without image': str(graph.imageless),
+            'keyframes without image': str(graph.without_image),
             'loops': str(graph.count('loop')),
-            'loops not trusted': str(graph.distrusted),
+            'loops not trusted': str(graph.rejected_loops),
             'links': str(graph.count('link')),
             'unknown motions': str(graph.count('unknown')),
             'optimisations': str(graph.optimisations),
@@ -245,9 +244,9 @@ class LiveSlam:
         return outgoing
 
     def _frame(self, stamp: int) -> Frame | None:
-        """Frame of the image with a stamp, which waits no longer; None where none is to be had."""
+        """Return the frame of the image with a stamp, and remove the image; None without one."""
         message, camera = self._images.pop(stamp, (None, None))
-        # The first CameraInfo may come after its image, which the odometry had with it.
+        # The first CameraInfo may arrive after the first image that the odometry used it for.
         camera = camera or self._camera
         if message is None or camera is None:
             return None

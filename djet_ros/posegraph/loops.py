@@ -1,4 +1,4 @@
-"""Edges between keyframes that are no neighbours: links over a few, and loops."""
+"""Edges between non-consecutive keyframes: links over a few keyframes, and loops."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from djet_ros.posegraph.pose_graph import Edge
 import numpy as np
 from numpy.typing import NDArray
 
-# A place is seen again from beside, from nearer or from farther off: its features are sought in
-# a wider circle than those of the next frame.
+# Search radius of features in a loop, as a share of the longer image side: a place is revisited
+# from another viewpoint.
 _SEARCH_RADIUS = 0.4
 
-# Points that two pairs of views must share, for the one to tell the other its length.
-_LEAST_SHARED = 20
+# Minimum number of points that two pairs of views must share to transfer a length.
+_MIN_SHARED = 20
 
 # Parallax in rad below which a depth is noise (about a pixel of a car's camera).
-_LEAST_PARALLAX = 1.5e-3
+_MIN_PARALLAX = 1.5e-3
 
 
 class EdgeFinder:
     """
-    Estimates edges between keyframes from their images, which are kept until they are forgotten.
+    Estimates edges between keyframes from their images, which it stores.
 
-    Keyframes have the numbers in which they come: 0, 1 and so on. kept: where their images and
-    features are kept; in memory unless said otherwise.
+    Keyframes are numbered in the order in which they are added: 0, 1 and so on. kept: storage of
+    their images and features, in memory by default.
     """
 
     def __init__(self, estimator: EstimatorConfig, config: SlamConfig,
@@ -52,23 +52,23 @@ class EdgeFinder:
         self._wide = TwoViewEstimator(replace(
             estimator, search_radius=max(estimator.search_radius, _SEARCH_RADIUS)))
         self._kept: MutableMapping[int, KeyframeImage] = {} if kept is None else kept
-        # Nanoseconds that have gone by until each keyframe; a step back in time takes none.
+        # Elapsed time in ns at each keyframe; steps back in time count as 0.
         self._times: list[int] = []
         self._stamp_ns = self._time = 0
-        # The k1 without which each keyframe's features are.
+        # The k1 that is corrected in the features of each keyframe.
         self._lenses: list[float] = []
         self._places = PlaceIndex()
-        # The neighbour before each keyframe: the motion to it has a length.
+        # The odometry edge to each keyframe from its predecessor.
         self._before: dict[int, Edge] = {}
         self._first = 0
-        # The newest keyframe that was asked, and its motion back to its neighbour.
+        # The newest keyframe, and its estimated motion back to its predecessor (cache).
         self._newest: tuple[int, RelativePose] | None = None
 
     def add(self, frame: Frame, before: Edge | None = None, k1: float = 0.0) -> None:
         """
-        Take the next keyframe, and the edge from its neighbour.
+        Add the next keyframe, and the edge from its predecessor.
 
-        k1: radial distortion without which the odometry saw it.
+        k1: radial distortion that the odometry had corrected in it.
         """
         number = self._first + len(self._times)
         gray, left_out = frame.gray, frame.left_out
@@ -85,7 +85,7 @@ class EdgeFinder:
             self._before[number] = before
 
     def forget(self, first: int) -> None:
-        """Forget the keyframes before one; nothing is found between them and others any more."""
+        """Remove the keyframes before one."""
         for number in range(self._first, first):
             self._kept.pop(number, None)
             self._before.pop(number, None)
@@ -95,9 +95,9 @@ class EdgeFinder:
 
     def links(self, current: int) -> Iterator[Edge]:
         """
-        Link a keyframe to the last few before it, but for its neighbour, by direct estimates.
+        Yield two-view estimates to the last few keyframes before one, except its predecessor.
 
-        Their lengths are taken as unknown: the odometry's are in the graph already.
+        Their lengths count as unknown, as those of the odometry are in the graph already.
         """
         motion, previous = np.eye(4), current
         for step in range(self._config.links):
@@ -111,14 +111,14 @@ class EdgeFinder:
     def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
         k1 = self._lens(current)
         relative = self._near.estimate(self._view(previous, k1), self._view(current, k1))
-        if relative.status is Status.OK and self._is_sure(relative):
+        if relative.status is Status.OK and self._is_verified(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
     def loops(self, current: int, units: bool = False) -> Iterator[Edge]:
         """
-        Propose keyframes that look like this one, and give those that geometry bears out.
+        Yield loops of a keyframe: similar keyframes that pass geometric verification.
 
-        units: whether to compare the units of lengths at both ends, see ``unit_change``.
+        units: whether to estimate the ratio of the units at both ends, see ``log_scale_ratio``.
         """
         config, here = self._config, current - self._first
         latest = self._times[here] - config.loop_gap * 1e9
@@ -135,23 +135,23 @@ class EdgeFinder:
         if not of_one_camera(view, other):
             return
         relative = self._wide.estimate(view, other)
-        if relative.status in TRACKED and self._is_sure(relative):
+        if relative.status in TRACKED and self._is_verified(relative):
             length = self._length(current, relative)
             edge = _edge(current, place, relative, length, 'loop')
             yield edge if not units else replace(
-                edge, stretch=self._stretch(current, place, relative, length))
+                edge, log_scale_ratio=self._log_scale_ratio(current, place, relative, length))
 
-    def _stretch(self, current: int, place: int, loop: RelativePose,
-                 length: Length) -> tuple[float, float] | None:
-        """Compare the units at both ends of a loop, by points that the steps to both saw too."""
+    def _log_scale_ratio(self, current: int, place: int, loop: RelativePose,
+                         length: Length) -> tuple[float, float] | None:
+        """Estimate the ratio of the units at the ends of a loop, from points shared with steps."""
         k1 = self._lens(current)
         near, far = self._depths(current, k1), self._depths(place, k1)
         if not length.known or near is None or far is None:
             return None
-        return unit_change(*near, loop, length.value, *far, self._kept[current].frame.K)
+        return log_scale_ratio(*near, loop, length.value, *far, self._kept[current].frame.K)
 
     def _depths(self, number: int, k1: float) -> tuple[RelativePose, float] | None:
-        """Motion from a keyframe back to its neighbour, and its length; None if not known."""
+        """Return the motion of a keyframe back to its predecessor and its length, or None."""
         step = self._before.get(number)
         if step is None or step.source not in self._kept or not step.scale_known:
             return None
@@ -160,7 +160,7 @@ class EdgeFinder:
         return (back, length) if back.status is Status.OK and length else None
 
     def _back(self, number: int, neighbour: int, k1: float) -> RelativePose:
-        """Estimate a keyframe's motion back to its neighbour; several loops may ask the newest."""
+        """Estimate the motion back to the predecessor; cached for the newest keyframe."""
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
         back = self._near.estimate(self._view(number, k1), self._view(neighbour, k1))
@@ -169,13 +169,13 @@ class EdgeFinder:
         return back
 
     def _length(self, current: int, relative: RelativePose) -> Length:
-        """Length of a loop's translation, by the points that the last odometry edge saw too."""
+        """Return the length of a loop's translation, from points shared with the last edge."""
         step = self._before.get(current)
         guess = float(np.linalg.norm(step.motion[:3, 3])) if step else 1.0
         if step is None or step.source not in self._kept or not step.scale_known or not guess:
             return unknown(guess)
         if relative.status is Status.NO_PARALLAX:
-            # The same place again: nearer than any step, in whatever direction.
+            # The same place: shorter than a step, in any direction.
             return Length(guess, guess, True)
         depths = self._depths(current, self._lens(current))
         if depths is None:
@@ -184,7 +184,7 @@ class EdgeFinder:
         return transferred_length(depths[0], relative, Length(guess, guess * share, True),
                                   self._kept[current].frame.K)
 
-    def _is_sure(self, relative: RelativePose) -> bool:
+    def _is_verified(self, relative: RelativePose) -> bool:
         inliers = int(relative.inliers.sum())
         return (inliers >= self._config.loop_inliers
                 and inliers >= self._config.loop_share * len(relative.x))
@@ -194,10 +194,11 @@ class EdgeFinder:
 
     def _view(self, keyframe: int, k1: float) -> View:
         """
-        Give the view of a keyframe without a radial distortion, as the newest of a loop has it.
+        Return the view of a keyframe with the radial distortion k1 corrected.
 
-        All of a loop are seen through one lens so: what is found of it later is true of before.
-        Where nothing is known any more, the lens may be another one, and each keeps its own.
+        k1 is that of the newest keyframe of a loop: a later estimate also holds for earlier
+        keyframes. If it is 0 after a reset, the lens may be another, and each keyframe keeps its
+        own.
         """
         own = self._lens(keyframe)
         k1 = k1 or own
@@ -210,57 +211,58 @@ class EdgeFinder:
 def transferred_length(step: RelativePose, other: RelativePose, length: Length,
                        K: Array) -> Length:
     """
-    Length of another motion from the same first view, from the length of a step.
+    Return the length of another motion from the same first view, from the length of a step.
 
-    A point that both pairs saw has one depth, so that its inverse depths in units of the two
-    translations are as the lengths of these. Unknown where too few points are shared.
+    A point seen in both pairs has one depth, so its inverse depths in units of the translations
+    are proportional to their lengths. Unknown if too few points are shared.
     """
-    told = _ratio(_Depths.here(step, K), _Depths.here(other, K))
-    if told is None:
+    estimated = _ratio(_Depths.here(step, K), _Depths.here(other, K))
+    if estimated is None:
         return unknown(length.value)
-    ratio, sigma = told
+    ratio, sigma = estimated
     return Length(length.value * ratio,
                   float(np.hypot(length.value * sigma, length.sigma * ratio)), length.known)
 
 
-def unit_change(step: RelativePose, step_length: float, loop: RelativePose, loop_length: float,
-                other: RelativePose, other_length: float, K: Array) -> tuple[float, float] | None:
+def log_scale_ratio(step: RelativePose, step_length: float, loop: RelativePose,
+                    loop_length: float, other: RelativePose, other_length: float,
+                    K: Array) -> tuple[float, float] | None:
     """
-    Tell how much larger the unit of lengths is at the far end of a loop than at the near one.
+    Estimate the unit of length at the far end of a loop relative to that at the near end.
 
-    step: from the loop's first view to another, other: from its second view to another, with
-    their lengths, each in the unit of its place; the loop's is in the first one's. Gives the
-    logarithm of the ratio of the units and its standard deviation, by what is surer; None where
-    too few points are shared.
-    * Points that all three saw have two depths in the second view. Few are found so often, above
-      all in small images.
-    * Points that the loop shares with one of the others tell its length, once in either unit.
-      There are many, but of a loop with hardly any length they tell little.
+    step: pair from the loop's first view to another, other: pair from its second view to another,
+    each with its length in the unit of its place; loop_length is in the unit of the first.
+    Returns (log ratio, standard deviation) by the more accurate of two estimates, None if too few
+    points are shared:
+    * Points seen in all three pairs have two depths in the second view. They are few, above all in
+      small images.
+    * Points shared by the loop and one other pair give the loop's length, once in each unit. They
+      are many, but hardly determine it if the loop is short.
     """
     near, far = _Depths.here(step, K), _Depths.here(other, K)
     here = _Depths.here(loop, K)
     there = here.there(loop, K)
-    ways = []
+    estimates = []
     at_near, at_far = _ratio(near, here), _ratio(far, there)
     if at_near is not None and at_far is not None:
-        ways.append((np.log(at_near[0] * step_length / (at_far[0] * other_length)),
-                     np.hypot(at_near[1] / at_near[0], at_far[1] / at_far[0])))
+        estimates.append((np.log(at_near[0] * step_length / (at_far[0] * other_length)),
+                          np.hypot(at_near[1] / at_near[0], at_far[1] / at_far[0])))
     mine, others = _shared(near, here)
     inverse = _from(near.inverse[mine] / step_length, here.x[others], loop.R,
                     loop_length * loop.t, K)
     both = _ratio(_Depths(there.x[others], inverse, near.parallax[mine]),
-                  far.of(far.parallax > _LEAST_PARALLAX))
+                  far.of(far.parallax > _MIN_PARALLAX))
     if both is not None:
-        ways.append((np.log(both[0] / other_length), both[1] / both[0]))
-    if not ways:
+        estimates.append((np.log(both[0] / other_length), both[1] / both[0]))
+    if not estimates:
         return None
-    change, sigma = min(ways, key=lambda way: float(way[1]))
-    return float(change), max(float(sigma), 1e-3)
+    ratio, sigma = min(estimates, key=lambda estimate: float(estimate[1]))
+    return float(ratio), max(float(sigma), 1e-3)
 
 
 class _Depths(NamedTuple):
     """
-    What a pair tells of M points in one of its views.
+    Depths of M points in one view of a pair.
 
     x: (M, 2) pixels; inverse: (M,) inverse depths in units of the translation; parallax: (M,) rad.
     """
@@ -271,7 +273,7 @@ class _Depths(NamedTuple):
 
     @classmethod
     def here(cls, pair: RelativePose, K: Array) -> _Depths:
-        """Of the inliers in the pair's first view."""
+        """Return the depths of the inliers in the pair's first view."""
         x = pair.x[pair.inliers]
         rays_x, rays_y = rays(K, x), rays(K, pair.y_opt[pair.inliers])
         inverse, _ = inverse_depths(pair.R, pair.t, rays_x, rays_y)
@@ -279,53 +281,54 @@ class _Depths(NamedTuple):
         return cls(x, inverse, parallax / (rays_y**2).sum(1))
 
     def there(self, pair: RelativePose, K: Array) -> _Depths:
-        """Of the same points in the pair's second view."""
+        """Return the depths of the same points in the pair's second view."""
         return _Depths(pair.y[pair.inliers], _from(self.inverse, self.x, pair.R, pair.t, K),
                        self.parallax)
 
     def of(self, chosen: NDArray[np.bool_]) -> _Depths:
-        """Give some of the points."""
+        """Return the depths of some of the points."""
         return _Depths(*(values[chosen] for values in self))
 
 
 def _from(inverse: Array, x: Array, R: Array, t: Array, K: Array) -> Array:
-    """Inverse depths (M,) in a view to which R, t lead, of pixels x (M, 2); NaN behind it."""
+    """Return the inverse depths (M,) of pixels x (M, 2) in a second view (R, t); NaN behind it."""
     ahead = (rays(K, x) @ R.T)[:, 2] + inverse * t[2]
     return np.asarray(inverse / np.where(ahead > 0, ahead, np.nan))
 
 
 def _shared(first: _Depths, second: _Depths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Give indices (S,) of the points that are the same pixels of a view."""
-    _, mine, others = np.intersect1d(_numbers(first.x), _numbers(second.x), return_indices=True)
+    """Return two index arrays (S,) of the points with the same pixels."""
+    _, mine, others = np.intersect1d(_pixel_keys(first.x), _pixel_keys(second.x),
+                                     return_indices=True)
     return mine, others
 
 
-def _numbers(points: Array) -> NDArray[np.int64]:
-    """Numbers (M,) of pixels (M, 2), equal where these are."""
+def _pixel_keys(points: Array) -> NDArray[np.int64]:
+    """Return keys (M,) of pixels (M, 2), equal for equal quarter pixels."""
     columns, rows = np.rint(4 * points).astype(np.int64).T
     return np.asarray(columns + (rows << 20))
 
 
 def _ratio(sure: _Depths, others: _Depths) -> tuple[float, float] | None:
     """
-    Tell by what factor others have larger inverse depths of the same points, and its sigma.
+    Return the ratio of others' inverse depths to those of the same points, and its sigma.
 
-    By points of which the former are sure; None where they are too few.
+    Only points with sufficient parallax in sure are used; None if they are too few.
     """
     mine, theirs = _shared(sure, others)
     x, parallax = sure.x[mine], sure.parallax[mine]
     with np.errstate(divide='ignore', invalid='ignore'):
         ratios = others.inverse[theirs] / sure.inverse[mine]
-    told = (parallax > _LEAST_PARALLAX) & np.isfinite(ratios)
-    if told.sum() < _LEAST_SHARED:
+    used = (parallax > _MIN_PARALLAX) & np.isfinite(ratios)
+    if used.sum() < _MIN_SHARED:
         return None
-    ratio = float(np.median(ratios[told]))
+    ratio = float(np.median(ratios[used]))
     if ratio <= 0:
         return None
-    # Standard deviation of a median, if places apart err independently, and more than that.
-    spread = 1.4826 * float(np.median(np.abs(ratios[told] - ratio)))
-    places = len(np.unique(x[told] // CELL, axis=0))
-    return ratio, 1.2533 * spread * float(np.sqrt(CAUTIOUS_INFLATION / places))
+    # Standard deviation of a median with independent errors per image cell, inflated.
+    spread = 1.4826 * float(np.median(np.abs(ratios[used] - ratio)))
+    cells = len(np.unique(x[used] // CELL, axis=0))
+    return ratio, 1.2533 * spread * float(np.sqrt(CAUTIOUS_INFLATION / cells))
 
 
 def _edge(source: int, target: int, relative: RelativePose, length: Length, kind: str) -> Edge:
@@ -334,6 +337,6 @@ def _edge(source: int, target: int, relative: RelativePose, length: Length, kind
 
 
 def _variance_along(edge: Edge) -> float:
-    """Variance of the length of an edge's motion."""
+    """Return the variance of the length of an edge's motion."""
     direction = unit(edge.motion[:3, 3])
     return float(direction @ edge.covariance[:3, :3] @ direction)

@@ -1,4 +1,4 @@
-"""From the results of a replay to an optimised trajectory: the map, fed from results."""
+"""Offline SLAM: from the results of a replay to an optimised trajectory."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
 from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import graph_of, scale_of, Step
-from djet_ros.posegraph.units import in_unit
+from djet_ros.posegraph.units import rescaled_motion
 from djet_ros.recordings.recording import Recording
 import numpy as np
 
-# What the offline SLAM goes by, of the section slam; the rest is for live use.
+# Parameters of section slam that apply offline; the others are for live use.
 PARAMETERS = tuple(f'slam.{name}' for name in (
     'keyframes', 'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap',
     'loop_votes', 'loop_candidates', 'loop_inliers', 'loop_share'))
@@ -28,10 +28,10 @@ PARAMETERS = tuple(f'slam.{name}' for name in (
 @dataclass(frozen=True)
 class Slam:
     """
-    What came of a run.
+    The result of a run.
 
-    frames: graph of all frames, as the odometry made it; offsets: of each frame from its keyframe;
-    optimised: the graph of the keyframes with links and loops; scale: what lengths are in.
+    frames: graph of all frames by odometry; offsets: pose of each frame in its keyframe;
+    optimised: graph of the keyframes with links and loops; scale: kind of scale of all lengths.
     """
 
     frames: PoseGraph
@@ -45,13 +45,13 @@ class Slam:
         return self.scale is Scale.METRIC
 
     def before(self) -> Array:
-        """Poses (N, 4, 4) of all frames by odometry."""
+        """Return the poses (N, 4, 4) of all frames by odometry."""
         return self.frames.poses
 
     def after(self) -> Array:
-        """Poses (N, 4, 4) of all frames, each moved with its keyframe."""
+        """Return the optimised poses (N, 4, 4) of all frames, each fixed in its keyframe."""
         keyframes, factors = self.optimised.graph.poses, self.optimised.factors
-        return np.array([keyframes[offset.keyframe] @ in_unit(
+        return np.array([keyframes[offset.keyframe] @ rescaled_motion(
             offset.motion, factors[offset.keyframe]) for offset in self.offsets])
 
 
@@ -59,21 +59,21 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
              progress: Callable[[int, int], None] | None = None,
              scratch: Path | None = None) -> Slam:
     """
-    Take keyframes, find links and loops in the recording's images, and optimise.
+    Select keyframes, find links and loops in the images of a recording, and optimise.
 
-    steps: at least one, of the recording's replay with the configuration; progress is called with
-    (frames done, frames in all); scratch: a folder with room for the images of the keyframes,
-    while it lasts. Raises DjetError.
+    steps: at least one, from a replay of the recording with this configuration; progress: called
+    with (frames done, total frames); scratch: folder for the temporary file with the keyframe
+    images. Raises DjetError.
     """
     frames, offsets = graph_of(steps), []
-    # Composed with others, what is wrong with a motion would no longer be seen.
+    # Before motions are composed, which would hide an invalid one.
     frames.check()
     frame_at = frame_finder(recording, config)
     with KeyframeFile(scratch) as kept:
         growing = KeyframeMap(config, kept)
         for number, step in enumerate(steps, 1):
             growing.extend(step, frame_at)
-            growing.seek()
+            growing.search_loops()
             assert growing.newest is not None
             offsets.append(growing.newest)
             if progress is not None:
@@ -82,5 +82,5 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
 
 
 def travelled(poses: Array) -> float:
-    """Length of the trajectory through poses (N, 4, 4)."""
+    """Return the length of the trajectory through poses (N, 4, 4)."""
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

@@ -1,9 +1,9 @@
 """
-Places seen before, by the descriptors that they share.
+Place recognition by voting with shared descriptors.
 
-Locality-sensitive hashing (Gionis, Indyk, Motwani, VLDB 1999): descriptors that agree in some
-chosen bits fall into one bucket; those of a bucket are compared in full. A keyframe gets a vote
-from each feature that has a near descriptor in it.
+Locality-sensitive hashing (Gionis, Indyk, Motwani, VLDB 1999): descriptors that agree in a
+selection of bits share a bucket, and those in one bucket are compared in full. Each feature votes
+for the keyframes that have a similar descriptor.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from numpy.typing import NDArray
 
 Index = NDArray[np.int64]
 
-# With descriptors of one point 20 to 40 bits apart, a table of 16 bits finds about a fifth of
-# them, and eight tables most; wrong ones are compared in full and cost time only.
+# Number of tables, and bits of each. If descriptors of one point differ in 20 to 40 bits, a table
+# of 16 bits finds about a fifth of them, and eight tables most; false ones only cost time.
 _TABLES, _BITS = 8, 16
 
 _CHOSEN = np.random.default_rng(0).permutation(256)[:_TABLES * _BITS].reshape(_TABLES, _BITS)
 
-# Keyframes that are sorted into tables together.
+# Keyframes that share a set of tables.
 _BLOCK = 64
 
-# Descriptors farther apart than this are of different points.
-_NEAR = 40
+# Largest Hamming distance in bits of descriptors of one point.
+_MAX_DISTANCE = 40
 
-# Strongest features that speak for a keyframe.
-_SPEAKERS = 500
+# Number of strongest features of a keyframe that are used.
+_MAX_FEATURES = 500
 
 _ONES = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
 
 
 class PlaceIndex:
     """
-    Descriptors of keyframes in the order of time, and the tables to find near ones.
+    An index of the descriptors of keyframes in order of time.
 
-    The tables are made for blocks of keyframes, when one is full or is asked: so that keyframes
-    can be added at any time.
+    Hash tables are built for blocks of keyframes, when a block is full or queried, so that
+    keyframes can be added at any time.
     """
 
     def __init__(self) -> None:
@@ -48,8 +48,8 @@ class PlaceIndex:
         self._count = 0
 
     def add(self, features: Features) -> None:
-        """Take the features of the next keyframe."""
-        order = np.argsort(-features.responses, kind='stable')[:_SPEAKERS]
+        """Add the features of the next keyframe."""
+        order = np.argsort(-features.responses, kind='stable')[:_MAX_FEATURES]
         self._newest.append(features.descriptors[order])
         self._count += 1
         if len(self._newest) == _BLOCK:
@@ -57,12 +57,12 @@ class PlaceIndex:
             self._newest = []
 
     def forget(self, first: int) -> None:
-        """Forget the keyframes before one, as far as whole blocks are of such."""
+        """Remove the blocks that contain only keyframes before one."""
         self._blocks = [block for block in self._blocks if block.end > first]
 
     def votes(self, features: Features, before: int) -> Index:
-        """Count (before,) the features that each of the first keyframes has too."""
-        order = np.argsort(-features.responses, kind='stable')[:_SPEAKERS]
+        """Return the number (before,) of features with a similar one in each of the first."""
+        order = np.argsort(-features.responses, kind='stable')[:_MAX_FEATURES]
         asking = features.descriptors[order]
         votes = np.zeros(before, np.int64)
         blocks = self._blocks
@@ -78,7 +78,7 @@ class PlaceIndex:
 
 
 class _Block:
-    """Some keyframes in a row, from the one with the number ``first`` to before ``end``."""
+    """Consecutive keyframes, with numbers from ``first`` to before ``end``."""
 
     def __init__(self, first: int, keyframes: Sequence[NDArray[np.uint8]]) -> None:
         self.first, self.end = first, first + len(keyframes)
@@ -87,20 +87,20 @@ class _Block:
         self._tables: list[tuple[NDArray[np.uint16], NDArray[np.uint16]]] = []
         for keys in _keys(self._descriptors):
             order = np.argsort(keys, kind='stable')
-            # A block has fewer descriptors than two bytes can count.
+            # A block has fewer than 2^16 descriptors.
             self._tables.append((keys[order], order.astype(np.uint16)))
 
     def votes(self, asking: NDArray[np.uint8]) -> Index:
-        """Count for each keyframe which of the descriptors (N, 32) have a near one there."""
+        """Return how many of the descriptors (N, 32) have a similar one in each keyframe."""
         mine, found = self._bucket_mates(asking)
-        near = _ONES[asking[mine] ^ self._descriptors[found]].sum(1) <= _NEAR
-        # A feature has one vote for a keyframe, however many near descriptors it finds there.
+        near = _ONES[asking[mine] ^ self._descriptors[found]].sum(1) <= _MAX_DISTANCE
+        # One vote per feature and keyframe, however many similar descriptors there are.
         size = self.end - self.first
         cast = np.unique(mine[near] * size + self._owner[found[near]])
         return np.bincount(cast % size, minlength=size)
 
     def _bucket_mates(self, asking: NDArray[np.uint8]) -> tuple[Index, Index]:
-        """Pairs of descriptors, of those asking and of the block's, that share a bucket."""
+        """Return the index pairs of query and block descriptors that share a bucket."""
         pairs = []
         for keys, (ordered, order) in zip(_keys(asking), self._tables):
             start = np.searchsorted(ordered, keys)
@@ -113,7 +113,7 @@ class _Block:
 
 
 def _keys(descriptors: NDArray[np.uint8]) -> Iterator[NDArray[np.uint16]]:
-    """Buckets (N,) of descriptors (N, 32) in each table."""
+    """Yield, for each table, the buckets (N,) of descriptors (N, 32)."""
     bits = np.unpackbits(descriptors, axis=1)
     for part in _CHOSEN:
         yield bits[:, part].astype(np.uint16) @ (1 << np.arange(_BITS)).astype(np.uint16)

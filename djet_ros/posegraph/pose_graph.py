@@ -1,8 +1,9 @@
 """
-Pose graphs: camera poses and the relative poses between them, with what is known about each.
+Pose graphs: camera poses, and relative poses between them with covariances.
 
-The inside speaks ROS: a motion (4, 4) is the target camera in the source camera, and its
-covariance (6, 6) is over (x, y, z, rotation about x, y, z) along the axes of the source.
+Conventions are those of ROS: a motion (4, 4) is the pose of the target camera in the source
+camera, and its covariance (6, 6) is over (x, y, z, rotation about x, y, z) in the axes of the
+source.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from djet_ros.odometry.uncertainty import in_a_chain, rotated
 import numpy as np
 from numpy.typing import NDArray
 
-# Where nobody knows it, a motion without a translation is taken to be of this length.
+# Length that is assumed for a motion of unknown scale and zero translation.
 _UNIT = 1.0
 
-# Below this share of its variances a direction of a covariance is rounding, not knowledge.
+# Smallest eigenvalue of a correlation matrix that is not rounding.
 _SINGULAR = 1e-15
 
 
 class Motion:
     """
-    What steps, edges and offsets have in common: where one camera is in another's frame.
+    Base of steps, edges and offsets: the pose of one camera in another.
 
     motion (4, 4), covariance (6, 6): see the module; scale_known: whether the length of the motion
-    means anything, in metres or in the one unit of the track.
+    is determined, in metres or in the relative unit of the track.
     """
 
     motion: Array
@@ -35,41 +36,39 @@ class Motion:
     scale_known: bool
 
     def check(self, name: str) -> None:
-        """Raise DjetError, by name, unless it is a pose with a covariance that has an inverse."""
+        """Raise DjetError, with a name, unless the pose is finite and the covariance regular."""
         if self.motion.shape != (4, 4) or not np.isfinite(self.motion).all():
-            raise DjetError(f'the motion of {name} is no pose of finite numbers; leave it out or '
-                            'mend it')
+            raise DjetError(f'the motion of {name} is not a finite pose; correct or remove it')
         wrong = _fault(self.covariance)
         if wrong:
-            raise DjetError(f'the covariance of {name} {wrong}, so that its inverse says nothing; '
-                            'leave it out or mend its covariance')
+            raise DjetError(f'the covariance of {name} {wrong} and cannot be inverted to an '
+                            'information matrix; correct it, or remove the edge')
 
     def covariance_in_target(self) -> Array:
         """
-        Covariance (6, 6) along the axes of the target.
+        Return the covariance (6, 6) in the axes of the target.
 
-        That is the error that g2o and GTSAM minimise, xi in ``motion exp(xi)``.
+        It is that of the error minimised by g2o and GTSAM, xi in ``motion exp(xi)``.
         """
         return rotated(self.motion[:3, :3].T, self.covariance)
 
     def information(self) -> Array:
-        """Inverse of ``covariance_in_target``, of its correlations: variances differ widely."""
+        """Return the inverse of ``covariance_in_target``, whitened first for conditioning."""
         covariance = self.covariance_in_target()
         sigmas = np.sqrt(np.diag(covariance))
         information = np.linalg.inv(covariance / np.outer(sigmas, sigmas)) \
             / np.outer(sigmas, sigmas)
         return np.asarray((information + information.T) / 2)
 
-    def own_covariance(self, uncertainty: float, noise: float) -> Array:
+    def independent_covariance(self, uncertainty: float, noise: float) -> Array:
         """
-        Covariance (6, 6) with its length as sure as it is among those of one odometry.
+        Return the covariance (6, 6) without the length error common to all motions of a track.
 
-        uncertainty: standard deviation of each known length as a share of it; noise: what of it is
-        each length's own. If all lengths of a graph are too large alike, and with them those of
-        the loops, which come from them, then the graph is as consistent as before, only larger:
-        such an error, as far as this length has it, must not make lengths look as if they could
-        give way one by one. A length that nobody knows is in the odometry's units, which all
-        share: were it free, loops of a few keyframes could turn motions round.
+        uncertainty: relative standard deviation of known lengths; noise: its part that is
+        independent between lengths. A common relative error scales the whole graph, loops
+        included, and keeps it consistent; treated as independent it would let single lengths give
+        way in the optimisation. An unknown length is in the odometry's unit, which all motions
+        share, and is limited to itself: were it free, short loops could reverse motions.
         """
         length = float(np.linalg.norm(self.motion[:3, 3]))
         if not self.scale_known:
@@ -91,10 +90,10 @@ class Edge(Motion):
     """
     A relative pose between two vertices of a graph.
 
-    source, target: indices of vertices; kind: 'odometry' (of neighbouring frames), 'link' (over
-    more than one keyframe), 'loop' (of a place seen again) or 'unknown' (not estimated, and the
-    covariance says so); stretch: of a loop, how much larger the unit of lengths is at the target
-    than at the source, as a logarithm and its standard deviation, where that is known.
+    source, target: indices of vertices; kind: 'odometry' (of consecutive frames), 'link' (over
+    more than one keyframe), 'loop' (of a revisited place) or 'unknown' (not estimated, with a
+    large covariance); log_scale_ratio: of a loop, the logarithm of the unit of length at the
+    target over that at the source, and its standard deviation, or None.
     """
 
     source: int
@@ -103,10 +102,10 @@ class Edge(Motion):
     covariance: Array
     kind: str = 'odometry'
     scale_known: bool = True
-    stretch: tuple[float, float] | None = None
+    log_scale_ratio: tuple[float, float] | None = None
 
-    def in_graph(self) -> Edge:
-        """Give the edge as sure as a graph should take it, whose edges err independently."""
+    def inflated(self) -> Edge:
+        """Return the edge with the covariance inflated for correlated errors of the odometry."""
         if self.kind != 'odometry':
             return self
         return replace(self, covariance=in_a_chain(self.covariance))
@@ -114,31 +113,31 @@ class Edge(Motion):
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Stamps (N,) in ns, poses (N, 4, 4) of the camera in its first frame, and edges."""
+    """Stamps (N,) in ns, poses (N, 4, 4) of the camera in the first frame, and edges."""
 
     stamps_ns: NDArray[np.int64]
     poses: Array
     edges: tuple[Edge, ...]
 
     def name(self, edge: Edge) -> str:
-        """Words by which a user finds an edge."""
+        """Return a description of an edge for error messages."""
         return (f'{edge.kind} edge {edge.source} -> {edge.target} '
                 f'({self.stamps_ns[edge.source]} ns -> {self.stamps_ns[edge.target]} ns)')
 
     def check(self) -> None:
-        """Raise DjetError, naming an edge, unless all have motions and covariances to go by."""
+        """Raise DjetError, naming the edge, for an invalid motion or covariance."""
         for edge in self.edges:
             edge.check(self.name(edge))
 
 
 def _clipped(covariance: Array, variance: float) -> Array:
-    """Give a covariance with no direction less sure than a variance."""
+    """Return a covariance with its eigenvalues limited to a variance."""
     values, axes = np.linalg.eigh(covariance)
     return np.asarray(axes * np.minimum(values, variance) @ axes.T)
 
 
 def _fault(covariance: Array) -> str:
-    """Say what is wrong with a covariance; nothing if it can be inverted."""
+    """Return what is wrong with a covariance, or '' if it can be inverted."""
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
         return 'is not a finite 6x6 matrix'
     variances = np.diag(covariance)

@@ -1,4 +1,4 @@
-"""Frames of a recording, as the odometry had them. The live pose graph needs none of this."""
+"""Frames of a recording as the odometry processed them, for offline use."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
 
-# Recorded nanoseconds for which an image waits for its mask, as in a replay.
-_PATIENCE_NS = 10**9
+# Time of the recording, in ns, for which an image waits for its mask, as in a replay.
+_MASK_TIMEOUT_NS = 10**9
 
 
 def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]:
     """
-    Give the function from stamps, in the order of recording, to frames as the odometry had them.
+    Return a function from stamps to frames, to be called in the order of the recording.
 
-    It raises DjetError for a stamp of which the recording has no image, or not in this order.
+    It raises DjetError if the recording has no image with a stamp, or not in this order.
     """
     masks = Masks(still_mask(config.odometry.mask_file))
     images = _images(recording, config, masks)
@@ -35,13 +35,13 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
                 raw = gray_image(message, config.odometry.gray_limits())
                 return Frame(camera.undistort(raw), camera.K, stamp, frame_of(message.header),
                              masks.of(stamp, raw.shape, camera))
-        raise DjetError(f'the recording has no image of {stamp} ns, which its results speak of; '
-                        'give the recording that was replayed')
+        raise DjetError(f'the recording has no image with stamp {stamp} ns, which is in the '
+                        'results; give the recording that was replayed')
     return frame_at
 
 
 def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tuple[Camera, Any]]:
-    """Images of a recording, each with its camera, once their masks are among those given."""
+    """Yield the images of a recording with their cameras, once masks has their masks."""
     rectified = means_rectified(config.odometry.rectified, recording.image_topic)
     camera: Camera | None = None
     mask_topic = recording.beside.get('mask', '') if config.odometry.mask else ''
@@ -54,7 +54,7 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
             waiting.append((recorded, camera, message))
         elif topic == mask_topic:
             masks.add(message)
-        while waiting and (not mask_topic or recorded - waiting[0][0] >= _PATIENCE_NS
+        while waiting and (not mask_topic or recorded - waiting[0][0] >= _MASK_TIMEOUT_NS
                            or masks.has(stamp_ns(waiting[0][2].header))):
             yield waiting.popleft()[1:]
     for _, of_image, message in waiting:
@@ -62,7 +62,7 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
 
 
 def _camera(info: Any, rectified: bool, config: Config) -> Camera | None:
-    """Give the camera of a CameraInfo; None where it makes none, and the odometry had none."""
+    """Return the camera of a CameraInfo; None if it is invalid, as for the odometry."""
     try:
         return Camera.from_info(info, rectified, config.odometry.residual_k1)
     except BadMessage:

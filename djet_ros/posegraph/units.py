@@ -1,12 +1,13 @@
 """
-Drift of a relative scale, seen by loops: how large the unit is at each keyframe.
+Correction of scale drift by loops: the unit of length at each keyframe.
 
-Where lengths are relative, the unit that landmarks carry along wanders. A loop sees points whose
-inverse depths are known in the units of both its ends, so it tells how these compare. Logarithms
-of units are then a graph of numbers, linear and with one unknown for each keyframe: neighbours
-have nearly the same, and a loop a known difference. That is the scale of a Sim(3) pose graph
-(Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010) solved before its
-poses: edges are brought to the first keyframe's unit, and poses are optimised as ever.
+With a relative scale, the unit of length that landmarks propagate drifts. A loop observes points
+whose inverse depths are known in the units at both of its ends, which gives their ratio. The
+logarithms of the units form a linear graph with one unknown per keyframe: consecutive keyframes
+have nearly the same unit, and a loop has a measured difference. This is the scale part of a Sim(3)
+pose graph (Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010), solved
+first: all edges are then rescaled to the unit of the first keyframe, and poses are optimised in
+SE(3).
 """
 
 from __future__ import annotations
@@ -21,74 +22,76 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
-# By how much the unit wanders along an edge, as a share of how unsure its length is; and at least.
-_WANDERING, _LEAST = 0.5, 1e-4
+# Standard deviation of the scale drift along an edge: as a fraction of the relative standard
+# deviation of its length; and at least.
+_DRIFT_FRACTION, _MIN_DRIFT = 0.5, 1e-4
 
-# Rounds of reweighting, in which loops that contradict the others lose their say.
-_ROUNDS = 20
+# Iterations of reweighting, which suppress loops that contradict the others.
+_ITERATIONS = 20
 
-# Standard deviations at which the robust loss bends, in the last rounds; the first ones are mild.
-_BEND, _MILD = 3.0, 100.0
+# Scale of the robust loss in standard deviations, in the last iteration and in the first.
+_LOSS_SCALE, _INITIAL_LOSS_SCALE = 3.0, 100.0
 
 
-def with_one_unit(graph: PoseGraph, first: float = 1.0) -> tuple[PoseGraph, Array]:
+def to_common_unit(graph: PoseGraph, first: float = 1.0) -> tuple[PoseGraph, Array]:
     """
-    Bring all edges of a graph to one unit, which is that of its first vertex over ``first``.
+    Rescale all edges of a graph to a common unit, that at the first vertex divided by ``first``.
 
-    Also gives the factors (N,) that make lengths in the unit of a vertex lengths in that one.
+    Returns (graph, factors (N,)): factors convert lengths in the unit at each vertex.
     """
     factors = first * np.exp(log_units(len(graph.poses), graph.edges))
-    edges = tuple(scaled(edge, float(factors[edge.source])) for edge in graph.edges)
+    edges = tuple(rescaled_edge(edge, float(factors[edge.source])) for edge in graph.edges)
     return replace(graph, edges=edges), factors
 
 
 def log_units(count: int, edges: Sequence[Edge]) -> Array:
-    """Logarithms (N,) of the units at vertices, the first one's 0; all 0 where no loop tells."""
-    told = [edge for edge in edges if edge.stretch is not None]
-    if not told:
+    """Return the log units (N,) of the vertices relative to the first; 0 without such loops."""
+    loops = np.array([edge.log_scale_ratio is not None for edge in edges], bool)
+    if not loops.any():
         return np.zeros(count)
     ends = np.array([(edge.source, edge.target) for edge in edges])
-    loops = np.array([edge.stretch is not None for edge in edges])
-    # A link says nothing of units; an edge without a length hardly anything.
+    # Links carry no information on units, and edges of unknown length hardly any.
     kept = loops | np.array([edge.kind in ('odometry', 'unknown') for edge in edges])
-    difference = np.array([edge.stretch[0] if edge.stretch else 0.0 for edge in edges])
-    sigma = np.array([edge.stretch[1] if edge.stretch else _wandering(edge) for edge in edges])
+    difference = np.array([edge.log_scale_ratio[0] if edge.log_scale_ratio else 0.0
+                           for edge in edges])
+    sigma = np.array([edge.log_scale_ratio[1] if edge.log_scale_ratio else _drift_sigma(edge)
+                      for edge in edges])
     ends, loops, difference, sigma = (values[kept] for values in (ends, loops, difference, sigma))
     rows = np.repeat(np.arange(len(ends)), 2)
     J = coo_matrix((np.tile([-1.0, 1.0], len(ends)), (rows, ends.ravel())),
                    shape=(len(ends), count)).tocsr()[:, 1:]
     weights = sigma**-2
     units = np.zeros(count)
-    for bend in np.geomspace(_MILD, _BEND, _ROUNDS):
+    for loss_scale in np.geomspace(_INITIAL_LOSS_SCALE, _LOSS_SCALE, _ITERATIONS):
         robust = J.T.multiply(weights).tocsc()
         units[1:] = spsolve(robust @ J, robust @ difference)
         off = (units[ends[:, 1]] - units[ends[:, 0]] - difference) / sigma
-        _, trust = Loss('geman_mcclure', bend * max(1.0, robust_scale(off[loops])))(off**2)
+        _, trust = Loss('geman_mcclure', loss_scale * max(1.0, robust_scale(off[loops])))(off**2)
         weights = np.where(loops, trust, 1.0) / sigma**2
     return units
 
 
-def scaled(edge: Edge, factor: float) -> Edge:
-    """Give an edge whose length is in another unit."""
+def rescaled_edge(edge: Edge, factor: float) -> Edge:
+    """Return an edge with its translation and covariance scaled by a factor."""
     if factor == 1.0:
         return edge
-    stretched = np.diag([factor] * 3 + [1.0] * 3)
-    return replace(edge, motion=in_unit(edge.motion, factor),
-                   covariance=stretched @ edge.covariance @ stretched)
+    scaling = np.diag([factor] * 3 + [1.0] * 3)
+    return replace(edge, motion=rescaled_motion(edge.motion, factor),
+                   covariance=scaling @ edge.covariance @ scaling)
 
 
-def in_unit(motion: Array, factor: float) -> Array:
-    """Give a motion (4, 4) whose length is in another unit."""
+def rescaled_motion(motion: Array, factor: float) -> Array:
+    """Return a motion (4, 4) with its translation scaled by a factor."""
     scaled_motion = motion.copy()
     scaled_motion[:3, 3] *= factor
     return scaled_motion
 
 
-def _wandering(edge: Edge) -> float:
-    """Tell by how much the logarithm of the unit wanders along an edge (standard deviation)."""
+def _drift_sigma(edge: Edge) -> float:
+    """Return the standard deviation of the change of the log unit along an edge."""
     length = float(np.linalg.norm(edge.motion[:3, 3]))
     if edge.kind != 'odometry' or not edge.scale_known or not length:
         return 1.0
     along = edge.motion[:3, 3] / length
     share = np.sqrt(along @ edge.covariance[:3, :3] @ along) / length
-    return float(np.clip(_WANDERING * share, _LEAST, 1.0))
+    return float(np.clip(_DRIFT_FRACTION * share, _MIN_DRIFT, 1.0))

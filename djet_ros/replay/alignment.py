@@ -1,4 +1,4 @@
-"""Trajectories laid onto their ground truth."""
+"""Alignment of trajectories with ground truth."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 def aligned(estimate: Array, truth: Array, scaled: bool = True) -> Array:
     """
-    Move positions (N, 3) onto the true ones (N, 3), as a whole and with the least squares.
+    Align positions (N, 3) with the true ones (N, 3) by least squares (Umeyama, PAMI 1991).
 
-    Not scaled: their common scale is free as well (Umeyama, PAMI 1991). Rows that are NaN in the
-    truth are moved with the others.
+    scaled: whether the estimate has true lengths; otherwise its scale is estimated as well. Rows
+    that are NaN in the truth are only transformed.
     """
     known = np.isfinite(truth).all(axis=1)
     centre, goal = estimate[known].mean(0), truth[known].mean(0)
@@ -24,6 +24,6 @@ def aligned(estimate: Array, truth: Array, scaled: bool = True) -> Array:
 
 
 def position_rmse(estimate: Array, truth: Array) -> float:
-    """Root mean square distance of positions (N, 3); rows of NaN in the truth are left out."""
+    """Return the RMSE of positions (N, 3); rows that are NaN in the truth are ignored."""
     squared = ((estimate - truth)**2).sum(axis=1)
     return float(np.sqrt(np.nanmean(squared)))

@@ -1,12 +1,11 @@
 """
-Drift over 100 to 800 m of a trajectory, as the KITTI odometry benchmark defines it.
+Drift over segments of 100 to 800 m, as defined by the KITTI odometry benchmark.
 
-From every tenth frame on, and for each length in LENGTHS, the segment ends at the first frame
-that lies further than that along the true path. Its error is what is left of the estimated
-relative pose after the true one, ``E = D_estimate^-1 D_truth``, per nominal length: |t(E)| as a
-percentage, and the angle of R(E) in degrees per 100 m. Both are averaged over all segments
-(A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012, and its
-development kit).
+A segment starts at every tenth frame, for each length in LENGTHS, and ends at the first frame
+beyond that length along the true path. Its error is ``E = D_estimate^-1 D_truth`` of the relative
+poses, per nominal length: |t(E)| in percent, and the angle of R(E) in degrees per 100 m. Both are
+averaged over all segments (A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous
+driving?", CVPR 2012, and its development kit).
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from scipy.spatial.transform import Rotation
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 _EVERY = 10
 
-# Share of the longer way of two below which the other is none.
-_STANDS = 1e-3
+# Ratio of two path lengths below which the shorter one counts as a standstill.
+_STANDSTILL_RATIO = 1e-3
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class Drift:
     """
     Mean drift of an estimated trajectory over its segments.
 
-    translation_percent: KITTI's t_rel; it means something only if the estimate has true lengths;
-    rotation_deg_per_100m: KITTI's r_rel; segments: how many there are; longest: the greatest
-    length in metres that any of them has.
+    translation_percent: KITTI's t_rel, meaningful only if the estimate has true lengths;
+    rotation_deg_per_100m: KITTI's r_rel; segments: number of segments; longest: length of the
+    longest segment in metres.
     """
 
     translation_percent: float
@@ -43,16 +42,16 @@ class Drift:
 
 def drift(truth: Array, estimate: Array) -> Drift | None:
     """
-    Compare two trajectories, poses (N, 4, 4) of the camera in metres, frame by frame.
+    Return the drift of a trajectory, from poses (N, 4, 4) of the camera in metres, frame by frame.
 
-    Each may have axes of its own. None where the true path is not over 100 m long. Raises
-    ValueError on shapes that differ and on poses that are not finite.
+    The two trajectories may have different frames. None if the true path is not longer than
+    100 m. Raises ValueError if the shapes differ or a pose is not finite.
     """
     if truth.shape != estimate.shape or truth.shape[1:] != (4, 4):
         raise ValueError(f'trajectories are {truth.shape} and {estimate.shape}; both must be '
                          '(N, 4, 4)')
     if not (np.isfinite(truth).all() and np.isfinite(estimate).all()):
-        raise ValueError('a pose is not finite; give the frames that both know')
+        raise ValueError('a pose is not finite; give the frames that both trajectories have')
     first, last, length = _segments(truth[:, :3, 3])
     if not len(first):
         return None
@@ -64,30 +63,30 @@ def drift(truth: Array, estimate: Array) -> Drift | None:
 
 
 def one_factor(places: Array, truth: Array) -> float:
-    """Factor that makes a path (N, 3) as large as the true one (N, 3), by their spread."""
+    """Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread."""
     here, there = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
     return float(there / here) if here > 0 else 1.0
 
 
 def scale_change(places: Array, truth: Array) -> float:
     """
-    Scale of a path (N, 3) over the last tenth of the true way, over that in the first tenth.
+    Return the scale of a path (N, 3) in the last tenth of the true path over that in the first.
 
-    Lengths of steps are summed up over either; 1 where the path has one scale, NaN where it
-    stands still on one of them, or the truth all along.
+    Scales are ratios of summed step lengths. 1 without scale drift; NaN if the path stands still
+    in one of the two, or the true path altogether.
     """
     here, there = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (places, truth))
     way = np.cumsum(there)
-    # At least a step each: that in which the first tenth ends, and that in which the last begins.
+    # At least one step each: the one in which the first tenth ends or the last begins.
     first, last = way - there <= 0.1 * way[-1], way >= 0.9 * way[-1]
     begun, ended = here[first].sum(), here[last].sum()
-    if min(begun, ended) <= _STANDS * max(begun, ended) or not there.any():
+    if min(begun, ended) <= _STANDSTILL_RATIO * max(begun, ended) or not there.any():
         return float('nan')
     return float(ended / there[last].sum() / (begun / there[first].sum()))
 
 
 def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
-    """First and last frames (M,) of all segments of a path (N, 3), and their lengths (M,)."""
+    """Return first and last frames (M,) and lengths (M,) of all segments of a path (N, 3)."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
     first, length = (grid.ravel() for grid in np.meshgrid(
         np.arange(0, len(places), _EVERY), LENGTHS, indexing='ij'))
@@ -97,5 +96,5 @@ def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArra
 
 
 def _between(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
-    """Poses (M, 4, 4) of the last frames in the first ones."""
+    """Return the poses (M, 4, 4) of the last frames in the first ones."""
     return np.asarray(np.linalg.inv(poses[first]) @ poses[last])

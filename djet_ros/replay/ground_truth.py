@@ -1,4 +1,4 @@
-"""True poses of a camera, known at some moments."""
+"""Ground truth: true poses of a camera at some stamps."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 
 class GroundTruth:
-    """Stamped poses (4, 4), camera in some fixed frame, in any order."""
+    """Stamped poses (4, 4) of the camera in a fixed frame, added in any order."""
 
     def __init__(self) -> None:
         self._poses: dict[int, Array] = {}
 
     @classmethod
     def of(cls, recording: Recording) -> GroundTruth:
-        """Read all that a recording knows."""
+        """Read the ground truth of a recording."""
         truth = cls()
         if recording.ground_truth_topic is not None:
             for message in recording.messages({recording.ground_truth_topic}):
@@ -27,24 +27,24 @@ class GroundTruth:
         return truth
 
     def add(self, stamp_ns: int, pose: Array) -> None:
-        """Take a pose; one with a number that is not finite is left out."""
+        """Add a pose, unless it is not finite."""
         if np.isfinite(pose).all():
             self._poses[stamp_ns] = pose
 
     def __len__(self) -> int:
-        """Count the poses."""
+        """Return the number of poses."""
         return len(self._poses)
 
     def known(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (M,), increasing, and poses (M, 4, 4)."""
+        """Return increasing stamps (M,) and their poses (M, 4, 4)."""
         stamps = sorted(self._poses)
         return (np.array(stamps, np.int64),
                 np.array([self._poses[stamp] for stamp in stamps]).reshape(-1, 4, 4))
 
     def at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """
-        Poses (N, 4, 4) at some stamps (N,), NaN where they are not known.
+        Return the poses (N, 4, 4) at some stamps (N,), NaN if unknown.
 
-        Between two poses at most 0.1 s apart they are interpolated.
+        They are interpolated between poses at most 0.1 s apart.
         """
         return poses_at(*self.known(), stamps_ns, LONGEST_GAP_NS)

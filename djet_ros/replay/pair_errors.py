@@ -1,14 +1,14 @@
 """
 Errors of estimated pairs against ground truth (paper, "Evaluation metrics").
 
-Each pair is held against the true motion between the very two frames that it relates, which are
-neighbours unless a bad frame lies between them. The rules:
-* rotation: angle of the rotation between truth and estimate (Rodrigues), for every pair whose
-  motion was estimated (OK, NO_PARALLAX);
+Each pair is compared with the true motion between its two frames, which are consecutive unless
+failed frames lie between them:
+* rotation: angle of the rotation between truth and estimate, for every pair with an estimated
+  motion (OK, NO_PARALLAX);
 * translation: angle between the true and the estimated direction, for every pair with status OK
-  whose true length is at least 1 cm: below that the direction of the truth is noise;
-* a pair whose motion was not estimated has no error: it is counted as a failure, and so is, for
-  translation, a pair called NO_PARALLAX although the camera went further than that.
+  and a true length of at least 1 cm, below which the true direction is noise;
+* a pair without an estimated motion has no error and counts as a failure; a NO_PARALLAX pair with
+  a true length of at least 1 cm counts as a failure of the translation.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from djet_ros.posegraph.steps import Step
 import numpy as np
 from numpy.typing import NDArray
 
-_SHORTEST_LENGTH = 0.01
+# Shortest true translation, in metres, whose direction is compared.
+_MIN_LENGTH = 0.01
 
 
 @dataclass(frozen=True)
 class PairErrors:
     """
-    Errors of N pairs in degrees, NaN where there is none by the rules of this module.
+    Errors of N pairs in degrees, NaN for pairs without an error by the rules of this module.
 
-    rotation_deg, translation_deg: (N,); compared: pairs with ground truth at both ends;
-    failures: how many of them have no rotation; translation_failures: how many of those whose
-    true length is large enough have no direction.
+    rotation_deg, translation_deg: (N,); compared: number of pairs with ground truth at both ends;
+    failures: those of them without a rotation; translation_failures: those of them with a
+    sufficient true length and no estimated direction.
     """
 
     rotation_deg: NDArray[np.float64]
@@ -43,7 +44,7 @@ class PairErrors:
 
 
 def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[float, float]:
-    """Errors of the rotation and of the direction of one motion (4, 4), in degrees, or NaN."""
+    """Return the errors of rotation and direction of a motion (4, 4) in degrees, or NaN."""
     if status not in (Status.OK, Status.NO_PARALLAX):
         return float('nan'), float('nan')
     rotation, direction = angles_off(motion, true_motion)
@@ -52,9 +53,9 @@ def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[fl
 
 def angles_off(motion: Array, true_motion: Array) -> tuple[float, float]:
     """
-    By what angles, in degrees, the rotation and the direction of a motion (4, 4) are off.
+    Return the angular errors of rotation and direction of a motion (4, 4), in degrees.
 
-    The latter is NaN where the true motion has no direction.
+    The latter is NaN if the true motion is too short to have a direction.
     """
     rotation = float(np.degrees(rotation_angle(true_motion[:3, :3], motion[:3, :3])))
     direction = float(np.degrees(direction_angle(true_motion[:3, 3], motion[:3, 3])))
@@ -62,12 +63,12 @@ def angles_off(motion: Array, true_motion: Array) -> tuple[float, float]:
 
 
 def has_direction(true_motion: Array) -> bool:
-    """Tell whether a true motion (4, 4) goes far enough for its direction to mean something."""
-    return bool(np.linalg.norm(true_motion[:3, 3]) >= _SHORTEST_LENGTH)
+    """Return whether a true motion (4, 4) is long enough for its direction to be compared."""
+    return bool(np.linalg.norm(true_motion[:3, 3]) >= _MIN_LENGTH)
 
 
 def pair_errors(pairs: Sequence[Step], previous_truth: Array, truth: Array) -> PairErrors:
-    """Compare N pairs with the true poses (N, 4, 4) at their two ends, NaN where not known."""
+    """Compare N pairs with the true poses (N, 4, 4) at their two ends, NaN if unknown."""
     rotation, translation = np.full((2, len(pairs)), np.nan)
     compared = failures = translation_failures = 0
     for i, (pair, start, end) in enumerate(zip(pairs, previous_truth, truth, strict=True)):
@@ -82,7 +83,7 @@ def pair_errors(pairs: Sequence[Step], previous_truth: Array, truth: Array) -> P
 
 
 def statistics(errors: NDArray[np.float64]) -> dict[str, float] | None:
-    """Mean, median, 95th percentile and maximum of the errors there are; None without any."""
+    """Return mean, median, 95th percentile and maximum of the finite errors; None without any."""
     known = errors[np.isfinite(errors)]
     if not known.size:
         return None

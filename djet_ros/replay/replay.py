@@ -1,4 +1,4 @@
-"""Offline replay: a recording through the tracker into a results folder."""
+"""Offline replay: runs the odometry on a recording and writes a results folder."""
 
 from __future__ import annotations
 
@@ -40,18 +40,19 @@ from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder, UNFINISHED
 import numpy as np
 
-# Recorded nanoseconds for which an image waits for what belongs to it.
-_PATIENCE_NS = 10**9
+# Time of the recording, in ns, for which an image waits for its side inputs (gyro, guess, mask).
+_SIDE_INPUT_TIMEOUT_NS = 10**9
 
-# Messages that are read ahead to find an image: those of a fast IMU beside a slow camera.
-_LONGEST_PIECE = 1000
+# Messages read ahead at most to find the next image: those of a fast IMU with a slow camera.
+_MAX_PIECE = 1000
 
 
 class Outcome(NamedTuple):
     """
-    The summary as it was written, and in one line what the user must know of, if anything.
+    The result of a run.
 
-    advice: lines on what was of no use, of the images and of what came beside them.
+    summary: as written to summary.json; problem: error message in one line, or None; advice:
+    warnings, one line each, on images and side inputs that could not be used.
     """
 
     summary: dict[str, Any]
@@ -61,9 +62,10 @@ class Outcome(NamedTuple):
 
 def with_next_image(recording: Recording) -> Iterator[tuple[BagMessage, BagMessage | None]]:
     """
-    Yield all messages of a recording, each with the first image after the next one or itself.
+    Yield all messages of a recording, each with the second image from it on (lookahead).
 
-    None where that is far, or the end; what is wrong with a message comes in its place.
+    The image is None if it is far ahead or at the end. An error of the recording is raised after
+    the messages before it.
     """
     pieces, problem = _pieces(recording), None
     piece = next(pieces, [])
@@ -83,12 +85,12 @@ def with_next_image(recording: Recording) -> Iterator[tuple[BagMessage, BagMessa
 
 
 def _pieces(recording: Recording) -> Iterator[list[BagMessage]]:
-    """Cut the messages after each image, and where very many come between two of them."""
+    """Split the messages after each image, or after _MAX_PIECE messages without one."""
     piece: list[BagMessage] = []
     try:
         for message in recording.messages():
             piece.append(message)
-            if message.topic == recording.image_topic or len(piece) == _LONGEST_PIECE:
+            if message.topic == recording.image_topic or len(piece) == _MAX_PIECE:
                 yield piece
                 piece = []
     except DjetError:
@@ -101,15 +103,15 @@ def _pieces(recording: Recording) -> Iterator[list[BagMessage]]:
 
 class Replay:
     """
-    One run of a recording through the tracker, with everything that comes of it written.
+    One run of the odometry on a recording, with all results written.
 
-    name: path of the recording, for people. All that can be refused is refused before there is a
-    folder. What goes wrong in the middle does not raise: it ends the run, and the summary and the
-    outcome say what it was.
+    name: path of the recording, for messages. Invalid input is refused in the constructor, before
+    a folder is created. An error during the run does not raise: it ends the run, and is in the
+    summary and the outcome.
     """
 
     def __init__(self, recording: Recording, config: Config, name: str) -> None:
-        """Prepare the run; DjetError where a parameter needs what the recording does not have."""
+        """Prepare the run; DjetError if a parameter needs what the recording does not have."""
         self._recording = recording
         self._config = config
         self._name = name
@@ -118,24 +120,24 @@ class Replay:
                                 recording.image_topic,
                                 still_mask=still_mask(config.odometry.mask_file))
         self._names = {topic: what for what, topic in recording.beside.items()}
-        # Images that wait for what belongs to them, which may be recorded after them, and the
-        # CameraInfo between them.
+        # Images waiting for side inputs, which may be recorded later, and the CameraInfo between
+        # them.
         self._waiting: deque[BagMessage] = deque()
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
-        # When the first message of each topic of the camera was recorded.
+        # Recording time of the first image and of the first CameraInfo, by topic.
         self._first_ns: dict[str, int] = {}
         self._log = _Log()
         if not self._tracker.mounted and (frame := _frame_of_images(recording)) is not None:
             self._mount(frame)
 
     def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
-        """Run to the end, calling progress after each image; an interrupt is passed on."""
+        """Run to the end, calling progress after each image; KeyboardInterrupt is passed on."""
         self._folder = folder
-        # A run that is killed leaves it: what it was of is to be known.
+        # The summary that a killed run leaves.
         folder.finish({**self._what(), **UNFINISHED})
         started = perf_counter()
-        complete, problem = False, 'broken off'
+        complete, problem = False, 'interrupted'
         try:
             for message, following in with_next_image(self._recording):
                 self._following = following
@@ -150,7 +152,7 @@ class Replay:
         except DjetError as error:
             problem = str(error)
         finally:
-            # Also when interrupted: what was written is to be understood.
+            # Also when interrupted.
             summary = {**self._summary(perf_counter() - started),
                        'complete': complete, 'error': problem or None}
             self._folder.finish(summary)
@@ -161,7 +163,7 @@ class Replay:
                 f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> int:
-        """Hand one message on; give how many images were worked on."""
+        """Take one message; return how many images were processed."""
         recording, what = self._recording, self._names.get(message.topic)
         if message.topic in (recording.image_topic, recording.info_topic):
             self._first_ns.setdefault(message.topic, message.stamp_ns)
@@ -176,7 +178,7 @@ class Replay:
         return self._work_off(message.stamp_ns)
 
     def _work_off(self, now_ns: int | None) -> int:
-        """Work on the images for which all is there, or that have waited long enough; count."""
+        """Process the images that have all side inputs or timed out; return their number."""
         done = 0
         while self._waiting:
             first = self._waiting[0]
@@ -186,7 +188,7 @@ class Replay:
             following = self._after_the_first
             if now_ns is not None and (
                     (following is None and self._tracker.leaps(first.message))
-                    or (now_ns - first.stamp_ns < _PATIENCE_NS
+                    or (now_ns - first.stamp_ns < _SIDE_INPUT_TIMEOUT_NS
                         and self._tracker.lacks(first.message))):
                 break
             self._image(self._waiting.popleft(), following)
@@ -195,7 +197,7 @@ class Replay:
 
     @property
     def _after_the_first(self) -> Any:
-        """Give the second image that waits, if there is one."""
+        """Return the second waiting image, or None."""
         images = [one for one in self._waiting if one.topic == self._recording.image_topic]
         return images[1].message if len(images) > 1 else None
 
@@ -236,61 +238,61 @@ class Replay:
             log.first_problem = log.first_problem or f'image {number}: {tracker.problem}'
 
     def _mount(self, image_frame: str) -> None:
-        """Find the camera on base_frame; without it there would be no odometry at all."""
+        """Look up the camera on base_frame; DjetError if the recording does not have it."""
         if not self._tracker.mount(self._frames.transform, image_frame):
             config = self._config.odometry
             camera, _ = mounted_frame(config, image_frame)
             raise DjetError(
-                f"odometry.base_frame is '{config.base_frame}', and no /tf_static in {self._name} "
-                f"tells where '{camera}' is on it; record it too, or leave base_frame empty "
-                "(--base-frame '') for the poses of the camera")
+                f"odometry.base_frame is '{config.base_frame}', but {self._name} has no transform "
+                f"from it to '{camera}' on /tf_static; record /tf_static, or leave base_frame "
+                "empty (--base-frame '') for the poses of the camera")
 
     def _publish(self, outgoing: list[Outgoing], stamp: int) -> None:
         for one in outgoing:
             self._folder.publish(one, stamp)
 
     def _complaint(self) -> str:
-        """Say what was wrong with a recording that was read to its end."""
+        """Return what is wrong with a recording that was read to its end, or ''."""
         counts, log = self._tracker.counts, self._log
         if not counts.processed and log.first_problem:
             return (f'{self._name}: none of {counts.received} images could be used; '
                     f'{log.first_problem}')
         if not counts.processed:
-            seen = self._when_info_came()
-            return (f'{self._name}: none of {counts.received} images came after a CameraInfo on '
-                    f'{self._recording.info_topic}{f" ({seen})" if seen else ""}; record it '
-                    'before the images, or choose one with --info-topic')
+            recorded = self._time_of_first_info()
+            return (f'{self._name}: none of {counts.received} images has an earlier CameraInfo on '
+                    f'{self._recording.info_topic}{f" ({recorded})" if recorded else ""}; record '
+                    'it before the images, or choose another topic with --info-topic')
         found = []
         if log.first_problem:
             found.append(f'{_unusable(counts)} could not be used; {log.first_problem}')
         if changes := counts.status[Status.SIZE_CHANGED.value]:
-            found.append(f'the image size or the camera changes {changes} times; each time the '
-                         'motion is unknown and the trajectory has a hole')
+            found.append(f'the image size or the camera changes {_times(changes)}; the motion is '
+                         'unknown there, which leaves a gap in the trajectory')
         if back := [after for before, after in log.jumps() if after < before]:
-            found.append(f'the stamps go back {len(back)} times; poses begin at the origin again '
-                         f'from stamp {", ".join(map(seconds_text, back[:3]))} on')
+            found.append(f'the stamps go back {_times(len(back))}; the poses restart at the '
+                         f'origin at stamp {", ".join(map(seconds_text, back[:3]))}')
         return f'{self._name}: {"; ".join(found)}' if found else ''
 
-    def _when_info_came(self) -> str:
-        """Say when the first CameraInfo was recorded; nothing where there is none."""
+    def _time_of_first_info(self) -> str:
+        """Return when the first CameraInfo was recorded, or '' if there is none."""
         image, info = (self._first_ns.get(topic) for topic in (
             self._recording.image_topic, self._recording.info_topic))
         return '' if image is None or info is None else (
             f'the first one was recorded {(info - image) * 1e-9:.3f} s after the first image')
 
     def _of_late_info(self) -> list[str]:
-        """Say that a recording begins with images of which no CameraInfo tells the camera."""
+        """Return a warning if images were recorded before the first CameraInfo."""
         counts = self._tracker.counts
         early = counts.dropped['waiting_for_camera_info']
-        # Those of a CameraInfo that can't be used are spoken of elsewhere.
+        # An invalid CameraInfo is reported by _complaint.
         if not early or not counts.processed or counts.rejected_infos:
             return []
-        return [f'{early} of {counts.received} images came before a CameraInfo on '
-                f'{self._recording.info_topic} and were left out, as live: '
-                f'{self._when_info_came()}']
+        return [f'{early} of {counts.received} images have no earlier CameraInfo on '
+                f'{self._recording.info_topic} and were dropped, as in a live node: '
+                f'{self._time_of_first_info()}; record it before the images']
 
     def _of_truth(self) -> list[str]:
-        """Say that there is ground truth, and none of it at the images."""
+        """Return a warning if there is ground truth, but at none of the images."""
         images = np.array([step.stamp_ns for step in self._log.steps], np.int64)
         if not len(self._truth) or not images.size \
                 or np.isfinite(self._truth.at(images)).any():
@@ -298,14 +300,15 @@ class Replay:
         name = self._recording.ground_truth_file or self._recording.ground_truth_topic
         known, _ = self._truth.known()
         if ((known[0] <= images) & (images <= known[-1])).any():
-            return [f'no image lies between two poses of {name} that are at most '
-                    f'{LONGEST_GAP_NS * 1e-9:g} s apart; nothing was compared']
+            return [f'no errors were computed: no image lies between two poses of {name} that '
+                    f'are at most {LONGEST_GAP_NS * 1e-9:g} s apart; give ground truth with a '
+                    'higher rate']
         ends = [seconds_text(stamp) for stamp in (*known[[0, -1]], images.min(), images.max())]
-        return [f'no image lies within the stamps of {name}, {ends[0]} to {ends[1]}; those of the '
-                f'images are {ends[2]} to {ends[3]}, and nothing was compared']
+        return [f'no errors were computed: the stamps of {name} are {ends[0]} to {ends[1]}, those '
+                f'of the images {ends[2]} to {ends[3]}; give ground truth with the same clock']
 
     def _what(self) -> dict[str, Any]:
-        """Tell what is replayed, and how."""
+        """Return the entries of the summary that describe the input and the method."""
         config = self._config
         return {'source': self._name, 'image_topic': self._recording.image_topic,
                 'method': config.estimator.method, 'preset': config.preset,
@@ -347,7 +350,7 @@ class Replay:
             self._plot(truth)
 
     def _plot(self, truth: Array) -> None:
-        """Draw the trajectory; what is not known of its lengths is taken from the ground truth."""
+        """Plot the trajectory; an unknown scale is taken from the ground truth."""
         log, unit = self._log, 'm'
         name = one_line(Path(self._name).name)
         title = f'{name}: {self._config.estimator.method}, {self._config.preset}'
@@ -355,89 +358,90 @@ class Replay:
         known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
         if log.scale is Scale.UNKNOWN and known.size:
             estimate = log.with_lengths_of(truth)
-            title += '\n(lengths of the steps from ground truth)'
+            title += '\n(step lengths from ground truth)'
         elif log.scale is Scale.UNKNOWN:
             unit = 'steps of unit length'
         elif log.scale is Scale.RELATIVE and known.size:
             estimate[:, :3, 3] *= one_factor(estimate[known, :3, 3], truth[known, :3, 3])
-            title += '\n(one scale for all of it from ground truth)'
+            title += '\n(common scale from ground truth)'
         elif log.scale is Scale.RELATIVE:
             unit = 'lengths of the first step'
-        # The two agree where the ground truth begins.
+        # The two coincide at the first pose of the ground truth.
         positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
             if known.size else None
         plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], positions, title, unit)
 
 
-# What may be wrong where no pair at all has been tracked, by what was said of most of them.
-_NOTHING_MATCHED = (
-    'the images are dark, empty or blurred, or show another place each time; look at exposure '
-    '(of 16 bits, at odometry.gray_range), and at the time between them')
-_NOTHING_FITS = (
-    'no one motion explains the matches; check that the calibration is that of the images '
-    '(--info-topic, odometry.rectified), and what moves in them (odometry.mask_file)')
+# Advice if no pair was tracked, by the most frequent status: too few matches, or another.
+_FEW_MATCHES_ADVICE = (
+    'the images are dark, without texture or blurred, or do not overlap; check the exposure, for '
+    '16-bit images odometry.gray_range, and the frame rate')
+_NO_MOTION_ADVICE = (
+    'no single motion explains the matches; check that the calibration belongs to the images '
+    '(--info-topic, odometry.rectified), and mask moving objects (odometry.mask_file)')
 
-# So few places can be moved onto any others.
-_LEAST_PLACES = 4
+# Minimum number of positions for an alignment: fewer fit any others.
+_MIN_POSITIONS = 4
 
 
 @dataclass
 class _Log:
-    """Steps of a run, small however long the recording is, and what first went wrong."""
+    """The steps of a run, and its first error."""
 
     steps: list[Step] = field(default_factory=list)
     first_problem: str | None = None
 
     @property
     def scale(self) -> Scale:
-        """Tell what all lengths are in."""
+        """Return the kind of scale of all lengths."""
         return scale_of(self.steps)
 
     def pairs(self) -> list[Step]:
         return [step for step in self.steps if step.previous_stamp_ns is not None]
 
     def jumps(self) -> list[tuple[int, int]]:
-        """Stamps between which the odometry jumped in time, backwards or over a gap."""
+        """Return the pairs of stamps at time jumps, backwards or over a gap."""
         return [(before.stamp_ns, after.stamp_ns) for before, after in pairwise(self.steps)
                 if after.status is Status.TIME_JUMP]
 
     def advice(self) -> list[str]:
-        """Say what a run that ended well keeps quiet."""
+        """Return warnings on gaps and on pairs that were not tracked."""
         return [*self._of_gaps(), *self._of_pairs()]
 
     def _of_gaps(self) -> list[str]:
-        """Say where the images leave out more than a pair may bridge."""
+        """Return a warning if gaps between images exceed odometry.max_gap."""
         gaps = [(after - before, after) for before, after in self.jumps() if after > before]
         if not gaps or not self.pairs():
             return []
         longest, after = max(gaps)
-        return [f'{len(gaps)} times there is no image for longer than odometry.max_gap, at most '
-                f'{longest * 1e-9:.3f} s, up to stamp {seconds_text(after)}; the trajectory goes '
-                'on at the last pose, and the motion in between is missing']
+        return [f'{len(gaps)} gaps between images exceed odometry.max_gap; the longest, '
+                f'{longest * 1e-9:.3f} s, ends at stamp {seconds_text(after)}; the trajectory '
+                'continues at the last pose, without the motion in the gap']
 
     def _of_pairs(self) -> list[str]:
-        """Say that nothing was tracked, or that nothing moved."""
+        """Return a warning if no pair was tracked, or none has a translation."""
         pairs = self.pairs()
         statuses = Counter(step.status for step in pairs)
         if not pairs:
             return [] if len(self.steps) < 2 else [
-                f'none of {len(self.steps)} images has a pair: they are too far apart; raise '
-                'odometry.max_gap beyond the seconds between them']
+                f'none of {len(self.steps)} images could be paired with the one before: the time '
+                'between them exceeds odometry.max_gap; set it to a larger value']
         if statuses[Status.NO_PARALLAX] == len(pairs):
-            return [f'the camera stood or only turned in all {len(pairs)} pairs (NO_PARALLAX): '
-                    'there are rotations, and no way']
+            return [f'all {len(pairs)} pairs have no parallax (NO_PARALLAX): the camera was '
+                    'stationary or only rotated, so there are rotations and no translations']
         if any(step.tracked for step in pairs):
             return []
         most = statuses.most_common(1)[0][0]
-        why = _NOTHING_MATCHED if most is Status.TOO_FEW_MATCHES else _NOTHING_FITS
-        return [f'none of {len(pairs)} pairs could be tracked ({most.value}): {why}']
+        advice = (_FEW_MATCHES_ADVICE if most is Status.TOO_FEW_MATCHES
+                  else _NO_MOTION_ADVICE)
+        return [f'none of {len(pairs)} pairs could be tracked (mostly {most.value}): {advice}']
 
     def drift(self, truth: Array) -> dict[str, float | None] | None:
         """
-        Drift over the frames whose true pose (N, 4, 4) is known; None where the way is too short.
+        Return the drift over the frames with a true pose (N, 4, 4), or None for a short path.
 
-        Without a scale, lengths mean nothing; the drift of the rotation does not need them. A
-        relative scale takes the one factor that serves the whole path best.
+        With an unknown scale only the drift of the rotation is given. A relative scale is
+        multiplied by the factor that fits the whole path best.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
         if not known.any():
@@ -454,16 +458,16 @@ class _Log:
 
     def positions(self, truth: Array) -> dict[str, float | None] | None:
         """
-        Root mean square error of positions, in metres, the length of the true way, and the scale.
+        Return the position RMSE and the length of the true path in metres, and the scale change.
 
-        That is how large it is at the end over what it is at the start, None where it is not told.
-        Errors are taken after the path was moved onto the true one (N, 4, 4), its scale free too
-        unless it is in metres; None where lengths mean nothing, and where nothing was tracked.
+        The RMSE is after alignment with the true poses (N, 4, 4), including the scale unless it is
+        metric. The scale change is that at the end over that at the start, or None if it cannot be
+        determined. None if the scale is unknown or nothing was tracked.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
         if not any(step.tracked for step in self.steps):
             return None
-        if self.scale is Scale.UNKNOWN or known.sum() < _LEAST_PLACES:
+        if self.scale is Scale.UNKNOWN or known.sum() < _MIN_POSITIONS:
             return None
         way = truth[known, :3, 3]
         places = np.array([step.pose[:3, 3] for step in self.steps])[known]
@@ -473,7 +477,7 @@ class _Log:
                 'scale_change': change if np.isfinite(change) else None}
 
     def with_lengths_of(self, truth: Array) -> Array:
-        """Poses (N, 4, 4) as estimated, but with the true length of each step where known."""
+        """Return the estimated poses (N, 4, 4) with the true length of each step, if known."""
         poses: list[Array] = []
         at: dict[int | None, int] = {}
         for i, step in enumerate(self.steps):
@@ -492,16 +496,20 @@ class _Log:
 
 
 def _unusable(counts: Counts) -> str:
-    """Say how many images, and how many CameraInfo, were rejected."""
+    """Return how many images, and how many CameraInfo, were rejected."""
     images, infos = counts.rejected.total(), counts.rejected_infos.total()
     return ' and '.join([*([f'{images} of {counts.received} images'] if images else []),
                          *([f'{infos} CameraInfo'] if infos else [])])
 
 
+def _times(count: int) -> str:
+    return 'once' if count == 1 else f'{count} times'
+
+
 def _static_frames(recording: Recording) -> StaticFrames:
-    """Read where frames are on one another, as far as the recording can be read."""
+    """Read the static frames, as far as the recording can be read."""
     frames = StaticFrames()
-    # Damage is said where the images come to it.
+    # Damage of the recording is reported when the images are read.
     with suppress(DjetError):
         for message in recording.static_frames():
             frames.add(message)
@@ -509,8 +517,7 @@ def _static_frames(recording: Recording) -> StaticFrames:
 
 
 def _frame_of_images(recording: Recording) -> str | None:
-    """Name the frame of the first image; None where there is damage before it."""
-    # As above.
+    """Return the frame_id of the first image; None if the recording is damaged before it."""
     with suppress(DjetError):
         for message in recording.messages({recording.image_topic}):
             if message.topic == recording.image_topic:
@@ -519,7 +526,7 @@ def _frame_of_images(recording: Recording) -> str | None:
 
 
 def _scale(recording: Recording, config: Config) -> ScaleSource:
-    """Make the scale source; for ground truth, that of the whole recording is read first."""
+    """Return the scale source; for ground truth, it is read from the whole recording first."""
     positions = None
     if config.odometry.scale == 'ground_truth' and recording.ground_truth_topic is not None:
         stamps, poses = GroundTruth.of(recording).known()

@@ -1,13 +1,13 @@
 """
-The results folder of a replay: everything is written as it comes, so that nothing is lost.
+The results folder of a replay; files are written during the run, so that nothing is lost.
 
 * trajectory_tum.txt, trajectory_kitti.txt: one pose per processed frame, camera in the first
-  camera, along optical axes; the last known pose where the motion could not be estimated
+  camera, in optical axes; the last known pose if the motion could not be estimated
 * frames.csv: one row per image
-* landmarks.ply: the points that carried the scale, in the first camera; where it was carried
-* bag/: what a live node would have published
-* config.yaml: the parameters in force
-* summary.json: counts, errors, and whether the run came to its end
+* landmarks.ply: the landmarks that propagated the scale, in the first camera, if there are any
+* bag/: the messages that a live node would have published
+* config.yaml: the effective parameters
+* summary.json: counts, errors, and whether the run completed
 * errors.csv (with ground truth) and trajectory.png, at the end
 """
 
@@ -46,8 +46,8 @@ LANDMARKS = 'landmarks.ply'
 _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
           'errors.csv', 'config.yaml')
 
-# What a summary says until the run comes to its end.
-UNFINISHED = {'complete': False, 'error': 'the run did not come to its end'}
+# The summary until the run has ended.
+UNFINISHED = {'complete': False, 'error': 'the run did not complete'}
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
@@ -56,15 +56,15 @@ COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matche
 
 class ResultsFolder(Closing):
     """
-    Writes the results of one replay; use it in a ``with`` statement.
+    Writes the results of one replay; a context manager.
 
-    Until ``finish`` the summary says that the run is incomplete. DjetError where the folder
-    exists (unless it is empty, or an earlier results folder that may be overwritten) or can't be
+    Until ``finish`` the summary marks the run as incomplete. Raises DjetError if the folder
+    exists (unless it is empty, or an earlier results folder and overwrite is set) or cannot be
     written.
     """
 
     def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
-        """Make room, create the files, and write the parameters."""
+        """Create the folder and its files, and write the parameters."""
         self.path = path
         present = path.exists()
         with self._beginning():
@@ -73,7 +73,7 @@ class ResultsFolder(Closing):
             with self._beginning():
                 self._begin(config)
         except BaseException:
-            # Without both of its marks it would be taken for somebody else's.
+            # Without both of its marks the folder could not be overwritten later.
             self._remove(present)
             raise
 
@@ -93,21 +93,21 @@ class ResultsFolder(Closing):
         try:
             yield
         except OSError as error:
-            raise DjetError(f'{self.path} could not be begun: {error.strerror or error}; make '
-                            'room, or choose another --output') from error
+            raise DjetError(f'{self.path} could not be created: {error.strerror or error}; free '
+                            'disk space, or choose another --output') from error
 
     def _remove(self, keep_folder: bool) -> None:
-        """Remove what a beginning that failed has made."""
+        """Remove the files of a failed start."""
         for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
         shutil.rmtree(self.path / BAG, ignore_errors=True)
         if not keep_folder:
-            # What others have put there meanwhile stays.
+            # Keep the folder if others have put files there meanwhile.
             with suppress(OSError):
                 self.path.rmdir()
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
-        """Write what became of a processed image, and how long it took; counted from 0."""
+        """Write the result of a processed image (number from 0) and its processing time."""
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
@@ -115,11 +115,11 @@ class ResultsFolder(Closing):
                    f'{1e3 * seconds:.2f}'))
 
     def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
-        """Write that an image was dropped or rejected, and why."""
+        """Write an image that was dropped or rejected, with the reason."""
         self._row((image, stamp_ns, 'UNUSED', reason, *[''] * (len(COLUMNS) - 4)))
 
     def add_landmarks(self, places: Array) -> None:
-        """Write landmarks (M, 3) that are not refined any more, in the first camera."""
+        """Write landmarks (M, 3) in the first camera, which are not refined any more."""
         if not len(places):
             return
         try:
@@ -132,13 +132,13 @@ class ResultsFolder(Closing):
             raise _blame(self.path, error) from error
 
     def publish(self, outgoing: Outgoing, stamp_ns: int) -> None:
-        """Write a message under the topic that the live node has for it."""
+        """Write a message under the topic of the live node."""
         topic = outgoing.topic
         self._bag.write(topic if topic.startswith('/') else f'/{NODE_NAME}/{topic}',
                         outgoing.message, stamp_ns)
 
     def add_errors(self, pairs: list[Step], errors: PairErrors) -> None:
-        """Write the errors of all pairs, empty where there is none."""
+        """Write the errors of all pairs; cells of NaN are empty."""
         try:
             with (self.path / 'errors.csv').open('w', encoding='utf-8', newline='') as file:
                 rows = csv.writer(file, lineterminator='\n')
@@ -152,7 +152,7 @@ class ResultsFolder(Closing):
             raise _blame(self.path, error) from error
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Put a summary in the place of the one before, all or nothing."""
+        """Replace the summary atomically."""
         try:
             self._summarise(summary)
         except OSError as error:
@@ -199,12 +199,12 @@ def _cells(values: NDArray[np.float64]) -> list[str]:
 
 
 def _blame(path: Path, error: OSError) -> DjetError:
-    return DjetError(f'{path} could not be written: {error.strerror or error}; what it holds so '
-                     'far is readable')
+    return DjetError(f'{path} could not be written: {error.strerror or error}; the results up to '
+                     'here are readable')
 
 
 def _widen(axes: Any) -> None:
-    """Give a straight trajectory room at its sides, so that its deviations can be seen."""
+    """Widen the plot of a straight trajectory, so that its deviations are visible."""
     limits = [np.array(axes.get_xlim()), np.array(axes.get_ylim())]
     longest = max(float(np.ptp(limit)) for limit in limits)
     for limit, widen in zip(limits, (axes.set_xlim, axes.set_ylim)):
@@ -215,11 +215,11 @@ def _widen(axes: Any) -> None:
 def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str,
                     unit: str) -> None:
     """
-    Draw a trajectory from above: x to the right, z ahead, positions (N, 3) in the first camera.
+    Plot a trajectory from above (x right, z forward), from positions (N, 3) in the first camera.
 
-    truth: (M, 3) or None; unit: of the axes.
+    truth: (M, 3) or None; unit: unit of the axes.
     """
-    # Here, because it takes half a second that only the end of a replay needs.
+    # Imported here, as it takes half a second and only the end of a replay needs it.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 7), layout='constrained')
@@ -228,8 +228,8 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str
         axes.plot(truth[:, 0], truth[:, 2], color='0.55', linewidth=2.5, label='ground truth')
     axes.plot(estimate[:, 0], estimate[:, 2], color='tab:blue', linewidth=1.2, label='estimate')
     axes.plot(*estimate[0, [0, 2]], 'o', color='black', markersize=5, label='start')
-    axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})')
-    # A $ in the name of a folder begins no formula.
+    axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, forward ({unit})')
+    # A $ in the name of a folder is not a formula.
     axes.set_title(title, parse_math=False)
     _widen(axes)
     axes.grid(color='0.9')

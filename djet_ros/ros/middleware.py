@@ -67,7 +67,7 @@ class RosPublisher:
 
     @property
     def listeners(self) -> int:
-        """Number of subscriptions."""
+        """Return the number of subscriptions."""
         return int(self._publisher.get_subscription_count())
 
 
@@ -100,7 +100,7 @@ class RosSubscription:
 
     @property
     def profile(self) -> Profile:
-        """Requested QoS, after overrides."""
+        """Return the requested QoS, after overrides."""
         return _profile(self._subscription.qos_profile)
 
     def new_losses(self) -> int:
@@ -138,7 +138,7 @@ class RosMiddleware:
 
     @property
     def node(self) -> str:
-        """Fully qualified node name."""
+        """Return the fully qualified node name."""
         return str(self._node.get_fully_qualified_name())
 
     def resolve(self, name: str) -> str:
