@@ -11,7 +11,7 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, OdometryConf
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import FIXED, live_choices, why_frames, with_live_values
+from djet_ros.live.parameters import FIXED, live_choices, tf_reason, with_live_values
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -276,7 +276,7 @@ def test_another_odometry_is_heard_by_its_topic_or_by_tf_where_it_is_asked_for(v
     ({'guess': True, 'guess_frame': 'odom_of_wheels'}, '')])
 def test_tf_is_asked_where_something_is_mounted_somewhere_and_nobody_has_said_where(values, why):
     config = from_flat({f'odometry.{name}': value for name, value in values.items()})
-    assert why_frames(config.odometry) == why
+    assert tf_reason(config.odometry) == why
 
 
 @pytest.mark.parametrize(('name', 'node', 'meant'), [

@@ -28,7 +28,7 @@ from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.kitti import KittiSequence
-from djet_ros.ros.command_line import topic_rules
+from djet_ros.ros.command_line import topic_remappings
 import numpy as np
 import pytest
 from ros_messages import camera_info, IMAGE, image, IMAGE_TYPE, INFO, INFO_TYPE, SEEN, serialised
@@ -489,7 +489,7 @@ def test_compressed_images_may_be_called_anything(rules):
 def test_rules_for_topics_are_found_among_the_words_for_ros():
     words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
              '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']
-    assert list(topic_rules(words, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
+    assert list(topic_remappings(words, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
 
 
 @pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',

@@ -10,7 +10,7 @@ from typing import Any
 from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
-from djet_ros.live.middleware import Offer, Profile
+from djet_ros.live.middleware import Profile, PublisherInfo
 from djet_ros.live.odometry_face import OdometryFace
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from ros_messages import camera_info, image, message_type
 class Graph:
     """A middleware of nobody else; frames: what tf knows, by parent and child."""
 
-    qos_remedy, senders_wait, node = 'overrides of {topic}', False, '/vo_node'
+    qos_override_names, publishers_block, node = 'overrides of {topic}', False, '/vo_node'
     message_type = staticmethod(message_type)
 
     def __init__(self) -> None:
@@ -58,20 +58,20 @@ class Graph:
         self.callbacks[topic], self.kinds[topic] = callback, kind
         self.heard.append(topic)
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
-                               new_refusals=lambda: int(topic in self.offered))
+                               new_incompatible=lambda: int(topic in self.offered))
 
     def offers(self, topic: str) -> list[Any]:
-        return ([Offer('/sender', self.kinds[topic], self.offered[topic])]
+        return ([PublisherInfo('/sender', self.kinds[topic], self.offered[topic])]
                 if topic in self.offered else [])
 
     def published(self, kind: str) -> list[str]:
         return self.elsewhere
 
-    def follow_frames(self) -> None:
+    def subscribe_tf(self) -> None:
         assert not self.hears_tf
         self.hears_tf = True
 
-    def forget_frames(self) -> None:
+    def unsubscribe_tf(self) -> None:
         assert self.hears_tf
         self.hears_tf = False
 
@@ -85,8 +85,8 @@ class Node:
     def __init__(self, **parameters: Any) -> None:
         self.graph = Graph()
         self.config: Config = from_flat({'estimator.max_features': 500, **parameters})
-        self.face = OdometryFace(self.graph, self.config)
-        self.face.session.start()
+        self.node = OdometryFace(self.graph, self.config)
+        self.node.session.start()
         self.graph.callbacks['/camera_info'](camera_info(K, SIZE))
         self._cards, self._sent = Cards(), 0
 
@@ -96,18 +96,18 @@ class Node:
         self.graph.callbacks['/image'](image(self._cards.gray(here),
                                              stamp_ns=self._sent * 10**8))
         self._sent += 1
-        counts, end = self.face.session._tracker.counts, monotonic() + 20
+        counts, end = self.node.session._tracker.counts, monotonic() + 20
         while counts.received < self._sent and monotonic() < end:
             sleep(0.01)
-        self.face.session.configure(self.config)
-        self.face._tick()
+        self.node.session.configure(self.config)
+        self.node._tick()
 
     def change(self, **values: Any) -> None:
         """Change parameters, as the middleware does it while the node runs."""
         self.config = with_values(self.config, values)
-        self.face.connect(self.config)
-        self.face.configure(self.config)
-        self.face._tick()
+        self.node.connect(self.config)
+        self.node.configure(self.config)
+        self.node._tick()
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def node() -> Iterator[Callable[..., Node]]:
 
     yield start
     for one in started:
-        one.face.session.stop(10)
+        one.node.session.stop(10)
 
 
 def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node):
@@ -164,7 +164,7 @@ def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic,
                   'odometry.guess_frame': 'wheels'})
     one.graph.offered[topic] = offered
     for _ in range(2):
-        one.face._tick()
+        one.node._tick()
     line, = (line for line in one.graph.lines if line.startswith('incompatible QoS'))
     assert line.endswith(f'no messages are received from it; {remedy}')
 
@@ -179,8 +179,8 @@ def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
         node, asked, offered, remedy):
     one = node(**{'ros.qos_reliability': asked})
     one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
-    assert one.face.why_silent('/image') == f'1 publisher, but no messages arrive{remedy}'
-    assert one.face.why_silent('/camera_info') == '1 publisher, but no messages arrive'
+    assert one.node.why_silent('/image') == f'1 publisher, but no messages arrive{remedy}'
+    assert one.node.why_silent('/camera_info') == '1 publisher, but no messages arrive'
 
 
 @pytest.mark.parametrize(('transport', 'elsewhere', 'hint'), [
@@ -192,4 +192,4 @@ def test_a_hint_at_a_topic_can_be_followed(node, transport, elsewhere, hint):
     one = node(**{'ros.image_transport': transport})
     one.graph.elsewhere = [elsewhere]
     topic = '/image' if transport == 'raw' else '/image/compressed'
-    assert one.face.why_silent(topic) == f'it has no publisher{hint}'
+    assert one.node.why_silent(topic) == f'it has no publisher{hint}'

@@ -29,7 +29,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from djet_ros.dds.wire import dds_type_name, decode, encode, sample_type
 from djet_ros.errors import DjetError
-from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
+from djet_ros.live.middleware import DEFAULT_PROFILE, Profile, PublisherInfo
 from djet_ros.recordings.decoding import jazzy
 
 # A blocked write holds Python's interpreter lock, so callers retry instead of waiting longer.
@@ -159,7 +159,7 @@ class Subscription:
         number, self._garbage = self._garbage, 0
         return number + int(self._reader.get_sample_lost_status().total_count_change)
 
-    def new_refusals(self) -> int:
+    def new_incompatible(self) -> int:
         """Return the number of publishers with incompatible QoS since the last call."""
         return int(self._reader.get_requested_incompatible_qos_status().total_count_change)
 
@@ -271,10 +271,10 @@ class Graph:
             change = self._waiting.attach if wanted else self._waiting.detach
             change(subscription.condition)
 
-    def offers(self, topic: str) -> list[Offer]:
+    def offers(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
-        return [Offer(f'participant {one.participant_key}', _ros_type(one.type_name),
-                      _profile(one.qos)) for one in _alive(self._publications)
+        return [PublisherInfo(f'participant {one.participant_key}', _ros_type(one.type_name),
+                              _profile(one.qos)) for one in _alive(self._publications)
                 if one.topic_name == f'rt{topic}']
 
     def listeners_without(self, dds_topic: str, user_data: str) -> set[str]:

@@ -11,7 +11,7 @@ from djet_ros.core.types import Array
 from djet_ros.dds.graph import Graph, Publisher, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
-from djet_ros.live.middleware import Offer, Profile
+from djet_ros.live.middleware import Profile, PublisherInfo
 from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
 from djet_ros.odometry.static_frames import StaticFrames, TOPIC, TYPE
 from djet_ros.recordings.decoding import message_type
@@ -34,8 +34,8 @@ class DdsMiddleware:
     use_sim_time: the current time is that of /clock.
     """
 
-    qos_remedy = ''
-    senders_wait = True
+    qos_override_names = ''
+    publishers_block = True
     message_type = staticmethod(message_type)
 
     def __init__(self, graph: Graph, names: Names, use_sim_time: bool = False) -> None:
@@ -43,7 +43,7 @@ class DdsMiddleware:
         self._names = names
         self._clock: int | None = None
         self._frames = StaticFrames()
-        self._follows_frames = False
+        self._tf_subscribed = False
         self._last_garbage = self._last_client_check = -float('inf')
         self._services: list[TriggerServer] = []
         if use_sim_time:
@@ -84,7 +84,7 @@ class DdsMiddleware:
         return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
                                   batch=100 if ready is None else 1, ready=ready)
 
-    def offers(self, topic: str) -> list[Offer]:
+    def offers(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
         return self._graph.offers(topic)
 
@@ -92,16 +92,16 @@ class DdsMiddleware:
         """Return the topics of a ROS type that have a publisher."""
         return self._graph.published(kind)
 
-    def follow_frames(self) -> None:
+    def subscribe_tf(self) -> None:
         """Subscribe to /tf_static; moving frames need tf2, which is part of ROS."""
-        if not self._follows_frames:
+        if not self._tf_subscribed:
             # Publishers of /tf_static latch their newest message.
             self._graph.listen(TOPIC, TYPE, self._frames.add,
                                Profile(depth=_FRAMES_DEPTH, latched=True),
                                garbage=self._note_garbage)
-        self._follows_frames = True
+        self._tf_subscribed = True
 
-    def forget_frames(self) -> None:
+    def unsubscribe_tf(self) -> None:
         """Do nothing: /tf_static has no traffic once its messages have been received."""
 
     def transform(self, parent: str, child: str) -> Array | None:

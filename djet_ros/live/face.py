@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from djet_ros.config.sections import NodeConfig
 from djet_ros.core.types import Array
-from djet_ros.live.middleware import Middleware, Offer, Profile, Publisher, Subscription
+from djet_ros.live.middleware import Middleware, Profile, Publisher, PublisherInfo, Subscription
 from djet_ros.live.topics import full_name, image_topics, IMAGE_TYPES, INFO_TYPE
 from djet_ros.odometry.messages import seconds_and_rest
 from djet_ros.odometry.tracker import Outgoing
@@ -77,7 +77,7 @@ class Face:
         self._refused: list[Subscription] = []
         # Topics whose QoS is that of the parameters.
         self._as_configured: set[str] = set()
-        self._latched = self._follows_frames = False
+        self._latched = self._tf_subscribed = False
         self._remedy = 'ros.qos_reliability to best_effort'
         self._last_tick = -float('inf')
 
@@ -139,7 +139,7 @@ class Face:
                else f' remap {topic}:={near[0]}')
         return f'it has no publisher; did you mean {near[0]}?{how}'
 
-    def _loss_remedy(self, topic: str, offers: Sequence[Offer]) -> str:
+    def _loss_remedy(self, topic: str, offers: Sequence[PublisherInfo]) -> str:
         """Return the remedy for large images that lose fragments, which no event reports."""
         images = self._images
         if topic != images.topic or images.profile.reliable:
@@ -199,26 +199,26 @@ class Face:
 
     def _takes_images(self) -> bool:
         """Return whether to take images now: always, if publishers cannot be made to wait."""
-        return not self._middleware.senders_wait or self.session.has_room
+        return not self._middleware.publishers_block or self.session.has_room
 
-    def follow_frames_while_wanted(self) -> None:
+    def update_tf_subscription(self) -> None:
         """Subscribe to tf only while a mounting is unknown: a robot's tf traffic costs time."""
         wanted = self.session.wants_frames
-        if wanted == self._follows_frames:
+        if wanted == self._tf_subscribed:
             return
-        self._follows_frames = wanted
+        self._tf_subscribed = wanted
         if wanted:
-            self._middleware.follow_frames()
+            self._middleware.subscribe_tf()
         else:
-            self._middleware.forget_frames()
+            self._middleware.unsubscribe_tf()
 
     # Once a second
 
     def _tick(self) -> None:
-        self.follow_frames_while_wanted()
+        self.update_tf_subscription()
         self.session.count_lost(self._images.new_losses())
         # Report on the next tick: the name of a publisher is known a little later than its QoS.
-        refused = [one for one in self._inputs if one.new_refusals()]
+        refused = [one for one in self._inputs if one.new_incompatible()]
         for subscription in self._refused:
             self._report_mismatch(subscription)
         self._refused = refused
@@ -246,7 +246,7 @@ class Face:
                          f'it; {self._qos_remedy(topic, ours)}')
 
     def _qos_remedy(self, topic: str, ours: Profile) -> str:
-        overrides = self._middleware.qos_remedy.format(topic=topic)
+        overrides = self._middleware.qos_override_names.format(topic=topic)
         if topic in self._as_configured:
             return ' or '.join(filter(None, [f'set {self._remedy}', overrides]))
         # Overrides do not apply to latched subscriptions.

@@ -8,7 +8,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.topics import BESIDE_TYPES, graph_input_type, GRAPH_INPUTS, graph_outputs
+from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs, SIDE_INPUT_TYPES
 from djet_ros.posegraph.live_slam import LiveSlam
 from djet_ros.recordings.mask_files import still_mask
 
@@ -27,7 +27,7 @@ class GraphFace(Face):
             LiveSlam(config, middleware.message_type, image, middleware.node.strip('/'),
                      still_mask(config.odometry.mask_file)), self,
             {**topics, 'image': image, 'camera_info': info})
-        self.follow_frames_while_wanted()
+        self.update_tf_subscription()
         self.advertise(graph_outputs(tf=config.slam.publish_tf))
         for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
                                                  self.session.relative_pose,
@@ -35,7 +35,7 @@ class GraphFace(Face):
             self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH),
                         as_configured=False)
         if config.odometry.mask:
-            self.listen(middleware.resolve('mask'), BESIDE_TYPES['mask'], self.session.mask,
+            self.listen(middleware.resolve('mask'), SIDE_INPUT_TYPES['mask'], self.session.mask,
                         replace(input_profile(config.ros), depth=config.slam.image_buffer))
         self.listen_to_camera(image, info, config.ros.image_transport,
                               replace(input_profile(config.ros), depth=config.slam.image_buffer))

@@ -16,7 +16,7 @@ class Profile:
     A QoS profile; depth None is history keep-all.
 
     If messages are not taken, keep-all blocks reliable keep-all publishers, or loses the oldest:
-    see ``Middleware.senders_wait``.
+    see ``Middleware.publishers_block``.
     """
 
     reliable: bool = True
@@ -36,7 +36,7 @@ class Profile:
 DEFAULT_PROFILE = Profile()
 
 
-class Offer(NamedTuple):
+class PublisherInfo(NamedTuple):
     """A publisher of a topic: its name for log messages, its ROS type and its QoS."""
 
     who: str
@@ -67,7 +67,7 @@ class Subscription(Protocol):
     def new_losses(self) -> int:
         """Return the number of messages lost in transport since the last call."""
 
-    def new_refusals(self) -> int:
+    def new_incompatible(self) -> int:
         """Return the number of publishers with incompatible QoS since the last call."""
 
 
@@ -75,10 +75,10 @@ class Middleware(Protocol):
     """The ROS graph as seen by one node. Callbacks run in the thread that calls ``spin``."""
 
     # Parameters, with {topic}, that override the QoS of a topic; '' if there are none.
-    qos_remedy: str
+    qos_override_names: str
 
     # Whether reliable publishers block while a subscription does not take messages.
-    senders_wait: bool
+    publishers_block: bool
 
     @property
     def node(self) -> str:
@@ -109,19 +109,19 @@ class Middleware(Protocol):
         Subscribe to a topic, by its resolved name.
 
         ready: called before each message; while it returns False, messages of this topic stay in
-        the middleware, and other topics continue. Used only if ``senders_wait``.
+        the middleware, and other topics continue. Used only if ``publishers_block``.
         """
 
-    def offers(self, topic: str) -> Sequence[Offer]:
+    def offers(self, topic: str) -> Sequence[PublisherInfo]:
         """Return the publishers of a topic, by its resolved name."""
 
     def published(self, kind: str) -> Sequence[str]:
         """Return the topics of a ROS type that have a publisher."""
 
-    def follow_frames(self) -> None:
+    def subscribe_tf(self) -> None:
         """Subscribe to tf."""
 
-    def forget_frames(self) -> None:
+    def unsubscribe_tf(self) -> None:
         """Unsubscribe from tf."""
 
     def transform(self, parent: str, child: str) -> Array | None:

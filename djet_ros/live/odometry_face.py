@@ -8,7 +8,7 @@ from djet_ros.config.sections import Config
 from djet_ros.live.face import Face, input_profile
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.session import Session
-from djet_ros.live.topics import BESIDE_TYPES, odometry_outputs, SPEED_TYPES
+from djet_ros.live.topics import odometry_outputs, SIDE_INPUT_TYPES, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
 from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker
@@ -38,10 +38,10 @@ class OdometryFace(Face):
                     speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES)),
                     still_mask=still_mask(config.odometry.mask_file)), self,
             {'image': image, 'camera_info': info})
-        self._hears_speed = self._hears_tf = False
-        self._hears_beside: set[str] = set()
+        self._speed_subscribed = self._guess_tf_subscribed = False
+        self._side_input_topics: set[str] = set()
         self.connect(config)
-        self.follow_frames_while_wanted()
+        self.update_tf_subscription()
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
         for name in ('reset', 'pause', 'resume'):
             middleware.serve(f'~/{name}', getattr(self.session, name))
@@ -56,22 +56,23 @@ class OdometryFace(Face):
         """Create the publishers and subscriptions of a configuration; may raise DjetError."""
         self.advertise(odometry_outputs(config.ros))
         odometry = config.odometry
-        wanted = {'imu': odometry.imu, 'mask': odometry.mask,
-                  'guess': odometry.guess_by_topic}
-        for what in [what for what in wanted if wanted[what] and what not in self._hears_beside]:
-            self.listen(self._middleware.resolve(what), BESIDE_TYPES[what],
-                        getattr(self.session, what),
-                        replace(input_profile(config.ros),
-                                depth=_MASKS_DEPTH if what == 'mask' else _DEPTH))
-            self._hears_beside.add(what)
-        if odometry.guess_by_tf and not self._hears_tf:
+        enabled = {'imu': odometry.imu, 'mask': odometry.mask,
+                   'guess': odometry.guess_by_topic}
+        for topic in enabled:
+            if enabled[topic] and topic not in self._side_input_topics:
+                self.listen(self._middleware.resolve(topic), SIDE_INPUT_TYPES[topic],
+                            getattr(self.session, topic),
+                            replace(input_profile(config.ros),
+                                    depth=_MASKS_DEPTH if topic == 'mask' else _DEPTH))
+                self._side_input_topics.add(topic)
+        if odometry.guess_by_tf and not self._guess_tf_subscribed:
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))
             self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
                         Profile(depth=_FRAMES_DEPTH, latched=True), as_configured=False)
-            self._hears_tf = True
-        if config.odometry.scale == 'speed' and not self._hears_speed:
+            self._guess_tf_subscribed = True
+        if config.odometry.scale == 'speed' and not self._speed_subscribed:
             for topic, kind in SPEED_TYPES.items():
                 self.listen(self._middleware.resolve(topic), kind, self.session.speed,
                             input_profile(config.ros))
-            self._hears_speed = True
+            self._speed_subscribed = True

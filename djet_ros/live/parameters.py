@@ -22,11 +22,11 @@ SHARED = ('preset', 'odometry.scale_uncertainty', 'odometry.rectified',
           'ros.image_transport', 'ros.qos_reliability', 'ros.queue_policy')
 
 # Parameters of the odometry node.
-ODOMETRY = frozenset(item.name for part in ('', 'estimator', 'odometry', 'ros')
-                     for item in section(Config(), part))
+ODOMETRY_PARAMETERS = frozenset(
+    item.name for part in ('', 'estimator', 'odometry', 'ros') for item in section(Config(), part))
 
 
-def why_frames(config: OdometryConfig) -> str:
+def tf_reason(config: OdometryConfig) -> str:
     """Return which setting needs a mounting from tf, or '' if none does."""
     if config.base_frame:
         return f'odometry.base_frame is {config.base_frame}'

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 
-def values_after(words: Sequence[str], *options: str) -> Iterator[str]:
+def option_values(words: Sequence[str], *options: str) -> Iterator[str]:
     """Yield the values of ROS options such as --params-file, after --ros-args."""
     for_ros = False
     for word, following in pairwise(words):
@@ -15,9 +15,9 @@ def values_after(words: Sequence[str], *options: str) -> Iterator[str]:
             yield following
 
 
-def topic_rules(words: Sequence[str], node: str) -> Iterator[tuple[str, str]]:
+def topic_remappings(words: Sequence[str], node: str) -> Iterator[tuple[str, str]]:
     """Yield the topic remappings (from, to) that apply to a node, as given."""
-    for rule in values_after(words, '-r', '--remap'):
+    for rule in option_values(words, '-r', '--remap'):
         old, _, new = rule.partition(':=')
         whose, _, old = old.replace('rostopic://', '').rpartition(':')
         if whose in ('', node) and not old.startswith('__'):

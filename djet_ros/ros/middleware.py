@@ -12,9 +12,9 @@ from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
-from djet_ros.live.middleware import DEFAULT_PROFILE, Offer, Profile
+from djet_ros.live.middleware import DEFAULT_PROFILE, Profile, PublisherInfo
 from djet_ros.odometry.messages import pose_of
-from djet_ros.ros.command_line import topic_rules
+from djet_ros.ros.command_line import topic_remappings
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -108,7 +108,7 @@ class RosSubscription:
         number, self._lost = self._lost, 0
         return number
 
-    def new_refusals(self) -> int:
+    def new_incompatible(self) -> int:
         """Return the number of publishers with incompatible QoS since the last call."""
         number, self._refused = self._refused, 0
         return number
@@ -123,8 +123,8 @@ class RosSubscription:
 class RosMiddleware:
     """The ROS graph as seen by a node; see ``Middleware``."""
 
-    qos_remedy = 'qos_overrides.{topic}.subscription.*'
-    senders_wait = False
+    qos_override_names = 'qos_overrides.{topic}.subscription.*'
+    publishers_block = False
     message_type = staticmethod(message_type)
 
     def __init__(self, node: Node) -> None:
@@ -149,7 +149,7 @@ class RosMiddleware:
         """Return whether the command line remaps a topic, even to its default name."""
         full = self._expand(name)
         return any(old != new and self._expand(old) == full
-                   for old, new in topic_rules(sys.argv, self._node.get_name()))
+                   for old, new in topic_remappings(sys.argv, self._node.get_name()))
 
     def _expand(self, name: str) -> str:
         return str(self._node.resolve_topic_name(name, only_expand=True))
@@ -181,10 +181,10 @@ class RosMiddleware:
         """Subscribe to a topic; ready is not used; overrides as for ``advertise``."""
         return RosSubscription(self._node, topic, kind, callback, profile)
 
-    def offers(self, topic: str) -> list[Offer]:
+    def offers(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
-        return [Offer(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
-                      _profile(one.qos_profile))
+        return [PublisherInfo(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
+                              _profile(one.qos_profile))
                 for one in self._node.get_publishers_info_by_topic(topic)]
 
     def published(self, kind: str) -> list[str]:
@@ -192,20 +192,20 @@ class RosMiddleware:
         return [name for name, kinds in self._node.get_topic_names_and_types()
                 if kind in kinds and self._node.count_publishers(name)]
 
-    def follow_frames(self) -> None:
+    def subscribe_tf(self) -> None:
         """Subscribe to tf; the parameters were checked to require tf2_ros."""
         tf2 = import_module('tf2_ros')
         self._frames = tf2.Buffer()
         self._listener = tf2.TransformListener(self._frames, self._node)
 
-    def forget_frames(self) -> None:
+    def unsubscribe_tf(self) -> None:
         """Unsubscribe from tf."""
         self._listener.unregister()
         self._listener = self._frames = None
 
     def transform(self, parent: str, child: str) -> Array | None:
         """Return the newest pose (4, 4) of frame child in parent, or None."""
-        # Called from another thread than forget_frames.
+        # Called from another thread than unsubscribe_tf.
         frames = self._frames
         if frames is None or not frames.can_transform(parent, child, Time()):
             return None

@@ -15,13 +15,13 @@ from djet_ros.errors import DjetError, one_line
 from djet_ros.live.parameters import (
     FIXED,
     live_choices,
-    ODOMETRY,
+    ODOMETRY_PARAMETERS,
     SHARED,
-    why_frames,
+    tf_reason,
     with_live_values,
 )
 from djet_ros.odometry.scale import check_scale
-from djet_ros.ros.command_line import values_after
+from djet_ros.ros.command_line import option_values
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -44,8 +44,8 @@ class Parameters:
         self._node = node
         given = _given(node)
         self.config = _possible(with_live_values(Config(), given))
-        _declare(node, (item for item in flat(self.config).values() if item.name in ODOMETRY),
-                 given)
+        _declare(node, (item for item in flat(self.config).values()
+                        if item.name in ODOMETRY_PARAMETERS), given)
 
     def call_on_change(self, prepare: Callable[[Config], None],
                        apply: Callable[[Config], None]) -> None:
@@ -71,7 +71,7 @@ class Parameters:
         before = flat(self.config)
         return [Parameter(item.name, value=item.value) for item in flat(config).values()
                 if item.name in values or item.value != before[item.name].value
-                ] + [one for one in parameters if one.name not in ODOMETRY]
+                ] + [one for one in parameters if one.name not in ODOMETRY_PARAMETERS]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         values = _values(parameters)
@@ -122,7 +122,7 @@ def graph_parameters(node: Node) -> Config:
 def _given(node: Node) -> dict[str, Any]:
     """Return the values given at the start, for the names in the schema; warn about others."""
     known = flat(Config())
-    for path in map(Path, values_after(sys.argv, '--params-file')):
+    for path in map(Path, option_values(sys.argv, '--params-file')):
         if why := why_unused(path, node.get_fully_qualified_name()):
             node.get_logger().warning(why)
     values = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
@@ -171,7 +171,7 @@ def _possible(config: Config) -> Config:
 
 
 def _require_frames(config: Config) -> None:
-    if asked := why_frames(config.odometry):
+    if asked := tf_reason(config.odometry):
         # Jazzy's package tf2_ros is C++ alone.
         _require('tf2_ros', 'tf2-ros-py', asked)
 
@@ -186,4 +186,4 @@ def _require(module: str, package: str, asked: str) -> None:
 
 
 def _values(parameters: list[Parameter]) -> dict[str, Any]:
-    return {one.name: one.value for one in parameters if one.name in ODOMETRY}
+    return {one.name: one.value for one in parameters if one.name in ODOMETRY_PARAMETERS}

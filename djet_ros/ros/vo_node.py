@@ -12,6 +12,6 @@ from rclpy.node import Node
 def make(node: Node) -> Face:
     """Create the odometry from the parameters of a node, which may change at run time."""
     parameters = Parameters(node)
-    face = OdometryFace(RosMiddleware(node), parameters.config)
-    parameters.call_on_change(face.connect, face.configure)
-    return face
+    odometry = OdometryFace(RosMiddleware(node), parameters.config)
+    parameters.call_on_change(odometry.connect, odometry.configure)
+    return odometry
