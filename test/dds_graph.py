@@ -78,7 +78,7 @@ class Peer:
             self.graph.spin(0.05)
 
     def said(self, **wanted: str) -> dict[str, str] | None:
-        """Give the last diagnostics that have these values; underscores stand for blanks."""
+        """Return the last diagnostics that have these values; underscores stand for blanks."""
         for message in reversed(self.heard['/diagnostics']):
             values = {pair.key: pair.value for pair in message.status[0].values}
             values['message'] = message.status[0].message
@@ -100,7 +100,7 @@ class Command:
 
     @property
     def log(self) -> str:
-        """Give what it has written so far."""
+        """Return what it has written so far."""
         return self.path.read_text()
 
     def finish(self) -> str:

@@ -30,7 +30,7 @@ ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
 
 
 def command(node: str, before: str = '') -> list[str]:
-    """Give the command that runs a node; before: what its Python is to do first."""
+    """Return the command that runs a node; before: what its Python is to do first."""
     return [sys.executable, '-c', f'{before}import sys; from djet_ros.cli.nodes import {node}; '
             f'sys.exit({node}())']
 
@@ -137,7 +137,7 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
-        """Give what the node has said so far."""
+        """Return what the node has said so far."""
         return self.path.read_text()
 
     def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
@@ -150,7 +150,7 @@ class NodeProcess:
 
 @contextmanager
 def peer(name: str, topics: Mapping[str, str] | None = None) -> Iterator[Peer]:
-    """Give a peer that listens to topics by type, and end it."""
+    """Return a peer that listens to topics by type, and end it."""
     one = Peer(name)
     for topic, kind in (topics or {}).items():
         one.listen(topic, kind)
@@ -160,7 +160,7 @@ def peer(name: str, topics: Mapping[str, str] | None = None) -> Iterator[Peer]:
 
 @contextmanager
 def nodes(folder: Path, image: str) -> Iterator[Callable[..., NodeProcess]]:
-    """Give a function that starts a node on images, and end all of them with clean logs."""
+    """Return a function that starts a node on images, and end all of them with clean logs."""
     started: list[NodeProcess] = []
 
     def start(*words: str, name: str = 'vo_node', before: str = '',

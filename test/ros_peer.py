@@ -44,7 +44,7 @@ class Peer:
         self._until(lambda: self._publishers[topic].get_subscription_count() >= count)
 
     def alone(self, topic):
-        """Wait until nobody listens any more."""
+        """Wait until there are no subscriptions any more."""
         self._until(lambda: not self._publishers[topic].get_subscription_count())
 
     def send(self, topic, data):

@@ -67,7 +67,7 @@ def graph_peer() -> Peer:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
-    """Give a function that starts a djet command; it has ended, without a traceback, at last."""
+    """Return a function that starts a djet command; it has ended, without a traceback, at last."""
     started: list[Command] = []
 
     def run(*words: str | Path, before: str = '') -> Command:
@@ -85,7 +85,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
 
 @pytest.fixture
 def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[..., Command]]:
-    """Give a function that starts djet live, and waits until its topics are there."""
+    """Return a function that starts djet live, and waits until its topics are there."""
     def run(*words: str, topic: str = IMAGE, before: str = '') -> Command:
         one = start('live', '-r', f'image:={topic}', *words, before=before)
         for output in TYPES:
@@ -169,7 +169,7 @@ def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
 
 
 def test_a_sender_without_end_waits_and_nothing_is_lost(live, peer, drive):
-    # Each end keeps 32 images beside those that wait for work.
+    # Each end of the connection keeps 32 images, besides those in the queue.
     room = 10 * drive[0].nbytes
     live(*EVERY, *FAST,
          before=f'from djet_ros.live import session; session.MAX_QUEUE_BYTES = {room}; ')
@@ -275,7 +275,7 @@ def test_what_is_seen_instead_is_said_with_the_remedy(live, peer, case):
     one = live(*FAST)
     publisher = peer.advertise(topic, kind, listeners=0)
     peer.wait('the log', lambda: line in one.log)
-    del publisher  # one that nobody holds is gone from the graph
+    del publisher  # without references it leaves the graph
 
 
 def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
@@ -328,7 +328,7 @@ def test_clients_of_fast_dds_take_its_services_for_absent_and_the_log_says_why(l
 
 
 def ends(peer: Peer, service: str) -> tuple[list[str], list[str]]:
-    """Give what the writers of answers and the readers of requests say of themselves."""
+    """Return the user data of the response writers and of the request readers."""
     from cyclonedds.builtin import (
         BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
     from cyclonedds.domain import DomainParticipant

@@ -31,7 +31,7 @@ def straight(metres: float, speed: float = 1.0, yaw: float = 0.0, stretch: float
 
 
 def winding(seed: int, frames: int) -> tuple[Poses, Poses]:
-    """Give a way of changing speed and direction, and an estimate that is off in all respects."""
+    """Return a path of changing speed and direction, and an estimate with all kinds of errors."""
     rng = np.random.default_rng(seed)
     turns = rng.normal(0, (0.003, 0.03, 0.003), (frames, 3))
     ways = np.stack([np.zeros(frames), np.zeros(frames), rng.uniform(0, 2.2, frames)], axis=1)

@@ -1,4 +1,4 @@
-"""The wiring of a live node, on a graph that only writes down what is asked of it."""
+"""A live node on a fake middleware, which records the calls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ros_messages import camera_info, image, message_type
 
 
 class Graph:
-    """A middleware of nobody else; frames: what tf knows, by parent and child."""
+    """A fake middleware; frames: transforms on tf, by parent and child."""
 
     qos_override_names, publishers_block, node = 'overrides of {topic}', False, '/vo_node'
     message_type = staticmethod(message_type)
@@ -30,7 +30,7 @@ class Graph:
         self.callbacks: dict[str, Callable[[Any], None]] = {}
         self.kinds: dict[str, str] = {}
         self.heard: list[str] = []
-        # Topics that somebody else publishes, whatever the type.
+        # Topics of other publishers, whatever the type.
         self.elsewhere: list[str] = []
         self.frames: dict[tuple[str, str], Any] = {}
         self.hears_tf = False
@@ -80,7 +80,7 @@ class Graph:
 
 
 class Node:
-    """The odometry's face on such a graph."""
+    """The odometry node on such a middleware."""
 
     def __init__(self, **parameters: Any) -> None:
         self.graph = Graph()

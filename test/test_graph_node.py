@@ -61,7 +61,7 @@ def camera() -> Iterator[Peer]:
 
 @pytest.fixture
 def nodes(tmp_path: Path, listener: Peer) -> Iterator[Callable[..., NodeProcess]]:
-    """Give a function that starts a node by name; all have ended cleanly after the test."""
+    """Return a function that starts a node by name; all have ended cleanly after the test."""
     listener.heard.clear()
     with processes(tmp_path, IMAGE) as start:
         yield lambda name, **parameters: start(name=name, **parameters)
@@ -98,7 +98,7 @@ def transforms(heard: Heard, parent: str) -> dict[int, Any]:
 
 
 def worst(poses: dict[int, Any], to_the_right: list[int]) -> float:
-    """Give the largest distance from the way to the camera's right, of poses by stamp."""
+    """Return the largest lateral error of poses by stamp on a path to the right."""
     return max(float(np.linalg.norm(
         here[:3, 3] - WAYS[(stamp - START) // PERIOD] * np.array(to_the_right)))
         for stamp, here in poses.items())
@@ -108,7 +108,7 @@ def drive(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess],
           **parameters: Any) -> NodeProcess:
     """Go to the right and back, and give the pose graph's process."""
     if parameters:
-        # There before the nodes, as on a robot: nothing tells when they have heard it.
+        # Published before the nodes start, as on a robot: its reception cannot be observed.
         camera.advertise('/tf_static', TYPES['/tf'], 0, durability='transient_local', depth=1)
         camera.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', TO_THE_LEFT))
     nodes('vo_node', **ODOMETRY_PARAMETERS, **parameters)
@@ -125,7 +125,7 @@ def drive(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess],
 
 @pytest.fixture
 def driven(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> NodeProcess:
-    """Give the pose graph's process, after a way to the right and back."""
+    """Return the process of the pose graph, after a path to the right and back."""
     return drive(listener, camera, nodes)
 
 
@@ -138,7 +138,7 @@ def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
     path = listener.heard[PATH][-1]
     assert path.header.frame_id == 'map'
     told = dict(pose_of(one) for one in listener.heard[ODOMETRY])
-    # Loops can't mend what is exact to 3 cm already.
+    # Loops cannot improve what is accurate to 3 cm already.
     assert worst(dict(pose_of(one) for one in path.poses), to_the_right) < max(
         worst(told, to_the_right), 0.03)
     # REP 105: odom -> camera is the odometry's alone, and map -> odom carries the correction

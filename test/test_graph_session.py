@@ -53,7 +53,7 @@ class Live:
 
 @pytest.fixture
 def live():
-    """Give a function that begins a session, which is stopped after the test."""
+    """Return a function that begins a session, which is stopped after the test."""
     started = []
 
     def start(**parameters):

@@ -72,7 +72,7 @@ def test_the_recipe_for_robot_localization_fuses_the_twist_of_our_odometry_alone
 
 
 def texts(value: Any) -> Iterator[str]:
-    """Give all texts in a JSON value, the names of fields among them."""
+    """Return all texts in a JSON value, the names of fields among them."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
@@ -117,7 +117,7 @@ def test_the_arguments_are_listed_and_explained(path: Path) -> None:
 
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
-    """Give the environment of an installed package: its share, and the node where ROS looks."""
+    """Return the environment of an installed package: its share, and the node where ROS looks."""
     pytest.importorskip('rclpy', reason='rclpy is missing: no ROS 2 is sourced here')
     index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
     index.mkdir(parents=True)
@@ -161,7 +161,7 @@ def launched(environment: dict[str, str], log: Path, *words: str, until: str,
 
 def parameters_of_launched(environment: dict[str, str], folder: Path, *words: str
                            ) -> tuple[bool, bool]:
-    """Give use_sim_time and ros.publish_tf of the odometry that a launch file starts."""
+    """Return use_sim_time and ros.publish_tf of the odometry that a launch file starts."""
     node = folder / 'lib' / 'djet_ros' / 'vo_node'
     node.write_text(f'#!/bin/sh\nexec {shlex.join([sys.executable, "-c", TELL])} "$@"\n')
     said = launched(environment, folder / 'out', *words, until='TOLD')
@@ -291,7 +291,7 @@ def test_two_cameras_have_their_own_nodes_and_topics(
 
 
 def with_player(environment: dict[str, str], folder: Path, does: str) -> dict[str, str]:
-    """Give an environment in which ``ros2 bag`` does something, as it may not be installed."""
+    """Return an environment with a fake ``ros2 bag``, as it may not be installed."""
     (folder / 'bin').mkdir()
     ros2 = folder / 'bin' / 'ros2'
     ros2.write_text(f'#!/bin/sh\n[ "$1" = bag ] && {{ {does}; }}\n'

@@ -1,4 +1,4 @@
-"""The SLAM beside a live odometry: steps out of messages, a map that grows, and its loops."""
+"""The live pose graph: steps from messages, an incremental map, and loop closure."""
 
 from dataclasses import replace
 import gc
@@ -30,7 +30,7 @@ SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
 
 
 class Odometry:
-    """An odometry that is told its motions, and words them as vo_node does."""
+    """An odometry with given motions, which publishes them as vo_node does."""
 
     def __init__(self, convention='optical', base_frame='', mounting=None):
         self._make = Messages(message_type, OdometryConfig(
@@ -39,7 +39,7 @@ class Odometry:
         self.reset()
 
     def reset(self):
-        """Begin anew at the origin."""
+        """Restart at the origin."""
         self.here, self.covariance = np.eye(4), np.zeros((6, 6))
 
     def _result(self, status, motion, covariance, standing=False, known=True):
@@ -49,7 +49,7 @@ class Odometry:
             standing, self._reference)
 
     def start(self):
-        """Give (status, Odometry) of a first frame, here."""
+        """Return (status, Odometry) of a first frame at the current pose."""
         self._reference = None
         result = self._result(Status.FIRST_FRAME, np.eye(4), np.zeros((6, 6)))
         self._reference = self.stamp
@@ -57,7 +57,7 @@ class Odometry:
         return self._make.status(result), self._make.odometry(result)
 
     def move(self, motion, covariance=None, standing=False, known=True):
-        """Give (relative pose, status, Odometry) of the next frame."""
+        """Return (relative pose, status, Odometry) of the next frame."""
         covariance = np.diag(SIGMAS**2) if covariance is None else covariance
         result = self._result(Status.OK, motion, covariance, standing, known)
         if not standing:
@@ -68,7 +68,7 @@ class Odometry:
                 self._make.odometry(result))
 
     def lose_track(self, *, bridged=False):
-        """Give (status, Odometry) of a bad pair; unless bridged the next starts from here."""
+        """Return (status, Odometry) of a bad pair; unless bridged the next starts from here."""
         result = self._result(Status.TOO_FEW_MATCHES, np.eye(4), UNKNOWN_MOTION)
         if not bridged:
             self.covariance, self._reference = result.pose_covariance, self.stamp
@@ -79,7 +79,7 @@ class Odometry:
 # Steps
 
 def told(steps, *messages):
-    """Give the steps that come of messages."""
+    """Return the steps that messages complete."""
     return [step for message in messages for step in take(steps, message)]
 
 
@@ -237,7 +237,7 @@ def test_a_status_of_another_kind_is_refused(spoil):
 
 @pytest.fixture(scope='module')
 def live():
-    """Give the class, for which GTSAM must be installed."""
+    """Return the class, for which GTSAM must be installed."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.live_slam import LiveSlam
     return LiveSlam
@@ -249,7 +249,7 @@ FEW_FEATURES = from_flat({'estimator.max_features': 800,
 
 
 class Drive:
-    """A way past cards, as an odometry that drifts to the right tells it."""
+    """A path past cards, as estimated by an odometry that drifts to the right."""
 
     def __init__(self, live, config=FEW_FEATURES, slam=QUICK, drift=0.01):
         self.slam = live(replace(config, slam=slam), message_type, 'image_rect')
@@ -262,7 +262,7 @@ class Drive:
         self.true, self.told, self.corrections, self.path = {}, {}, {}, None
 
     def start(self, place=REST):
-        """Begin, or begin anew, at a place."""
+        """Start or restart at a place."""
         self._true = place
         return self._take(self.odometry.start)
 
@@ -376,7 +376,7 @@ def test_closing_a_loop_takes_the_drift_away(driven):
 
 
 def test_map_to_odom_and_odom_to_camera_make_the_optimised_pose(driven):
-    """As REP 105 has it: nobody but the odometry says where the camera is in its frame."""
+    """As in REP 105: only the odometry publishes the camera in the odometry frame."""
     optimised = dict(pose_of(one) for one in driven.path.poses)
     newest = max(optimised)
     correction = driven.slam.map.correction
@@ -507,7 +507,7 @@ def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target
 
 
 def test_without_a_scale_the_map_keeps_the_units_of_the_odometry(live):
-    """Directions are mended, as far as they tell; lengths bend, but no motion is turned round."""
+    """Directions are corrected; lengths change, but no motion is reversed."""
     drive = Drive(live)
     move = drive.odometry.move
 

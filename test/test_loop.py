@@ -103,7 +103,7 @@ def test_live_it_shrinks_by_a_factor_too(block):
     chained = dict(zip(before, accumulate(
         (pairs.get(stamp, np.eye(4)) for stamp in before), np.matmul)))
     assert len(before) == 214
-    # What both laps have in common no loop can tell, and the odometry leaves little more than it:
+    # Loops do not observe errors common to both laps, and the odometry has few others:
     # it goes by landmarks already, and pairs are what a graph begins with.
     assert error(after) < error(before)
     assert error(after) < min(error(chained) / 2, 0.06)

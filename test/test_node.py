@@ -83,7 +83,7 @@ def publisher() -> Iterator[Peer]:
 
 @pytest.fixture
 def node(tmp_path: Path, subscriber: Peer) -> Iterator[Callable[..., NodeProcess]]:
-    """Give a function that starts the node; it has ended, with a clean log, after the test."""
+    """Return a function that starts the node; it has ended, with a clean log, after the test."""
     with nodes(tmp_path, IMAGE) as begin:
         def start(*words: str, **parameters: Any) -> NodeProcess:
             one = begin(*words, **parameters)
@@ -144,7 +144,7 @@ def wait_for_log(node: NodeProcess, text: str, seconds: float = 2 * PATIENCE) ->
 
 
 def filmed(images: list[Any], folder: Path) -> FrameSequence:
-    """Give the images as a sequence in files, with what an IMU beside the camera felt."""
+    """Return the images as a sequence in files, with the measurements of an IMU."""
     folder.mkdir()
     paths = [folder / f'{i:06}.png' for i in range(len(images))]
     for path, pixels in zip(paths, images):
@@ -182,7 +182,7 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
                     for topic in poses}
 
     with BagRecording(tmp_path / 'bag', beside={'imu': None} if imu else {}) as source:
-        # There before the node, as on a robot: nothing tells when the node has heard it.
+        # Published before the node starts, as on a robot: its reception cannot be observed.
         publisher.advertise('/tf_static', TF_TYPE, 0, durability='transient_local')
         for frames in source.static_frames():
             publisher.send('/tf_static', frames)
@@ -347,7 +347,7 @@ def test_each_bad_image_is_said_once_and_the_next_good_pair_is_tracked(
     camera(publisher)
     for round_, (reason, make) in enumerate(BAD_IMAGES.items()):
         subscriber.heard.clear()
-        # The camera begins anew each time.
+        # The camera restarts each time.
         assert publisher.call('reset')['success'], round_
         play(publisher, drive[:3])
         for _ in range(3):

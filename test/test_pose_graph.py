@@ -87,7 +87,7 @@ def unscaled(tmp_path_factory):
 
 
 def random_graph(seed, vertices=8):
-    """Give a graph whose poses do not agree with its edges, and full covariances."""
+    """Return a graph whose poses are inconsistent with its edges, with full covariances."""
     rng = np.random.default_rng(seed)
 
     def motion(size):
@@ -107,7 +107,7 @@ def random_graph(seed, vertices=8):
 
 
 def exact_graph(vertices=6):
-    """Give a graph whose poses agree with its edges."""
+    """Return a graph whose poses are consistent with its edges."""
     graph = random_graph(3, vertices)
     edges = [replace(edge, motion=np.linalg.inv(graph.poses[edge.source])
                      @ graph.poses[edge.target]) for edge in graph.edges]
@@ -394,7 +394,7 @@ def test_a_g2o_file_has_the_same_errors_as_the_graph_has_in_gtsam(results, unsca
 
 
 def test_the_errors_stay_the_same_through_a_file_that_gtsam_writes(tmp_path):
-    """Of graphs whose sigmas are alike: GTSAM writes six digits, too few for unknown lengths."""
+    """For graphs with similar sigmas: GTSAM writes six digits, too few for unknown lengths."""
     gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     for seed in range(5):
         graph, path = random_graph(seed), tmp_path / f'{seed}.g2o'

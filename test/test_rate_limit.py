@@ -10,12 +10,12 @@ SECOND = 10**9
 
 
 def taken(limit, stamps):
-    """Give the stamps of the images that are taken."""
+    """Return the stamps of the images that are accepted."""
     return [stamp for stamp in stamps if limit.takes(stamp)]
 
 
 def camera(hertz, seconds=20, jitter=0.0, start=0):
-    """Give stamps (ns) of a camera, each off by up to a share of the period."""
+    """Return stamps (ns) of a camera, each off by up to a share of the period."""
     count = int(hertz * seconds)
     off = np.random.default_rng(0).uniform(-jitter, jitter, count)
     return [start + round((i + off[i] + 1) * SECOND / hertz) for i in range(count)]

@@ -93,7 +93,7 @@ def record(path, messages):
 
 
 def drive(change=lambda i, message: message, info=True):
-    """Messages of a drive; change makes another message of an image (or None)."""
+    """Yield the messages of a drive; change makes another message of an image (or None)."""
     cards, here = Cards(), np.eye(4)
     for i in range(FRAMES):
         stamp = SECOND + i * SECOND // 10
@@ -142,7 +142,7 @@ AHEAD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]
 
 
 def on_a_robot():
-    """Messages of a drive with the camera on a mast on the base."""
+    """Yield the messages of a drive with the camera on a mast on the base."""
     mast = pose(x=0.1)
     yield '/tf_static', MAKE.frame(0, 'base_link', 'mast', AHEAD @ np.linalg.inv(mast)), SECOND
     yield '/tf_static', MAKE.frame(0, 'mast', 'camera', mast), SECOND
@@ -166,7 +166,7 @@ def test_with_a_base_frame_the_odometry_is_that_of_the_vehicle_by_the_bags_own_t
 
 
 def test_tf_of_a_recording_gives_the_lengths_through_a_frame_that_moves(tmp_path):
-    """Messages of tf come between the images, a little after the one that they cover."""
+    """Messages of tf are recorded between the images, a little after the image they cover."""
     here = np.eye(4)
 
     def told():
@@ -333,7 +333,7 @@ def test_the_bag_holds_what_the_live_node_publishes(replayed):
     axes[:3, :3] = OPTICAL_TO_BODY
     last = axes @ poses[-1] @ axes.T
     assert np.allclose(pose_of(newest)[1], last, atol=1e-9)
-    # What becomes known of a frame later is in the pose, though not in what was told of its pair.
+    # Poses include later corrections of a frame, the motion of its pair does not.
     assert np.allclose(chained, last, atol=0.02)
 
 
@@ -605,7 +605,7 @@ def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_pa
 
 
 def seen(tmp_path, frames):
-    """Give a recording of images (H, W) with the true poses of the drive."""
+    """Return a recording of images (H, W) with the true poses of the drive."""
     poses = tmp_path / 'poses.txt'
     with TumWriter(poses) as truth:
         for i in range(len(frames)):
@@ -781,7 +781,7 @@ def test_images_before_the_first_camera_info_are_told(tmp_path):
 
 
 def shifted(frames, seconds):
-    """Messages of a drive, of which some frames have other stamps."""
+    """Yield the messages of a drive, of which some frames have other stamps."""
     for i, (topic, message, stamp) in enumerate(drive()):
         stamp += round(seconds * SECOND) if i // 2 in frames else 0
         message.header = header(stamp)
@@ -923,7 +923,7 @@ def test_poses_are_read_from_every_kind_of_message():
 
 
 def with_speeds(late=0):
-    """Messages of a drive with speeds, whose stamps are late by some seconds."""
+    """Yield the messages of a drive with speeds, whose stamps are late by some seconds."""
     vector = message_type('geometry_msgs/msg/Vector3')
     for topic, message, stamp in drive():
         if topic == INFO_TOPIC:
@@ -940,7 +940,7 @@ def test_a_speed_topic_gives_metres(tmp_path):
     assert re.search(r'lengths\W+metric', said.stdout)
     assert said.stderr == ''
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
-    # Speeds are weighed with what landmarks tell of the lengths.
+    # Speeds are fused with the lengths from landmarks.
     assert np.allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 0.2, rtol=0.01)
 
 

@@ -1,4 +1,4 @@
-"""The live session: a real tracker, real threads, and a graph that only writes down what comes."""
+"""The live session: a real tracker, real threads, and a fake graph that records messages."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ TOPICS = {'image': '/left/image_raw', 'camera_info': '/left/camera_info'}
 
 
 class Graph:
-    """Writes down what a session publishes and logs; publishing can be made slow, or fail."""
+    """Records what a session publishes and logs; publishing can be made slow, or fail."""
 
     def __init__(self) -> None:
         self.batches: list[list[Outgoing]] = []
         self.lines: list[str] = []
-        # What tf knows: the second frame in the first, by their names.
+        # Transforms on tf: the second frame in the first, by their names.
         self.frames: dict[tuple[str, str], Any] = {}
         self.wanted: set[str] = set()
         self.delay = 0.0
@@ -74,13 +74,13 @@ class Graph:
             assert self._changed.wait_for(condition, 20)
 
     def said(self) -> dict[str, str]:
-        """Give the values of the last diagnostics."""
+        """Return the values of the last diagnostics."""
         return {pair.key: pair.value
                 for pair in self.heard('/diagnostics')[-1].status[0].values}
 
 
 class Live:
-    """A session at work, with its tracker and its graph."""
+    """A running session, with its tracker and its graph."""
 
     def __init__(self, **parameters: Any) -> None:
         config = from_flat({'estimator.max_features': 500, 'ros.queue_policy': 'every',
@@ -95,18 +95,18 @@ class Live:
             self.session.image(image(gray, stamp_ns=i * PERIOD))
 
     def wait_for_images(self, received: int) -> None:
-        """Wait until so many images are done with."""
+        """Wait until a number of images have been received and processed."""
         end = monotonic() + 20
         while self.tracker.counts.received < received and monotonic() < end:
             sleep(0.005)
-        # Whoever meddles in between is let in after the image in work.
+        # Other calls get the lock after the image being processed.
         self.session.configure(self.tracker.config)
         assert self.tracker.counts.received == received
 
 
 @pytest.fixture
 def live() -> Iterator[Callable[..., Live]]:
-    """Give a function that starts a session; all are stopped in the end."""
+    """Return a function that starts a session; all are stopped in the end."""
     started: list[Live] = []
 
     def start(**parameters: Any) -> Live:

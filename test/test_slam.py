@@ -62,7 +62,7 @@ def chain(poses, covariance=None):
 
 
 def steps(poses):
-    """Give the steps of an odometry that took these poses."""
+    """Return the steps of an odometry that took these poses."""
     graph = chain(poses)
     return [Step(10**9, Status.FIRST_FRAME, poses[0])] + [
         Step(int(graph.stamps_ns[edge.target]), Status.OK, poses[edge.target],
@@ -79,7 +79,7 @@ def loop(true, source, target):
 
 @pytest.fixture(scope='module')
 def keyframes():
-    """Give what keeps keyframes of steps, and where each frame is; GTSAM must be installed."""
+    """Return what keeps keyframes of steps, and where each frame is; GTSAM must be installed."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.keyframe_map import KeyframeMap
 
@@ -168,7 +168,7 @@ def test_an_error_common_to_all_lengths_is_no_freedom_of_each():
 
 
 def test_a_length_that_nobody_knows_may_be_another_but_not_any():
-    """Its standard deviation is itself, and that of what is known beside it stays."""
+    """Its standard deviation is its length; the other directions keep theirs."""
     motion, direction = pose(z=2.0), np.diag([0, 0, 1.0, 0, 0, 0])
     edge = Edge(0, 1, motion, np.diag(SIGMAS**2) + 1e6 * direction, scale_known=False)
     assert np.allclose(edge.independent_covariance(0.05, 0.01),
@@ -185,7 +185,7 @@ def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so(keyframes
 
 
 def test_over_a_gap_the_map_turns_as_far_as_the_odometry_does(keyframes):
-    """A gyro tells it how far; the odometry's frame stays the same, and so does what is there."""
+    """A gyro measures the rotation; the odometry's frame and the map stay as they are."""
     before, turned = pose(z=9.0), pose(z=9.0, yaw=np.radians(60))
     told = steps(np.array([pose(), before, turned, turned @ pose(z=4.0)]))
     told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, turned)
@@ -219,7 +219,7 @@ def test_where_no_way_is_known_a_turn_is_known_as_well_as_the_odometry_knows_it(
 
 
 def test_bad_frames_and_stationary_ones_are_passed_by(keyframes):
-    """A step may be told from the frame before the last; it then has its keyframe."""
+    """The reference of a step may be the frame before the last, with that frame's keyframe."""
     told = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))
     told[3] = replace(told[3], previous_stamp_ns=told[1].stamp_ns)
     kept, offsets = keyframes(told)
@@ -241,7 +241,7 @@ def test_parameters_outside_their_range_are_refused(name, value):
 
 @pytest.fixture(scope='module')
 def features():
-    """Features of three different worlds, and of the first once more from beside."""
+    """Features of three different worlds, and of the first from another viewpoint."""
     estimator = TwoViewEstimator()
     views = [Cards(seed).gray() for seed in (1, 2, 3)] + [Cards(1).gray(pose(x=0.2), noise=1)]
     return [estimator.features(view) for view in views]
@@ -368,7 +368,7 @@ def test_loops_lead_over_a_step_back_in_time():
 
 
 def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
-    """What landmarks have found of it by the end, they did not know at the beginning."""
+    """The distortion found by landmarks at the end was not known at the beginning."""
     cards, k1 = Cards(), 0.06
     poses = [pose(x=0.5 * i, yaw=0.03 * i) for i in (*range(4), *range(2, -1, -1))]
     poses = [here @ pose(z=0.2 * (i > 3)) for i, here in enumerate(poses)]
@@ -405,7 +405,7 @@ def test_no_loop_is_sought_between_images_of_two_sizes():
 
 
 def bonneted(frame, mask):
-    """Give the frame of a car whose own bonnet hides the lower third, and its mask or None."""
+    """Return the frame of a car whose bonnet hides the lower third, and its mask or None."""
     gray = frame.gray.copy()
     bonnet = np.random.default_rng(0).integers(0, 256, gray.shape, np.uint8)
     gray[160:] = cv2.GaussianBlur(bonnet, (0, 0), 1.5)[160:]
@@ -598,7 +598,7 @@ def test_alignment_undoes_any_motion_and_scale():
 
 @pytest.fixture(scope='module')
 def drive(tmp_path_factory):
-    """Give a KITTI sequence of a way to the right and back, past cards."""
+    """Return a KITTI sequence of a path to the right and back, past cards."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     folder = tmp_path_factory.mktemp('dataset') / 'sequences' / '00'
     (folder / 'image_0').mkdir(parents=True)

@@ -169,7 +169,7 @@ def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypa
     edges, units = drifting(truth)
 
     class Told:
-        """Gives the loops that are told."""
+        """Return the given loops."""
 
         def __init__(self, *_):
             pass
