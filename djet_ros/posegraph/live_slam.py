@@ -39,9 +39,9 @@ class LiveSlam:
     """
     Closes loops on a running odometry.
 
-    config: sections slam and estimator, and the parameters shared with the odometry (SHARED in
-    live/parameters.py); still_mask: (H, W) bool, pixels that odometry.mask_file excludes from all
-    images; message_type: function from a type name to its class; image_topic: resolved image
+    config: sections slam and estimator, and the parameters shared with the odometry (see SHARED
+    in live/parameters.py); still_mask: (H, W) bool, pixels that odometry.mask_file excludes from
+    all images; message_type: function from a type name to its class; image_topic: resolved image
     topic, for odometry.rectified 'auto'; node: node name in the diagnostics.
 
     Outgoing topics: /tf (map to odometry frame, for each step), path (optimised poses of the
