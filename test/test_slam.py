@@ -322,7 +322,7 @@ def test_keyframes_in_a_file_take_no_memory():
 def test_a_folder_without_room_is_said(tmp_path):
     with pytest.raises(DjetError, match='nowhere'):
         KeyframeFile(tmp_path / 'nowhere')
-    with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='make room'):
+    with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='free disk space'):
         # as long as a file may be, as on a full disk
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         try:

@@ -39,8 +39,8 @@ class LiveSlam:
     """
     Closes loops on a running odometry.
 
-    config: sections slam and estimator, and the parameters shared with the odometry (see SHARED
-    in live/parameters.py); still_mask: (H, W) bool, pixels that odometry.mask_file excludes from
+    config: sections slam and estimator, and the parameters shared with the odometry, listed in
+    live/parameters.py; still_mask: (H, W) bool, pixels that odometry.mask_file excludes from
     all images; message_type: function from a type name to its class; image_topic: resolved image
     topic, for odometry.rectified 'auto'; node: node name in the diagnostics.
 
