@@ -45,7 +45,8 @@ from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset, open_datasets, opened, Selection
 from djet_ros.lab.summary import common_errors
-from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.odometry.result import camera_motion
+from djet_ros.odometry.visual_odometry import VisualOdometry
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.recordings.recording import open_recording

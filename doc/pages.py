@@ -22,7 +22,7 @@ from djet_ros.lab.chains import CHAINS
 from djet_ros.lab.methods import TITLES
 from djet_ros.lab.published import TABLE_1
 from djet_ros.lab.scenes import SCENES
-from djet_ros.live.parameters import FIXED, SHARED
+from djet_ros.live.parameters import FIXED_PARAMETERS, SHARED_PARAMETERS
 from djet_ros.odometry.images import ENCODINGS
 import yaml
 
@@ -145,11 +145,11 @@ def complaints(_: Any) -> str:
 
 
 def fixed(_: Any) -> str:
-    return named(FIXED)
+    return named(FIXED_PARAMETERS)
 
 
 def shared(_: Any) -> str:
-    return named(['estimator.*', *SHARED])
+    return named(['estimator.*', *SHARED_PARAMETERS])
 
 
 def encodings(_: Any) -> str:

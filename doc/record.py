@@ -39,7 +39,7 @@ from djet_ros.dds.middleware import DdsMiddleware
 from djet_ros.dds.names import Names
 from djet_ros.lab.scenes import render_sequence
 from djet_ros.lab.sequences import open_datasets, opened, Selection
-from djet_ros.live.graph_face import GraphFace
+from djet_ros.live.graph_node import PoseGraphNode
 from djet_ros.live.middleware import Profile
 from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -513,7 +513,7 @@ def run_pose_graph() -> int:
     stop = stop_by_signal()
     names = Names('pose_graph_node', [word for word in sys.argv[1:] if word != '-r'])
     with Graph() as graph:
-        return GraphFace(DdsMiddleware(graph, names), from_flat(
+        return PoseGraphNode(DdsMiddleware(graph, names), from_flat(
             {'ros.queue_policy': 'every'})).run(stop)
 
 

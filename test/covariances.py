@@ -5,7 +5,7 @@ from __future__ import annotations
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.types import TRACKED
 from djet_ros.odometry.messages import Messages
-from djet_ros.odometry.visual_odometry import OdometryResult
+from djet_ros.odometry.result import OdometryResult
 import numpy as np
 from ros_messages import message_type
 

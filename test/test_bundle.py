@@ -5,17 +5,17 @@ from dataclasses import replace
 import cv2
 from djet_ros.core.bundle import (
     eliminate,
-    in_frame,
     jacobians,
     Landmarks,
     noise_scale,
     observe,
+    points_in_frame,
     PosePrior,
     Poses,
     projected,
 )
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.radial import straightened
+from djet_ros.core.radial import undistort
 import numpy as np
 import pytest
 
@@ -30,9 +30,9 @@ def scene(rng, frames=4, landmarks=40, k1=0.05):
     found = Landmarks.at(rng.uniform((100, 80), (540, 400), (landmarks, 2)),
                          1 / rng.uniform(4, 20, landmarks), 0, frames)
     found.anchors[landmarks // 2:] = 1
-    found.points = straightened(K, found.found, k1)
+    found.points = undistort(K, found.found, k1)
     for frame in range(frames):
-        found.minima[:, frame] = projected(K, in_frame(K, poses, found, frame), k1)
+        found.minima[:, frame] = projected(K, points_in_frame(K, poses, found, frame), k1)
         later = found.anchors < frame
         found.seen[later, frame] = True
         A = rng.normal(size=(landmarks, 2, 2))
@@ -49,7 +49,7 @@ def test_a_landmark_is_observed_at_its_projection():
         world = poses.R[anchor].T @ (ray / landmarks.rho[n] - poses.t[anchor])
         here = poses.R[3] @ world + poses.t[3]
         there = cv2.projectPoints(here, np.zeros(3), np.zeros(3), K, np.array([0.05, 0, 0, 0]))[0]
-        assert projected(K, in_frame(K, poses, landmarks, 3), 0.05)[n] == pytest.approx(
+        assert projected(K, points_in_frame(K, poses, landmarks, 3), 0.05)[n] == pytest.approx(
             there.ravel())
 
 
@@ -119,7 +119,7 @@ def test_elimination_equals_solving_the_full_system():
     # With k1, and no other information: the gauge does not affect it.
     J = np.column_stack([of_k1.ravel(), J])
     information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
-    told = eliminate(observed, weights, 0.7, 4, lens=True).of_k1()
+    told = eliminate(observed, weights, 0.7, 4, lens=True).marginal_k1()
     assert told.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
     assert told.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
 

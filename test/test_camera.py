@@ -2,7 +2,7 @@
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.camera import Camera, is_rectified, same_camera
 from djet_ros.odometry.images import BadMessage
 from djet_ros.odometry.masks import Masks
 import numpy as np
@@ -38,7 +38,7 @@ def reason(*args, **changes):
     ('auto', '/rgb/raw/image', False), ('auto', '/rect/image_raw/foxglove', False),
     ('auto', '/rect/camera/image', False), ('auto', '/compressed', False)])
 def test_the_parameter_or_the_topic_says_whether_images_are_rectified(parameter, topic, expected):
-    assert means_rectified(parameter, topic) is expected
+    assert is_rectified(parameter, topic) is expected
 
 
 def test_rectified_images_have_the_camera_p_and_stay_as_they_are():
@@ -48,7 +48,7 @@ def test_rectified_images_have_the_camera_p_and_stay_as_they_are():
     assert camera.undistort(gray) is gray
 
 
-def test_where_p_is_missing_rectified_images_have_the_camera_k():
+def test_rectified_images_without_p_have_the_camera_k():
     assert np.array_equal(Camera.from_info(camera_info(K, SIZE, p=np.zeros(12)), True).K, K)
 
 
@@ -79,21 +79,21 @@ def test_images_without_a_distortion_by_their_calibration_have_the_residual_one(
     assert np.array_equal(camera.unseen(gray.shape), same.unseen(gray.shape))
 
 
-def test_a_residual_distortion_beside_that_of_the_calibration_is_refused():
+def test_a_residual_distortion_with_one_of_the_calibration_is_refused():
     info = camera_info(K, SIZE, d=DISTORTIONS['plumb_bob'])
     with pytest.raises(BadMessage, match=r'residual_k1 is 0\.02, but .* -0\.28 0\.09 .* to 0'):
         Camera.from_info(info, False, 0.02)
 
 
 @pytest.mark.parametrize('k1', [-1000.0, -50.0, 500.0])
-def test_a_residual_distortion_that_shows_next_to_nothing_is_the_parameters_fault(k1):
+def test_a_residual_distortion_that_leaves_hardly_any_image_names_the_parameter(k1):
     camera = Camera.from_info(camera_info(K, SIZE), True, k1)
     with pytest.raises(BadMessage, match=r'leaves \d% .* odometry.residual_k1; .* or to 0'):
         camera.undistort(np.zeros(SIZE[::-1], np.uint8))
 
 
 @pytest.mark.parametrize('model', DISTORTIONS)
-def test_points_are_seen_where_undistortion_takes_them_from(model):
+def test_projection_is_the_inverse_of_undistortion(model):
     D = DISTORTIONS[model]
     camera = Camera(K, D, SIZE, model)
     seen, _ = camera.pixels(PLACES, camera.k1)
@@ -103,7 +103,7 @@ def test_points_are_seen_where_undistortion_takes_them_from(model):
     assert not np.allclose(camera.pixels(PLACES, camera.k1 + 0.1)[0], seen, atol=0.1)
 
 
-def test_a_fisheye_whose_coefficients_are_zeros_has_angles_in_equal_steps():
+def test_a_fisheye_with_zero_coefficients_is_equidistant():
     camera = Camera.from_info(camera_info(K, SIZE, d=np.zeros(4), distortion_model='equidistant'),
                               False)
     angle = np.radians(20)
@@ -116,7 +116,7 @@ def test_a_fisheye_whose_coefficients_are_zeros_has_angles_in_equal_steps():
 
 
 @pytest.mark.parametrize('model', [*DISTORTIONS, ''])
-def test_how_points_move_in_the_image_is_the_derivative_of_where_they_are_seen(model):
+def test_the_jacobian_of_the_projection_is_its_derivative(model):
     camera = Camera(K, DISTORTIONS.get(model, np.empty(0)), SIZE, model or 'plumb_bob')
     for way in 1e-6 * np.eye(2):
         more, less = (camera.pixels(PLACES + sign * way, 0.05)[0] for sign in (1, -1))
@@ -125,7 +125,7 @@ def test_how_points_move_in_the_image_is_the_derivative_of_where_they_are_seen(m
 
 
 @pytest.mark.parametrize('model', DISTORTIONS)
-def test_undistortion_brings_points_where_the_pinhole_camera_sees_them(model):
+def test_undistorted_points_are_those_of_the_pinhole_camera(model):
     D = DISTORTIONS[model]
     info = camera_info(K, SIZE, p=P.ravel(), d=D, distortion_model=model)
     camera = Camera.from_info(info, False)
@@ -144,7 +144,7 @@ def test_undistortion_brings_points_where_the_pinhole_camera_sees_them(model):
 
 @pytest.mark.parametrize('model', DISTORTIONS)
 @pytest.mark.parametrize('outwards', [1, -1])
-def test_a_camera_of_matrices_brings_nothing_black_in_from_the_rim(model, outwards):
+def test_undistortion_leaves_no_black_border(model, outwards):
     camera = Camera(K, outwards * DISTORTIONS[model], SIZE, model)
     bright = np.full(SIZE[::-1], 200, np.uint8)
     assert np.array_equal(camera.K, K)
@@ -184,7 +184,7 @@ def test_nothing_is_unseen_without_distortion_or_within_the_image():
     assert Camera(K, np.array([-0.2, 0.06, 0, 0, 0]), SIZE).unseen(SIZE[::-1]) is None
 
 
-def test_no_feature_stands_where_the_distortion_mirrors_the_image():
+def test_there_is_no_feature_beyond_the_fold_of_the_distortion():
     focal = np.array([[300.0, 0, 319.5], [0, 300, 239.5], [0, 0, 1]])
     camera = Camera(focal, np.array([-0.35, 0, 0, 0, 0]), (640, 480))
     raw = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
@@ -222,7 +222,7 @@ def blob_near(image, x, y, reach=8):
     return left + (patch * columns).sum() / patch.sum(), top + (patch * rows).sum() / patch.sum()
 
 
-def test_a_stereo_rectification_does_not_turn_the_camera():
+def test_a_stereo_rectification_does_not_rotate_the_camera():
     turned = cv2.Rodrigues(np.array([0, 0.05, 0]))[0].ravel()
     camera = Camera.from_info(camera_info(K, SIZE, p=P.ravel(), r=turned,
                                           d=DISTORTIONS['plumb_bob']), False)
@@ -261,7 +261,7 @@ NO_LENS = [((0, 0), 1.0), ((0, 0), 1e-300), ((1, 1), 2e5), ((0, 0), 1e300), ((0,
 
 
 @pytest.mark.parametrize('at, value', NO_LENS)
-def test_a_camera_matrix_of_no_lens_is_refused_wherever_it_stands(at, value):
+def test_an_impossible_camera_matrix_is_refused_in_k_and_p(at, value):
     wrong = with_number(at, value)
     P = np.hstack([wrong, np.zeros((3, 1))]).ravel()
     assert reason(k=wrong.ravel()) == 'bad_calibration'
@@ -285,7 +285,7 @@ def test_a_telephoto_lens_and_a_small_part_of_a_large_sensor_are_cameras():
 @pytest.mark.parametrize('model, first', [
     ('plumb_bob', 1e300), ('plumb_bob', 500.0), ('plumb_bob', -1e4), ('plumb_bob', -50.0),
     ('equidistant', 1e300), ('equidistant', -1e4)])
-def test_a_distortion_that_shows_next_to_nothing_of_the_image_is_refused(model, first):
+def test_a_distortion_that_leaves_hardly_any_image_is_refused(model, first):
     D = np.zeros(len(DISTORTIONS[model]))
     D[0] = first
     camera = Camera(K, D, SIZE, model)

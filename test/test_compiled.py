@@ -20,28 +20,29 @@ from djet_ros.core.corners import (
     _exact_peaks,
     _peaks,
     corner_slopes,
-    noise_of,
+    image_noise,
     spread_out,
 )
-from djet_ros.core.covariance import _along_curve, sums_of_cells, without_each
+from djet_ros.core.covariance import _morton_order, leave_one_out, sums_of_cells
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.features import most_similar
 from djet_ros.core.geometry import fit_rotation, rotation_exp, rotation_log
-from djet_ros.core.graded import graded_surfaces, grades_through, smooth_finely
+from djet_ros.core.graded import graded_surfaces, smooth_finely, warped_grades
 from djet_ros.core.hamming import dense_descriptors, match_distances
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, minimise
 from djet_ros.core.orb_pattern import pattern, reach
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import place_all, place_exactly
+from djet_ros.core.patches import align_all, align_patches
 from djet_ros.core.prediction import nearest
 from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import planes_at
-from djet_ros.core.starts import around
+from djet_ros.core.starts import starts_around
 from djet_ros.core.types import Pose, Status
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
+from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 from test_bundle import K as BUNDLE_K, scene
@@ -116,7 +117,7 @@ def test_patch_alignment_equals_numpy(count: int) -> None:
     x = rng.uniform((-5, -5), (325, 205), (count, 2))
     y = x + rng.uniform((-0.5, -1.5), (2.5, 1.5), x.shape)
     warp = warps(rng, count)
-    ours, numpys = both(lambda: place_exactly(there, here, x, y, warp))
+    ours, numpys = both(lambda: align_patches(there, here, x, y, warp))
     moved = (numpys.places != y).any(1)
     assert ((ours.places != y).any(1) != moved).sum() <= 0.02 * count
     off = np.abs(ours.places - numpys.places).max(1)
@@ -132,10 +133,10 @@ def test_patches_of_several_images_equal_those_of_each(counts: tuple[int, ...]) 
     images, here = [image(seed) for seed in range(3)], image(3)
     x = rng.uniform(20, 180, (sum(counts), 2))
     warp, y, ends = warps(rng, len(x)), x + rng.uniform(-2, 2, x.shape), np.cumsum(counts)
-    together = place_all(list(zip(images, counts)), x, warp, here, y)
+    together = align_all(list(zip(images, counts)), x, warp, here, y)
     for there, count, end in zip(images, counts, ends):
         some = slice(end - count, end)
-        alone = place_all([(there, count)], x[some], warp[some], here, y[some])
+        alone = align_all([(there, count)], x[some], warp[some], here, y[some])
         for mine, others in zip(together, alone):
             np.testing.assert_array_equal(mine[some], others)
 
@@ -180,7 +181,7 @@ def test_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
 def test_noise_and_places_of_corners_are_those_of_numpy(size: tuple[int, int]) -> None:
     for seed in range(2):
         gray = image(seed, size)
-        ours, numpys = both(partial(noise_of, gray))
+        ours, numpys = both(partial(image_noise, gray))
         assert ours == numpys
         slopes = corner_slopes(gray)
         found, _ = _peaks(slopes, 0.5, gray.shape)
@@ -249,7 +250,7 @@ def test_references_are_those_of_numpy_to_a_grade(counts: tuple[int, int]) -> No
     points = np.random.default_rng(2).uniform((-9, -9), (330, 210), (count, 2))
     contrasts = np.where(np.arange(count) < 100, 0.4, 1.1)
     warp, chosen = warps(np.random.default_rng(3), count), pattern(96, 0.65)
-    ours, numpys = both(lambda: grades_through(
+    ours, numpys = both(lambda: warped_grades(
         warp, list(zip(images, counts)), points, 48.0, contrasts, chosen))
     assert ours.shape == numpys.shape == (96, count)
     off = np.abs(ours.astype(int) - numpys)
@@ -287,7 +288,7 @@ def test_the_optimiser_ends_where_numpy_does() -> None:
 @pytest.mark.parametrize('steps', [0, 4])
 def test_many_starts_are_refined_as_numpy_does(loss: Loss, steps: int) -> None:
     matches, start = problem(np.random.default_rng(4), 203, True)
-    starts = [*around(start, 10), Pose(np.eye(3), np.zeros(3))]
+    starts = [*starts_around(start, 10), Pose(np.eye(3), np.zeros(3))]
     ours, numpys = both(lambda: refine_all(matches, starts, loss, steps))
     np.testing.assert_allclose(ours.costs, numpys.costs, rtol=1e-7)
     np.testing.assert_allclose(ours.R, numpys.R, atol=1e-6)
@@ -300,7 +301,7 @@ def test_many_starts_are_refined_as_numpy_does(loss: Loss, steps: int) -> None:
 def test_losses_with_chirality_equal_numpy(
         loss: Loss, indefinite: bool, signs: tuple[float, ...]) -> None:
     matches, start = problem(np.random.default_rng(6), 203, indefinite)
-    seen = refine_all(matches, [*around(start, 10), Pose(np.eye(3), np.zeros(3))], loss, 1)
+    seen = refine_all(matches, [*starts_around(start, 10), Pose(np.eye(3), np.zeros(3))], loss, 1)
     ours, numpys = both(lambda: losses_in_front(matches, seen, loss, signs))
     np.testing.assert_allclose(ours, numpys, rtol=1e-9, atol=1e-12)
 
@@ -328,14 +329,14 @@ def test_rotations_are_fitted_as_numpy_does(count: int) -> None:
 @pytest.mark.parametrize('count', [1, 2, 700])
 def test_sums_over_cells_equal_numpy(count: int) -> None:
     rng = np.random.default_rng(count)
-    order, codes = _along_curve(rng.uniform((-90, -20), (1600, 900), (count, 2)))
+    order, codes = _morton_order(rng.uniform((-90, -20), (1600, 900), (count, 2)))
     J, weights, r = rng.normal(size=(5, count)), rng.uniform(0, 1, count), rng.normal(size=count)
     ours, numpys = both(lambda: sums_of_cells(J, weights, r, order, codes))
     np.testing.assert_array_equal(ours[1], numpys[1])
     for mine, others in zip(ours, numpys):
         np.testing.assert_allclose(mine, others, rtol=1e-9, atol=1e-9)
     whole = (J * weights) @ J.T + 1e-3 * np.eye(5)
-    for mine, others in zip(*both(lambda: without_each(whole, ours[0]))):
+    for mine, others in zip(*both(lambda: leave_one_out(whole, ours[0]))):
         np.testing.assert_allclose(mine, others, rtol=1e-7, atol=1e-7 * np.abs(others).max())
 
 

@@ -11,7 +11,7 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, OdometryConf
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
-from djet_ros.live.parameters import FIXED, live_choices, tf_reason, with_live_values
+from djet_ros.live.parameters import FIXED_PARAMETERS, live_choices, tf_reason, with_live_values
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -27,7 +27,7 @@ def written(tmp_path, text):
 
 
 @pytest.mark.parametrize('name', GENERATED)
-def test_the_shipped_yaml_is_the_generated_one(name):
+def test_shipped_yaml_is_up_to_date(name):
     expected = dump_yaml(Config(), GENERATED[name], preset_as_comments=True)
     assert (CONFIG / name).read_text() == expected, (
         f"regenerate config/{name}: python -c 'from djet_ros.config.sections import *; "
@@ -35,12 +35,12 @@ def test_the_shipped_yaml_is_the_generated_one(name):
         f"{GENERATED[name]}, preset_as_comments=True), end=str())' > config/{name}")
 
 
-def test_every_parameter_is_in_one_of_the_shipped_yamls():
+def test_shipped_yaml_files_contain_every_section():
     shipped = [part for parts in GENERATED.values() for part in parts]
     assert sorted(shipped) == sorted(['', *SECTIONS])
 
 
-def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
+def test_shipped_yaml_reads_as_the_defaults_without_fixing_the_preset():
     for name in GENERATED:
         assert load_yaml(CONFIG / name) == Config()
     assert '# method: "djet"' in SHIPPED.read_text()
@@ -48,22 +48,22 @@ def test_the_shipped_yaml_reads_as_the_defaults_and_leaves_the_preset_free():
 
 @pytest.mark.parametrize('text', ['', '0', '1 1', '9 3', '0 65536', '-1 5', '0 1e3', '0 5 9',
                                   'low high', '0 ' + '9' * 5000])
-def test_a_gray_range_is_two_values_in_order(text):
+def test_invalid_gray_range_is_refused(text):
     with pytest.raises(DjetError, match="odometry.gray_range is '.*'; give 'low high', whole"):
         from_flat({'odometry.gray_range': text})
 
 
-def test_a_gray_range_may_have_a_comma():
+def test_gray_range_may_have_a_comma():
     assert from_flat({'odometry.gray_range': '0, 4095'}).odometry.gray_limits() == (0, 4095)
 
 
-def test_every_parameter_says_what_it_means():
+def test_every_parameter_has_a_description():
     for item in flat(Config()).values():
         assert len(item.description.text) > 10, item.name
 
 
 @pytest.mark.parametrize('as_comments', [False, True])
-def test_a_written_configuration_reads_back_equal(tmp_path, as_comments):
+def test_yaml_round_trip(tmp_path, as_comments):
     config = from_flat({'preset': 'paper', 'estimator.window': 9, 'odometry.odom_frame': 'a: "b"',
                         'odometry.scale_value': 1e-6, 'ros.publish_tf': True,
                         'odometry.rectified': 'true'})
@@ -71,7 +71,7 @@ def test_a_written_configuration_reads_back_equal(tmp_path, as_comments):
     assert load_yaml(path) == config
 
 
-def test_plain_and_ros_layout_give_the_same(tmp_path):
+def test_plain_and_ros_layout_read_alike(tmp_path):
     plain = load_yaml(written(tmp_path, 'estimator: {method: rpe}\nros.qos_depth: 7\n'))
     ros = load_yaml(written(tmp_path, """
         /other: {ros__parameters: {speed: 1}}
@@ -81,19 +81,19 @@ def test_plain_and_ros_layout_give_the_same(tmp_path):
     assert plain == ros == from_flat({'estimator.method': 'rpe', 'ros.qos_depth': 7})
 
 
-def test_a_small_float_without_a_point_is_a_number(tmp_path):
+def test_float_in_exponent_notation_without_a_point_is_read(tmp_path):
     config = load_yaml(written(tmp_path, 'odometry: {scale_value: 1e-3}'))
     assert config.odometry.scale_value == 1e-3
 
 
-def test_a_preset_sets_the_estimator_and_explicit_values_come_on_top():
+def test_explicit_values_override_the_preset():
     config = from_flat({'estimator.window': 11, 'preset': 'paper'})
     assert config.estimator == preset('paper', window=11)
     again = with_values(config, {'preset': 'best'})
     assert again.estimator == preset('best')
 
 
-def test_integers_are_taken_for_floats_and_floats_not_for_integers():
+def test_int_is_accepted_for_float_but_not_float_for_int():
     config = from_flat({'odometry.max_gap': 2})
     assert config.odometry.max_gap == 2.0
     assert type(config.odometry.max_gap) is float
@@ -106,7 +106,7 @@ def test_integers_are_taken_for_floats_and_floats_not_for_integers():
     '{imu_rotation: [0.0, 0.0, 0.0, 1.0], gray_range: [0, 4095]}',
     '{imu_rotation: [0, 0, 0, 1], gray_range: [0, 4095]}',
     "{imu_rotation: '[0, 0, 0, 1]', gray_range: '[0, 4095]'}"])
-def test_several_numbers_are_a_text_or_a_list(tmp_path, values):
+def test_number_lists_may_be_strings_or_lists(tmp_path, values):
     config = load_yaml(written(tmp_path, f'odometry: {values}')).odometry
     assert config.imu_quaternion() == (0, 0, 0, 1)
     assert config.gray_limits() == (0, 4095)
@@ -144,7 +144,7 @@ def test_several_numbers_are_a_text_or_a_list(tmp_path, values):
     ('odometry.max_gap', None, 'of type float'),
     ('ros.publish_tf', 1, 'of type bool'),
 ])
-def test_a_wrong_value_is_refused_in_one_line_that_names_it(name, value, message):
+def test_invalid_value_is_refused_in_one_line_with_its_name(name, value, message):
     with pytest.raises(DjetError, match=message) as caught:
         from_flat({name: value})
     assert '\n' not in str(caught.value)
@@ -156,7 +156,7 @@ def test_a_wrong_value_is_refused_in_one_line_that_names_it(name, value, message
     '[' * 5000, 'n: ' + '9' * 5000, 'odometry: {max_gap: 0x' + 'f' * 5000 + '}',
     '/**: {ros__parameters: 7}', 'text',
 ])
-def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text):
+def test_invalid_parameter_file_is_refused_in_one_line(tmp_path, text):
     path = written(tmp_path, text)
     with pytest.raises(DjetError) as caught:
         load_yaml(path)
@@ -164,7 +164,7 @@ def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text):
     assert '\n' not in str(caught.value)
 
 
-def test_a_missing_a_huge_and_a_binary_file_are_refused(tmp_path):
+def test_missing_huge_and_binary_files_are_refused(tmp_path):
     huge = written(tmp_path, '# ' + 'x' * 3_000_000)
     binary = tmp_path / 'binary.yaml'
     binary.write_bytes(bytes(range(128, 256)))
@@ -178,7 +178,7 @@ def test_a_missing_a_huge_and_a_binary_file_are_refused(tmp_path):
     st.one_of(st.sampled_from([*flat(Config()), 'estimator', 'ros']), st.text(max_size=8)),
     st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
                  lambda inner: st.lists(inner, max_size=2), max_leaves=3), max_size=4))
-def test_no_values_raise_anything_but_our_error(values):
+def test_arbitrary_values_raise_only_djet_error(values):
     try:
         config = from_flat(values)
     except DjetError:
@@ -186,7 +186,7 @@ def test_no_values_raise_anything_but_our_error(values):
     assert {name: flat(config)[name].value for name in values}.keys() == values.keys()
 
 
-def test_flags_carry_only_what_was_given():
+def test_flag_values_contain_only_given_flags():
     parser = argparse.ArgumentParser()
     add_flags(parser, ['preset', 'estimator.method', 'odometry.max_gap', 'ros.publish_tf'])
     args = parser.parse_args(['--method', 'rpe', '--max-gap', '3', '--publish-tf', 'true'])
@@ -195,7 +195,7 @@ def test_flags_carry_only_what_was_given():
     assert '--max-gap' in parser.format_help()
 
 
-def test_a_flag_that_cannot_be_read_is_named():
+def test_invalid_flag_value_is_named():
     parser = argparse.ArgumentParser()
     add_flags(parser, ['odometry.max_gap'])
     with pytest.raises(DjetError, match=r"odometry\.max_gap is 'soon'; it must be of type float"):
@@ -209,31 +209,31 @@ LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(
 @pytest.mark.parametrize('text', [
     LAUGHS + 'estimator: {window: *a11}',
     LAUGHS.replace('[', '{<<: [').replace(']', ']}').replace('[ha, ha]', '{ha: 1}')])
-def test_aliases_that_unfold_to_more_than_memory_holds_are_refused(tmp_path, text):
+def test_yaml_aliases_that_expand_beyond_memory_are_refused(tmp_path, text):
     with pytest.raises(DjetError, match='its aliases expand to more than'):
         load_yaml(written(tmp_path, text))
 
 
-def test_aliases_are_read(tmp_path):
+def test_yaml_aliases_are_read(tmp_path):
     text = 'estimator: {window: &side 7}\nodometry: {max_lost: *side}'
     assert load_yaml(written(tmp_path, text)).odometry.max_lost == 7
 
 
 @pytest.mark.parametrize('value', ['!!bool so', '!!int ""', '!!float ""', '!!timestamp soon',
                                    '\x01', '2001-01-01 00:00:00 +99:99'])
-def test_values_that_the_yaml_library_stumbles_over_are_refused_in_one_line(tmp_path, value):
+def test_values_that_crash_the_yaml_library_are_refused_in_one_line(tmp_path, value):
     with pytest.raises(DjetError, match='is not valid YAML') as caught:
         load_yaml(written(tmp_path, f'estimator: {{window: {value}}}'))
     assert str(caught.value).isprintable()
 
 
-def test_what_strangers_wrote_cannot_control_the_terminal():
+def test_error_messages_contain_no_control_characters():
     error = DjetError('no parameter \x1b[2J\n\u202e ' + 'x' * 5000)
     assert str(error).startswith('no parameter ?[2J ? xxx')
     assert len(str(error)) < 1100
 
 
-def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
+def test_offline_choices_are_not_available_live():
     scale = flat(Config())['odometry.scale']
     offered = [one for one in scale.description.choices if one != 'ground_truth']
     assert list(live_choices(scale)) == offered
@@ -248,12 +248,12 @@ def test_a_live_graph_is_offered_no_choice_that_only_a_recording_has():
                for item in flat(Config()).values() if item.name != 'odometry.scale')
 
 
-def test_what_poses_are_called_and_along_which_axes_they_are_is_fixed_for_a_nodes_life():
+def test_frames_and_axes_of_poses_are_read_only():
     of_poses = {name for name in flat(Config()) if name.startswith('odometry.')
                 and name.endswith(('_frame', '_convention'))} - {'odometry.guess_frame'}
     assert len(of_poses) == 4
-    assert of_poses < set(FIXED)
-    assert set(FIXED) < flat(Config()).keys()
+    assert of_poses < set(FIXED_PARAMETERS)
+    assert set(FIXED_PARAMETERS) < flat(Config()).keys()
 
 
 @pytest.mark.parametrize(('values', 'by'), [
@@ -261,7 +261,7 @@ def test_what_poses_are_called_and_along_which_axes_they_are_is_fixed_for_a_node
     ({'guess': True}, (True, False)), ({'scale': 'guess'}, (True, False)),
     ({'guess': True, 'guess_frame': 'odom_of_wheels'}, (False, True)),
     ({'scale': 'guess', 'guess_frame': 'odom_of_wheels'}, (False, True))])
-def test_another_odometry_is_heard_by_its_topic_or_by_tf_where_it_is_asked_for(values, by):
+def test_guess_comes_from_its_topic_or_from_tf(values, by):
     config = from_flat({f'odometry.{name}': value for name, value in values.items()}).odometry
     assert (config.guess_by_topic, config.guess_by_tf) == by
 
@@ -274,7 +274,7 @@ def test_another_odometry_is_heard_by_its_topic_or_by_tf_where_it_is_asked_for(v
     ({'guess': True}, 'odometry.guess is true'),
     ({'scale': 'guess'}, 'odometry.scale is guess'),
     ({'guess': True, 'guess_frame': 'odom_of_wheels'}, '')])
-def test_tf_is_asked_where_something_is_mounted_somewhere_and_nobody_has_said_where(values, why):
+def test_tf_is_needed_for_mountings_that_are_not_parameters(values, why):
     config = from_flat({f'odometry.{name}': value for name, value in values.items()})
     assert tf_reason(config.odometry) == why
 
@@ -285,7 +285,7 @@ def test_tf_is_asked_where_something_is_mounted_somewhere_and_nobody_has_said_wh
     ('vo_node', '/left/vo_node', False), ('/left/vo_node', '/left/vo_node', True),
     ('/**/vo_node', '/left/vo_node', True), ('/*/vo_node', '/left/vo_node', True),
     ('vo_node', '/vo_node_2', False), ('vo.node', '/vo_node', False)])
-def test_a_file_for_other_nodes_alone_is_said_as_ros_understands_names(
+def test_parameter_file_for_other_nodes_is_detected_by_ros_name_rules(
         tmp_path, name, node, meant):
     path = written(tmp_path, f"'{name}': {{ros__parameters: {{preset: paper}}}}")
     said = why_unused(path, node)
@@ -294,7 +294,7 @@ def test_a_file_for_other_nodes_alone_is_said_as_ros_understands_names(
         "name the node in the file, or use '/**' for all nodes")
 
 
-def test_a_file_for_several_nodes_is_for_each_of_them(tmp_path):
+def test_parameter_file_may_be_for_several_nodes(tmp_path):
     path = written(tmp_path, """
         left: {vo_node: {ros__parameters: {preset: paper}}}
         other: {ros__parameters: {}}
@@ -314,7 +314,7 @@ def gap(path, *nodes):
     '/left/vo_node: {ros__parameters: {odometry.max_gap: 3}}',
     'left: {vo_node: {ros__parameters: {odometry: {max_gap: 3}}}}',
     '/left: {vo_node: {ros__parameters: {odometry: {max_gap: 3}}}}'])
-def test_a_file_for_the_odometry_in_a_namespace_serves_offline_and_there_and_nowhere_else(
+def test_parameter_file_with_a_namespace_is_read_offline_and_by_that_node_only(
         tmp_path, text):
     path = written(tmp_path, text)
     assert gap(path) == gap(path, '/left/vo_node') == 3
@@ -326,7 +326,7 @@ def test_a_file_for_the_odometry_in_a_namespace_serves_offline_and_there_and_now
             "name the node in the file, or use '/**' for all nodes")
 
 
-def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_meant(tmp_path):
+def test_parameter_file_of_two_cameras_is_ambiguous_offline(tmp_path):
     path = written(tmp_path, """
         /**: {ros__parameters: {odometry: {max_gap: 1.5, max_lost: 9}}}
         /left/vo_node: {ros__parameters: {odometry: {max_gap: 3}}}
@@ -344,7 +344,7 @@ def test_of_two_cameras_in_a_file_each_takes_its_own_and_offline_one_has_to_be_m
     assert load_yaml(path).preset == 'fast'
 
 
-def test_a_file_for_other_nodes_alone_is_refused_and_not_taken_for_the_defaults(tmp_path):
+def test_parameter_file_for_other_nodes_is_refused(tmp_path):
     for name in ('left_vo', 'pose_graph_node', '/*/eye'):
         path = written(tmp_path, f"'{name}': {{ros__parameters: {{slam.loop_votes: 7}}}}")
         with pytest.raises(DjetError, match='none for /vo_node, so it is ignored; ') as one:
@@ -353,7 +353,7 @@ def test_a_file_for_other_nodes_alone_is_refused_and_not_taken_for_the_defaults(
             f'{path}: it has parameters for /{name.strip("/")} and none ')
 
 
-def test_loops_go_by_the_pose_graphs_own_parameters_and_by_the_odometrys(tmp_path):
+def test_offline_slam_reads_parameters_of_both_nodes(tmp_path):
     path = written(tmp_path, """
         pose_graph_node: {ros__parameters: {slam: {loop_votes: 7}, estimator: {window: 5}}}
     """)

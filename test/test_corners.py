@@ -5,7 +5,7 @@ from djet_ros.core.corners import (
     corner_slopes,
     detect_corners,
     detect_large_corners,
-    noise_of,
+    image_noise,
     spread_out,
 )
 from djet_ros.core.hamming import describable
@@ -71,8 +71,8 @@ def test_corners_are_detected_in_noise_without_false_ones():
 def test_noise_is_estimated_from_flat_blocks(image, sigma):
     image = np.tile(image, (2, 2))
     image[:, :300] = 90
-    assert noise_of(noisy(image, sigma)) == pytest.approx(sigma, rel=0.2)
-    assert noise_of(image) == 0
+    assert image_noise(noisy(image, sigma)) == pytest.approx(sigma, rel=0.2)
+    assert image_noise(image) == 0
 
 
 def test_slopes_are_in_gray_levels_per_pixel():

@@ -19,7 +19,7 @@ from djet_ros.lab.coverage import (
     normalised_square,
     share_with_bounds,
 )
-from djet_ros.odometry.visual_odometry import camera_motion
+from djet_ros.odometry.result import camera_motion
 import numpy as np
 import pytest
 from scipy.stats import binom

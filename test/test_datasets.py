@@ -2,7 +2,7 @@
 
 import cv2
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.interpolation import poses_at
 from djet_ros.recordings.bag_writers import write_kitti_bag
@@ -124,7 +124,7 @@ def test_a_distorted_sequence_is_replayed_as_its_raw_images_with_their_distortio
         {recording.info_topic, recording.image_topic})][:2]
     assert info.d.tolist() == [*PINCUSHION, 0]
     assert np.array_equal(gray_image(image), texture)
-    camera = Camera.from_info(info, means_rectified('auto', recording.image_topic))
+    camera = Camera.from_info(info, is_rectified('auto', recording.image_topic))
     assert camera.K.tolist() == K.tolist()
     assert np.array_equal(camera.undistort(texture), euroc(asl).image(2))
 

@@ -89,7 +89,7 @@ def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[.
     def run(*words: str, topic: str = IMAGE, before: str = '') -> Command:
         one = start('live', '-r', f'image:={topic}', *words, before=before)
         for output in TYPES:
-            graph_peer.wait(output, lambda output=output: graph_peer.graph.offers(output))
+            graph_peer.wait(output, lambda output=output: graph_peer.graph.publishers_of(output))
         for messages in graph_peer.heard.values():
             messages.clear()
         return one
@@ -116,7 +116,7 @@ def tracked(peer: Peer, stamps: list[int]) -> Callable[[], bool]:
                                    for message in peer.heard[f'{NODE}/relative_pose']}
 
 
-def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         live, start, peer, bag, tmp_path):
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 0
     poses = [topic for topic in TYPES if topic != '/diagnostics']
@@ -133,7 +133,7 @@ def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
         assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
 
 
-def test_a_bag_with_an_imu_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+def test_live_poses_with_imu_equal_those_of_djet_replay_bit_for_bit(
         live, start, peer, bag, tmp_path):
     """Its mounting comes over /tf_static."""
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--imu', 'true']) == 0
@@ -152,7 +152,7 @@ def test_a_bag_with_an_imu_played_live_gives_the_poses_of_djet_replay_to_the_las
 
 
 @pytest.mark.parametrize('reliability', ['best_effort', 'reliable'])
-def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
+def test_every_image_at_the_recorded_rate_is_accounted_for(
         live, start, peer, bag, reliability):
     live('-p', f'ros.qos_reliability:={reliability}', topic=RECTIFIED)
     start('play', bag).finish()
@@ -168,7 +168,7 @@ def test_every_image_of_a_bag_at_its_own_rate_is_accounted_for(
         assert peer.said()['frames lost on the way'] == '0'
 
 
-def test_a_sender_without_end_waits_and_nothing_is_lost(live, peer, drive):
+def test_publisher_waits_while_the_queue_is_full(live, peer, drive):
     # Each end of the connection keeps 32 images, besides those in the queue.
     room = 10 * drive[0].nbytes
     live(*EVERY, *FAST,
@@ -188,7 +188,7 @@ def test_a_sender_without_end_waits_and_nothing_is_lost(live, peer, drive):
                for message in peer.heard['/diagnostics'])
 
 
-def test_the_node_survives_the_players_end_and_takes_the_next_one(live, start, peer, bag):
+def test_node_continues_with_the_next_player(live, start, peer, bag):
     live(*EVERY, *FAST, topic=RECTIFIED)
     for _ in range(2):
         player = start('play', bag, '--loop', '--rate', '5')
@@ -203,7 +203,7 @@ def test_the_node_survives_the_players_end_and_takes_the_next_one(live, start, p
     assert int(said['status: TIME_JUMP']) >= 2
 
 
-def test_two_players_at_once_are_both_counted(live, start, peer, bag):
+def test_images_of_two_players_are_counted(live, start, peer, bag):
     live(*EVERY, *FAST, topic=RECTIFIED)
     players = [start('play', bag, '--rate', '5') for _ in range(2)]
     for player in players:
@@ -212,7 +212,7 @@ def test_two_players_at_once_are_both_counted(live, start, peer, bag):
     assert int(said['frames processed']) + int(said['frames dropped']) == 2 * FRAMES
 
 
-def test_a_late_camera_info_is_waited_for(live, peer, drive):
+def test_node_waits_for_a_late_camera_info(live, peer, drive):
     live(*EVERY, *FAST)
     images = peer.advertise(IMAGE, IMAGE_TYPE)
     for i in range(3):
@@ -227,7 +227,7 @@ def test_a_late_camera_info_is_waited_for(live, peer, drive):
     peer.wait('pairs', tracked(peer, [stamp(4), stamp(5)]))
 
 
-def test_a_latched_camera_info_from_before_the_node_is_heard(live, peer, drive):
+def test_latched_camera_info_from_before_the_start_is_received(live, peer, drive):
     infos = peer.advertise(INFO, INFO_TYPE, Profile(depth=1, latched=True), listeners=0)
     infos.publish(camera_info(K, SIZE))
     live(*EVERY, *FAST)
@@ -238,7 +238,7 @@ def test_a_latched_camera_info_from_before_the_node_is_heard(live, peer, drive):
     peer.wait('a pair', tracked(peer, [stamp(1)]))
 
 
-def test_garbage_on_the_topics_is_said_and_counted_and_the_next_pair_is_tracked(
+def test_garbage_on_the_topics_is_reported_and_tracking_continues(
         live, peer, drive):
     from djet_ros.dds.wire import encode
     one = live(*EVERY, *FAST)
@@ -261,7 +261,7 @@ def test_garbage_on_the_topics_is_said_and_counted_and_the_next_pair_is_tracked(
     assert 'could not be read' in one.log
 
 
-def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
+def test_incompatible_qos_is_logged_with_both_profiles(live, peer):
     one = live('-p', 'ros.qos_reliability:=reliable')
     images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(reliable=False), listeners=0)
     peer.wait('the log', lambda: f'incompatible QoS on {IMAGE}' in one.log)
@@ -270,7 +270,7 @@ def test_a_qos_that_does_not_fit_is_said_with_both_sides(live, peer):
 
 
 @pytest.mark.parametrize('case', SEEN)
-def test_what_is_seen_instead_is_said_with_the_remedy(live, peer, case):
+def test_missing_input_is_logged_with_a_likely_topic_or_parameter(live, peer, case):
     topic, kind, line = SEEN[case]
     one = live(*FAST)
     publisher = peer.advertise(topic, kind, listeners=0)
@@ -278,7 +278,7 @@ def test_what_is_seen_instead_is_said_with_the_remedy(live, peer, case):
     del publisher  # without references it leaves the graph
 
 
-def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
+def test_services_respond_as_in_ros_on_cyclone_dds(live, peer, drive):
     live(*EVERY, *FAST)
     infos, images = peer.advertise(INFO, INFO_TYPE), peer.advertise(IMAGE, IMAGE_TYPE)
     infos.publish(camera_info(K, SIZE))
@@ -301,7 +301,7 @@ def test_services_answer_as_ros_expects_it_on_cyclone_dds(live, peer, drive):
     assert said['frames received'] == '0'
 
 
-def test_a_request_of_another_middleware_is_said_and_changes_nothing(live, peer):
+def test_request_from_another_middleware_is_logged_and_ignored(live, peer):
     one = live(*FAST)
     requests = peer.graph.advertise_raw(
         f'rq{NODE}/pauseRequest', 'std_srvs::srv::dds_::Trigger_Request_', Profile(), '')
@@ -312,7 +312,7 @@ def test_a_request_of_another_middleware_is_said_and_changes_nothing(live, peer)
     assert not peer.said(message='paused')
 
 
-def test_clients_of_fast_dds_take_its_services_for_absent_and_the_log_says_why(live, peer):
+def test_services_are_absent_to_fast_dds_clients_and_the_log_says_why(live, peer):
     one = live(*FAST)
     writers, readers = ends(peer, f'{NODE}/reset')
     # rmw_fastrtps waits until there are as many of either
@@ -354,7 +354,7 @@ def test_diagnostics_follow_simulated_time(live, start, peer, bag):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_in_mid_stream_ends_all_cleanly_within_a_second(live, start, peer, bag, number):
+def test_signal_during_a_stream_ends_all_processes_within_a_second(live, start, peer, bag, number):
     one = live(*EVERY, topic=RECTIFIED)
     player = start('play', bag, '--loop', '--rate', '10')
     echo = start('echo', '--diagnostics')
@@ -384,7 +384,7 @@ def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):
 
 
 @pytest.mark.parametrize('words', [(), ('--diagnostics',)])
-def test_echo_says_over_which_topic_nothing_comes(start, peer, words):
+def test_echo_names_the_topic_without_messages(start, peer, words):
     echo = start('echo', *words)
     peer.wait('a line', lambda: echo.log)
     assert echo.log == 'waiting for /vo_node/odometry: nobody publishes it\n'
@@ -414,7 +414,7 @@ def call(peer: Peer, service: str, number: int) -> bytes:
     return answers[0][20:]
 
 
-def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
+def test_user_configuration_of_cyclone_dds_takes_precedence(tmp_path):
     from djet_ros.dds.graph import Graph
     file = tmp_path / 'cyclone.xml'
     file.write_text('<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/>'
@@ -423,7 +423,7 @@ def test_a_configuration_of_cyclone_dds_comes_on_top(tmp_path):
         Graph({**ENVIRONMENT, 'ROS_DOMAIN_ID': '232', 'CYCLONEDDS_URI': uri}).close()
 
 
-def test_a_robot_that_keeps_ros_to_itself_in_the_old_way_is_not_heard_outside():
+def test_ros_localhost_only_is_respected():
     from djet_ros.dds.graph import _configuration
     beyond = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'ROS_STATIC_PEERS': '10.0.0.9'}
     inside = _configuration({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
@@ -433,7 +433,7 @@ def test_a_robot_that_keeps_ros_to_itself_in_the_old_way_is_not_heard_outside():
         assert _configuration({**beyond, 'ROS_LOCALHOST_ONLY': off}) == _configuration(beyond)
 
 
-def test_a_graph_that_was_left_can_be_entered_again():
+def test_graph_can_be_joined_again_after_leaving():
     from djet_ros.dds.graph import Graph
     elsewhere = {**ENVIRONMENT, 'ROS_DOMAIN_ID': '231'}
     with Graph(elsewhere) as first:
@@ -463,7 +463,7 @@ def test_names_are_resolved_and_remapped_as_in_ros():
     # As launch files hand it on.
     (['camera_info:=camera_info'], '/front/camera_info'),
 ])
-def test_camera_info_is_beside_the_images_unless_a_rule_says_where(rules, info):
+def test_camera_info_is_in_the_image_namespace_unless_remapped(rules, info):
     names = Names('vo_node', ['image:=/front/image_raw', *rules])
     assert image_topics(names.resolve, names.is_remapped, 'raw') == ('/front/image_raw', info)
 
@@ -471,7 +471,7 @@ def test_camera_info_is_beside_the_images_unless_a_rule_says_where(rules, info):
 @pytest.mark.parametrize('rule', [
     'image:=/cam/image_raw', 'image:=/cam/image_raw/compressed',
     'image/compressed:=/cam/image_raw/compressed'])
-def test_compressed_images_may_be_named_with_or_without_their_transport(rule):
+def test_compressed_topic_may_be_given_with_or_without_its_suffix(rule):
     names = Names('vo_node', [rule])
     assert image_topics(names.resolve, names.is_remapped, 'compressed') == (
         '/cam/image_raw/compressed', '/cam/camera_info')
@@ -480,13 +480,13 @@ def test_compressed_images_may_be_named_with_or_without_their_transport(rule):
 @pytest.mark.parametrize('rules', [
     ['image/compressed:=/cam/jpeg'],
     ['image:=/cam/image_raw', '/cam/image_raw/compressed:=/cam/jpeg']])
-def test_compressed_images_may_be_called_anything(rules):
+def test_compressed_topic_may_have_any_name(rules):
     names = Names('vo_node', rules)
     assert image_topics(names.resolve, names.is_remapped, 'compressed') == (
         '/cam/jpeg', '/cam/camera_info')
 
 
-def test_rules_for_topics_are_found_among_the_words_for_ros():
+def test_topic_remappings_are_found_in_the_ros_arguments():
     words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
              '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']
     assert list(topic_remappings(words, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
@@ -494,7 +494,7 @@ def test_rules_for_topics_are_found_among_the_words_for_ros():
 
 @pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',
                                   '__node:=a/b', '__node:='])
-def test_names_that_ros_refuses_are_refused(rule):
+def test_invalid_ros_names_are_refused(rule):
     with pytest.raises(DjetError, match='is not a remapping|is not a valid node name'):
         Names('vo_node', [rule])
     with pytest.raises(DjetError, match='is not a valid node name'):
@@ -512,7 +512,7 @@ def test_names_that_ros_refuses_are_refused(rule):
     ([], {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'HOUSE'}, 'choose from LOCALHOST, SUBNET'),
     ([], {'CYCLONEDDS_URI': '<Cyclone'}, 'check CYCLONEDDS_URI'),
 ])
-def test_what_the_user_can_mend_is_said_in_a_line(
+def test_user_errors_are_one_line(
         words, environment, reason, monkeypatch, capfd, tmp_path):
     for name, value in {'ROS_DOMAIN_ID': '231', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
                         **environment}.items():
@@ -523,7 +523,7 @@ def test_what_the_user_can_mend_is_said_in_a_line(
     assert reason in line
 
 
-def test_without_cyclone_dds_the_commands_say_how_to_get_it(monkeypatch, capsys):
+def test_missing_cyclone_dds_is_reported_with_the_install_command(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'djet_ros.dds.graph', None)
     for name in [name for name in sys.modules if name.startswith('cyclonedds')]:
         monkeypatch.setitem(sys.modules, name, None)

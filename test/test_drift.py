@@ -63,7 +63,7 @@ def by_the_book(truth: Poses, estimate: Poses) -> tuple[float, float, int]:
 
 
 @pytest.mark.parametrize(('seed', 'frames'), [(0, 150), (1, 400), (2, 1200)])
-def test_it_is_what_the_benchmark_says_in_words(seed: int, frames: int) -> None:
+def test_drift_equals_a_direct_implementation_of_the_benchmark(seed: int, frames: int) -> None:
     truth, estimate = winding(seed, frames)
     found = drift(truth, estimate)
     percent, degrees, segments = by_the_book(truth, estimate)
@@ -72,7 +72,7 @@ def test_it_is_what_the_benchmark_says_in_words(seed: int, frames: int) -> None:
     assert found.rotation_deg_per_100m == pytest.approx(degrees, rel=1e-6)
 
 
-def test_what_is_too_long_by_a_part_drifts_by_that_part() -> None:
+def test_scale_error_is_the_translation_drift() -> None:
     found = drift(straight(450), straight(450, stretch=1.03))
     # Segments end with the first frame beyond their length: 101 m instead of 100.
     assert found.translation_percent == pytest.approx(3.03, abs=0.02)
@@ -80,13 +80,13 @@ def test_what_is_too_long_by_a_part_drifts_by_that_part() -> None:
     assert found.longest == 400
 
 
-def test_a_turn_too_many_in_each_metre_adds_up() -> None:
+def test_constant_yaw_error_is_the_rotation_drift() -> None:
     found = drift(straight(950), straight(950, yaw=math.radians(0.004)))
     assert found.rotation_deg_per_100m == pytest.approx(0.4, rel=0.01)
     assert found.longest == 800
 
 
-def test_no_error_is_no_drift_in_whatever_axes() -> None:
+def test_drift_is_zero_without_errors_in_any_axes() -> None:
     truth, _ = winding(4, 400)
     elsewhere = np.eye(4)
     elsewhere[:3, :3], elsewhere[:3, 3] = rotation_exp(np.array([0.3, -1.0, 0.5])), (5, -3, 80)
@@ -95,7 +95,7 @@ def test_no_error_is_no_drift_in_whatever_axes() -> None:
     assert found.rotation_deg_per_100m == pytest.approx(0, abs=1e-5)
 
 
-def test_the_rotation_does_not_depend_on_lengths_that_nobody_knows() -> None:
+def test_rotation_drift_does_not_depend_on_scale() -> None:
     truth, estimate = winding(5, 400)
     shrunk = estimate.copy()
     shrunk[:, :3, 3] *= 0.1
@@ -104,7 +104,7 @@ def test_the_rotation_does_not_depend_on_lengths_that_nobody_knows() -> None:
     assert other.translation_percent > 80
 
 
-def test_below_100_metres_there_is_none() -> None:
+def test_no_drift_below_100_metres() -> None:
     assert drift(straight(100), straight(100)) is None
     assert drift(straight(101), straight(101)) == Drift(0.0, 0.0, 1, 100)
     still = np.tile(np.eye(4), (500, 1, 1))
@@ -116,6 +116,6 @@ def test_below_100_metres_there_is_none() -> None:
     (straight(10)[:, :3], straight(10)[:, :3], r'\(11, 3, 4\); both must be \(N, 4, 4\)'),
     (straight(10), straight(10) * np.nan, 'not finite'),
 ])
-def test_what_cannot_be_compared_is_refused(truth: Poses, estimate: Poses, said: str) -> None:
+def test_incomparable_trajectories_are_refused(truth: Poses, estimate: Poses, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         drift(truth, estimate)

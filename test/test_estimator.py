@@ -30,7 +30,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.hamming import dense_descriptors
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.pair import Limits, Pair
-from djet_ros.core.starts import five_point, Known, likely_starts, planar_starts
+from djet_ros.core.starts import five_point, KnownMotion, likely_starts, planar_starts
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import Pose, RelativePose, Status
@@ -253,9 +253,9 @@ class WatchedSurface(DescriptorSurface):
         super().__init__(*arguments)
         self.asked = []
 
-    def around(self, y, warp=None):
+    def fit_around(self, y, warp=None):
         self.asked.append(y)
-        return super().around(y, warp)
+        return super().fit_around(y, warp)
 
 
 class Wall:
@@ -573,7 +573,7 @@ def pair_from_the_truth(kitti: Path, first: int) -> tuple[RelativePose, Pose]:
     true_motion = np.linalg.inv(sequence.poses[1]) @ sequence.poses[0]
     # So that the right basin does not depend on RANSAC.
     near = Pose(true_motion[:3, :3], unit(true_motion[:3, 3]))
-    return estimator.estimate(*views, known=Known(guess=near)), near
+    return estimator.estimate(*views, known=KnownMotion(guess=near)), near
 
 
 @pytest.mark.parametrize('first', [1, 2])

@@ -88,7 +88,7 @@ def test_no_mutual_best_match_is_missing(pair, radius):
 
 def test_the_nearer_of_two_similar_features_is_matched(pair):
     wall = pair[0]
-    twice = Features.described(*(np.concatenate([getattr(wall, name)] * 2) for name in (
+    twice = Features.with_descriptors(*(np.concatenate([getattr(wall, name)] * 2) for name in (
         'points', 'octaves', 'angles', 'responses', 'descriptors')))
     twice.points[len(wall):] += (0.0, 20.0)
     _, columns = match_nearby(wall, twice, 60.0).T

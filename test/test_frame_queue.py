@@ -20,14 +20,14 @@ def drained(queue):
     return items
 
 
-def test_latest_keeps_the_newest_in_order_and_counts_the_rest():
+def test_latest_keeps_the_newest_and_counts_drops():
     queue = FrameQueue('latest', 2)
     assert all(queue.put(i) for i in range(5))
     assert queue.dropped == 3
     assert drained(queue) == [3, 4]
 
 
-def test_what_comes_next_can_be_looked_at_and_stays():
+def test_peek_does_not_remove():
     queue = FrameQueue('latest', 2)
     assert queue.peek() is None
     queue.put('first')
@@ -36,7 +36,7 @@ def test_what_comes_next_can_be_looked_at_and_stays():
     assert [queue.get(), queue.get()] == ['first', 'second']
 
 
-def test_who_looks_for_what_comes_next_waits_for_it_or_for_the_end():
+def test_peek_waits_for_an_item_or_close():
     queue, seen = FrameQueue('latest', 2), []
     one = in_thread(lambda: seen.append(queue.peek(timeout=20)))
     queue.put('first')
@@ -50,7 +50,7 @@ def test_who_looks_for_what_comes_next_waits_for_it_or_for_the_end():
     assert queue.peek(timeout=0.01) is None
 
 
-def test_every_loses_nothing_while_there_is_room():
+def test_every_drops_nothing_below_the_limit():
     queue, got = FrameQueue('every', 3, room=2000), []
 
     def read():
@@ -66,7 +66,7 @@ def test_every_loses_nothing_while_there_is_room():
     assert queue.dropped == 0
 
 
-def test_many_writers_and_readers_account_for_every_item():
+def test_concurrent_writers_and_readers_account_for_every_item():
     queue, got = FrameQueue('latest', 4), []
 
     def read():
@@ -86,7 +86,7 @@ def test_many_writers_and_readers_account_for_every_item():
 
 
 @pytest.mark.parametrize('policy, left', [('every', [0, 1, 2, 3]), ('latest', [4, 5, 6, 7])])
-def test_what_waits_weighs_no_more_than_the_room_and_one(policy, left):
+def test_queued_weight_exceeds_the_limit_by_at_most_one_item(policy, left):
     queue = FrameQueue(policy, 1000, room=10)
     assert sum(queue.put(i, 3) for i in range(8)) == (4 if policy == 'every' else 8)
     assert queue.dropped == 4
@@ -95,14 +95,14 @@ def test_what_waits_weighs_no_more_than_the_room_and_one(policy, left):
 
 
 @pytest.mark.parametrize('policy', ['latest', 'every'])
-def test_what_is_heavier_than_the_room_is_taken_by_itself(policy):
+def test_item_heavier_than_the_limit_is_accepted_alone(policy):
     queue = FrameQueue(policy, 1000, room=10)
     for item in ('first', 'second'):
         assert queue.put(item, 11)
         assert queue.get() == item
 
 
-def test_every_tells_when_a_sender_had_better_wait():
+def test_every_reports_a_full_queue():
     queue = FrameQueue('every', 1, room=10)
     for taken in range(5):
         assert queue.has_room
@@ -113,20 +113,20 @@ def test_every_tells_when_a_sender_had_better_wait():
     assert queue.has_room
 
 
-def test_the_newest_is_always_welcome():
+def test_latest_always_has_room():
     queue = FrameQueue('latest', 1)
     queue.put('old')
     assert queue.has_room
 
 
-def test_an_empty_queue_lets_the_reader_wait_as_long_as_it_wants():
+def test_get_times_out_on_an_empty_queue():
     start = monotonic()
     assert FrameQueue('latest', 1).get(timeout=0.05) is None
     assert monotonic() - start >= 0.05
 
 
 @pytest.mark.parametrize('policy', ['latest', 'every'])
-def test_closing_wakes_everybody_and_leaves_what_waits(policy):
+def test_close_wakes_readers_and_keeps_queued_items(policy):
     queue, answers = FrameQueue(policy, 1), []
     reader = in_thread(lambda: answers.append(queue.get()))
     queue.close()
@@ -141,7 +141,7 @@ def test_closing_wakes_everybody_and_leaves_what_waits(policy):
     assert drained(queue) == ['first']
 
 
-def test_clearing_makes_room():
+def test_clear_makes_room():
     queue = FrameQueue('every', 2, room=4)
     queue.put(1, 2)
     queue.put(2, 2)
@@ -153,6 +153,6 @@ def test_clearing_makes_room():
 
 
 @pytest.mark.parametrize('policy, size', [('newest', 1), ('latest', 0)])
-def test_a_senseless_queue_is_refused(policy, size):
+def test_invalid_queue_parameters_are_refused(policy, size):
     with pytest.raises(ValueError, match='queue policy'):
         FrameQueue(policy, size)

@@ -17,10 +17,10 @@ from djet_ros.core.geometry import (
     rays,
     rotation_angle,
     rotation_exp,
+    singular_values,
     skew,
     slant_warp,
     sphere_tangents,
-    stretches,
     unit,
 )
 from hypothesis import example, given, strategies as st
@@ -172,7 +172,7 @@ def test_singular_values_are_those_of_numpy():
     warps = np.random.default_rng(8).normal(size=(50, 2, 2))
     warps[0] = 2 * np.eye(2)
     expected = np.linalg.svd(warps, compute_uv=False)
-    assert np.allclose(stretches(warps), expected.T[::-1])
+    assert np.allclose(singular_values(warps), expected.T[::-1])
 
 
 def test_a_rotation_fit_is_exact_and_robust_to_outliers():

@@ -7,7 +7,7 @@ from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.graded import graded_surfaces, grades, smooth_finely
 from djet_ros.core.hamming import descriptor_bits, hamming_surfaces, intensities, smooth
 from djet_ros.core.orb_pattern import pattern, REACH, TESTS
-from djet_ros.core.surfaces import DescriptorSurface, with_minimum
+from djet_ros.core.surfaces import DescriptorSurface, resolve_indefinite
 import numpy as np
 import pytest
 from two_view import K, textured
@@ -75,7 +75,7 @@ def test_without_grading_all_of_orbs_bits_are_compared():
     estimator = TwoViewEstimator(config)
     views = [estimator.view(image, K) for image in (image_a, image_b)]
     x = np.array([[60.0, 50.0], [90.0, 61.0]])
-    fitted = DescriptorSurface(*views, x, config).around(x)
+    fitted = DescriptorSurface(*views, x, config).fit_around(x)
     pixels = x.astype(int)
     samples = hamming_surfaces(descriptor_bits(views[0].smoothed, pixels), views[1].smoothed,
                                pixels, 1).reshape(9, 2)
@@ -97,7 +97,7 @@ def test_graded_tests_are_more_accurate_in_noise_than_bits(noise):
         config = EstimatorConfig(grading=grading, binary_tests=count)
         views = [TwoViewEstimator(config).view(image, K) for image in images]
         surface = DescriptorSurface(*views, x, config)
-        fitted, _ = with_minimum(surface.around(x), 'project')
+        fitted, _ = resolve_indefinite(surface.fit_around(x), 'project')
         errors[grading] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
     assert errors[24.0] < 0.8 * errors[0.0]
 
@@ -114,8 +114,8 @@ def test_a_change_of_exposure_changes_neither_minima_nor_residuals(exposure):
     x = grid.reshape(-1, 2).astype(float)
     left, errors = {}, {}
     for name, view in (('same', same), ('after', after)):
-        fitted, _ = with_minimum(
-            DescriptorSurface(before, view, x, EstimatorConfig()).around(x), 'project')
+        fitted, _ = resolve_indefinite(
+            DescriptorSurface(before, view, x, EstimatorConfig()).fit_around(x), 'project')
         left[name] = np.median(fitted.c / np.maximum(np.trace(fitted.A, axis1=1, axis2=2), 1e-9))
         errors[name] = np.median(np.linalg.norm(fitted.minima() - x, axis=1))
     # Less light has fewer gray levels, so that noise has more effect.

@@ -156,7 +156,7 @@ def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
         assert np.allclose(map_to_odom[stamp] @ odom_to_child[stamp], here, atol=1e-9)
 
 
-def test_an_odometry_that_does_not_fit_is_said_with_what_can_be_mended(nodes, camera):
+def test_odometry_with_incompatible_qos_is_logged_with_the_remedy(nodes, camera):
     one = nodes('pose_graph_node', **SLAM_PARAMETERS)
     camera.advertise(ODOMETRY, TYPES[ODOMETRY], listeners=0, reliability='best_effort')
     end = monotonic() + 30
@@ -166,11 +166,11 @@ def test_an_odometry_that_does_not_fit_is_said_with_what_can_be_mended(nodes, ca
             f'volatile, or set qos_overrides.{ODOMETRY}.subscription.*') in one.log
 
 
-def test_loops_are_closed_and_the_frames_fit_together(listener: Peer, driven: NodeProcess) -> None:
+def test_loops_are_closed_with_consistent_frames(listener: Peer, driven: NodeProcess) -> None:
     check_the_map(listener, to_the_right=[0, -1, 0])
 
 
-def test_with_a_base_frame_the_map_is_of_the_vehicle_by_the_mounting_on_tf(
+def test_map_is_of_the_base_frame_with_the_mounting_from_tf(
         listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> None:
     pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     drive(listener, camera, nodes, **{'odometry.base_frame': 'base_link'})
@@ -181,7 +181,7 @@ def test_with_a_base_frame_the_map_is_of_the_vehicle_by_the_mounting_on_tf(
     assert pairs == {('map', 'odom'), ('odom', 'base_link')}
 
 
-def test_a_reset_forgets_the_map_and_goes_on(
+def test_reset_discards_the_map(
         listener: Peer, camera: Peer, driven: NodeProcess) -> None:
     listener.heard.clear()
     assert camera.call('reset', '/pose_graph_node')['success']
@@ -193,14 +193,14 @@ def test_a_reset_forgets_the_map_and_goes_on(
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_it_cleanly(
+def test_signal_ends_the_node_cleanly(
         driven: NodeProcess, number: signal.Signals) -> None:
     code, seconds = driven.end(number)
     assert code == 0
     assert seconds < 5
 
 
-def test_what_is_missing_is_said_with_its_resolved_name(
+def test_missing_inputs_are_logged_with_their_resolved_names(
         listener: Peer, nodes: Callable[..., NodeProcess]) -> None:
     nodes('vo_node')
     listener.ask('published', topic=ODOMETRY)
@@ -223,14 +223,14 @@ def node(*words: str, before: str = '') -> subprocess.CompletedProcess[str]:
                           timeout=60, capture_output=True, text=True, check=False)
 
 
-def test_without_gtsam_it_says_in_one_line_how_to_get_it() -> None:
+def test_missing_gtsam_is_reported_with_the_install_command() -> None:
     done = node(before='import sys; sys.modules["gtsam"] = None; ')
     assert (done.returncode, done.stderr) == (
         2, "pose_graph_node: error: gtsam is missing: pip install './djet_ros[slam]' (the "
         'folder with the README)\n')
 
 
-def test_what_the_user_can_mend_ends_it_with_one_line() -> None:
+def test_user_error_ends_the_node_with_one_line() -> None:
     done = node('--ros-args', '-p', 'slam.links:=0')
     assert done.returncode == 2
     assert 'slam.links is 0' in done.stderr.splitlines()[-1]

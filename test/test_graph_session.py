@@ -72,7 +72,7 @@ def until(condition):
         sleep(0.01)
 
 
-def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
+def test_odometry_does_not_wait_for_the_loop_search(live):
     one = live(optimise_period=0.0)
     one.drive(WAYS)
     until(lambda: len(one.graph.heard('/tf')) == len(WAYS))
@@ -82,7 +82,7 @@ def test_the_odometry_does_not_wait_for_loops_and_loops_are_found(live):
     assert one.slam.map.without_image == 0
 
 
-def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):
+def test_odometry_of_a_base_frame_waits_for_the_mounting_on_tf(live):
     one = live(base_frame='base_link')
     one.drive(WAYS[:3])
     until(lambda: any("tf does not know where 'camera' is on 'base_link'; until then the "
@@ -94,7 +94,7 @@ def test_the_odometry_of_a_vehicle_waits_until_tf_knows_the_mounting(live):
         -3:] == [START + i * 100_000_000 for i in (3, 4, 5)])
 
 
-def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
+def test_graph_is_optimised_when_the_odometry_is_silent(live, monkeypatch):
     monkeypatch.setattr('djet_ros.live.graph_session.SILENCE_TIMEOUT', 0.0)
     one = live(optimise_period=1000.0)
     one.drive(WAYS)
@@ -104,7 +104,7 @@ def test_silence_is_used_to_optimise_what_is_left(live, monkeypatch):
     until(lambda: one.slam.map.optimisations == before + 1)
 
 
-def test_what_is_missing_is_said_by_its_topic(live, monkeypatch):
+def test_missing_inputs_are_logged_with_their_topics(live, monkeypatch):
     monkeypatch.setattr('djet_ros.live.graph_session.SILENCE_TIMEOUT', 0.0)
     one = live()
     one.session.camera_info(camera_info(K, SIZE))
@@ -126,7 +126,7 @@ def test_closed_loops_are_logged(live):
                       for line in one.graph.lines))
 
 
-def test_a_reset_begins_a_new_map(live):
+def test_reset_starts_a_new_map(live):
     one = live()
     one.drive(WAYS[:5])
     until(lambda: len(one.graph.heard('/tf')) == 5)
@@ -149,7 +149,7 @@ def test_nothing_is_published_after_a_stop(live):
     assert not one.session.failed
 
 
-def test_what_is_in_work_at_a_stop_is_not_published(live):
+def test_task_in_progress_at_a_stop_is_not_published(live):
     one = live()
     odometry = one.slam.odometry
 
@@ -167,7 +167,7 @@ def test_what_is_in_work_at_a_stop_is_not_published(live):
 
 
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
-def test_an_error_in_the_thread_is_no_silent_stall(live):
+def test_error_in_the_worker_thread_is_reported(live):
     one = live()
     assert not one.session.failed
     one.graph.broken = True

@@ -10,7 +10,7 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, unit
-from djet_ros.core.ground import Ground, turned
+from djet_ros.core.ground import Ground, rotate_tilt
 from djet_ros.core.masks import blocked
 from djet_ros.core.types import RelativePose, Status, View
 from djet_ros.lab.scenes import make_scene
@@ -313,20 +313,20 @@ def test_tilt_is_propagated_through_a_rotation():
     """By pitch alone as far as it nods, by roll as far as it tips; turning makes one the other."""
     nods, tips, turns = (rotation_exp(angle) for angle in 0.1 * np.eye(3)[[0, 2, 1]])
     sure = np.zeros((3, 3))
-    np.testing.assert_allclose(turned(np.array([0.05, 0.0]), nods, sure)[0], [0.15, 0.0])
-    np.testing.assert_allclose(turned(np.array([0.0, 0.02]), tips, sure)[0], [0.0, -0.08])
-    np.testing.assert_allclose(turned(np.array([0.05, 0.0]), turns, sure)[0],
+    np.testing.assert_allclose(rotate_tilt(np.array([0.05, 0.0]), nods, sure)[0], [0.15, 0.0])
+    np.testing.assert_allclose(rotate_tilt(np.array([0.0, 0.02]), tips, sure)[0], [0.0, -0.08])
+    np.testing.assert_allclose(rotate_tilt(np.array([0.05, 0.0]), turns, sure)[0],
                                [0.05 * np.cos(0.1), 0.05 * np.sin(0.1)], atol=1e-4)
 
 
 def test_the_covariance_of_tilt_is_propagated_through_a_rotation():
     lean, R = np.array([0.2, -0.1]), rotation_exp(np.array([0.05, -0.2, 0.1]))
     covariance = np.diag([1.0, 2.0, 3.0]) * 1e-4
-    after, by_lean, by_turn = turned(lean, R, covariance)
+    after, by_lean, by_turn = rotate_tilt(lean, R, covariance)
     step = 1e-6
-    by_lean_found = np.transpose([turned(lean + off, R, covariance)[0] - after
+    by_lean_found = np.transpose([rotate_tilt(lean + off, R, covariance)[0] - after
                                   for off in step * np.eye(2)]) / step
-    J = np.transpose([turned(lean, rotation_exp(off) @ R, covariance)[0] - after
+    J = np.transpose([rotate_tilt(lean, rotation_exp(off) @ R, covariance)[0] - after
                       for off in step * np.eye(3)]) / step
     np.testing.assert_allclose(by_lean, by_lean_found, atol=1e-5)
     np.testing.assert_allclose(by_turn, J @ covariance @ J.T, atol=1e-8)

@@ -11,9 +11,9 @@ from djet_ros.core.hamming import (
     descriptor_bits,
     hamming_surfaces,
     intensities,
-    intensities_through,
     match_distances,
     smooth,
+    warped_intensities,
 )
 from djet_ros.core.orb_pattern import REACH, TESTS
 import numpy as np
@@ -132,9 +132,9 @@ def test_warped_patches_of_two_images_in_one_pass_equal_those_of_each():
     rng = np.random.default_rng(5)
     images = rng.integers(0, 256, (2, 120, 160), np.uint8)
     points, warps = rng.uniform(20, 100, (700, 2)), np.tile(1.1 * np.eye(3, 2), (700, 1, 1))
-    together = intensities_through(warps, [(images[0], 300), (images[1], 400)], points)
+    together = warped_intensities(warps, [(images[0], 300), (images[1], 400)], points)
     for image, some in zip(images, (slice(0, 300), slice(300, 700))):
-        alone = intensities_through(warps[some], [(image, len(points[some]))], points[some])
+        alone = warped_intensities(warps[some], [(image, len(points[some]))], points[some])
         for one, other in zip(alone, together):
             np.testing.assert_allclose(other[:, some], one, atol=1e-3)
 
@@ -144,7 +144,7 @@ def test_a_warped_patch_is_sampled_at_the_inverse_warp():
     points = np.array([[60, 50], [90, 60], [70, 70], [80, 66]])
     warps = np.array([np.eye(3, 2), 1.25 * np.eye(3, 2), [[0.9, 0.2], [-0.1, 1.1], [0, 0]],
                       [[0.9, 0.2], [-0.1, 1.1], [0.01, -0.006]]])
-    bits = np.less(*intensities_through(warps, [(smoothed, len(points))], points))
+    bits = np.less(*warped_intensities(warps, [(smoothed, len(points))], points))
     assert np.array_equal(bits[:, :1], descriptor_bits(smoothed, points[:1]))
 
     def between(x, y):

@@ -139,7 +139,7 @@ def test_a_range_changes_no_image_of_8_bits():
     lambda pixels: image(pixels, 'mono16'),
     lambda pixels: image(pixels.byteswap(), 'mono16', is_bigendian=1),
     lambda pixels: compressed(encoded('.png', pixels), 'png')])
-def test_16_bits_that_become_few_levels_are_told_with_the_values_they_had(message):
+def test_few_levels_of_16_bits_are_reported_with_their_range(message):
     dark = message(small(GRAY, 2, 8000))
     levels, low, high = few_levels(dark, gray_image(dark))
     assert levels <= 3
@@ -147,7 +147,7 @@ def test_16_bits_that_become_few_levels_are_told_with_the_values_they_had(messag
     assert few_levels(dark, gray_image(dark, (8000, 8511))) is None
 
 
-def test_a_few_broken_pixels_hide_no_lack_of_gray_levels():
+def test_broken_pixels_do_not_hide_few_gray_levels():
     values = np.full((480, 640), 100, '<u2')
     values.ravel()[:40_000:1000] = np.arange(40) * 1600
     message = image(values, 'mono16')
@@ -156,7 +156,7 @@ def test_a_few_broken_pixels_hide_no_lack_of_gray_levels():
 
 @pytest.mark.parametrize('kind', [lambda d: array('B', d.tobytes()), lambda d: d.tobytes(),
                                   lambda d: memoryview(d.tobytes()), lambda d: d.copy()])
-def test_data_may_be_of_any_kind_that_middleware_gives(kind):
+def test_data_may_be_of_any_type_of_the_middleware(kind):
     message = image(GRAY, padding=3)
     message.data = kind(message.data)
     assert np.array_equal(gray_image(message), GRAY)
@@ -219,7 +219,7 @@ def test_a_compressed_image_is_decoded():
 
 @pytest.mark.parametrize('bits', [8, 16])
 @pytest.mark.parametrize('pattern', MOSAICS)
-def test_a_mosaic_that_was_compressed_as_it_is_gives_the_gray_of_the_raw_one(pattern, bits):
+def test_a_compressed_mosaic_gives_the_gray_of_the_raw_one(pattern, bits):
     encoding = f'bayer_{pattern}{bits}'
     pixels = mosaic(pattern) if bits == 8 else wide(mosaic(pattern))
     data = encoded('.png', pixels.astype(f'u{bits // 8}'))
@@ -229,7 +229,7 @@ def test_a_mosaic_that_was_compressed_as_it_is_gives_the_gray_of_the_raw_one(pat
         assert np.array_equal(gray_image(compressed(data, said)), expected)
 
 
-def test_what_became_gray_before_it_was_compressed_is_no_mosaic():
+def test_a_mosaic_converted_before_compression_is_gray():
     for said in ('bayer_rggb8; jpeg compressed mono8', 'bayer_rggb8; jpeg compressed bgr8',
                  'bayer_rggb8; jpeg', 'mono8; png compressed ', 'bayer_of_none; png compressed '):
         assert np.array_equal(gray_image(compressed(encoded('.png'), said)), GRAY)
@@ -239,7 +239,7 @@ def test_trailing_zeros_after_a_jpeg_are_usual():
     assert gray_image(compressed(encoded('.jpg') + bytes(900))).shape == GRAY.shape
 
 
-def test_an_orientation_tag_does_not_turn_the_camera():
+def test_an_orientation_tag_does_not_rotate_the_image():
     data = encoded('.jpg')
     # EXIF with one entry: orientation 6, a rotation by 90 degrees.
     exif = (b'Exif\0\0MM\0*\0\0\0\x08\0\x01' + struct.pack('>HHIHH', 0x112, 3, 1, 6, 0)

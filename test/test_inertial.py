@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from djet_ros.core.fusion import agrees, fused, Turn
+from djet_ros.core.fusion import agrees, fused, MeasuredRotation
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
@@ -66,7 +66,7 @@ def test_the_jerks_of_a_hand_are_integrated_to_a_hundredth_of_a_degree(seed: int
     for i in range(len(poses) - 1):
         turn = gyro.turn(i * PERIOD, (i + 1) * PERIOD)
         assert turn is not None
-        assert np.linalg.norm(turn.off(relative(poses, i, i + 1))) < np.radians(0.01)
+        assert np.linalg.norm(turn.correction(relative(poses, i, i + 1))) < np.radians(0.01)
 
 
 def test_rates_along_the_axes_of_a_robot_are_those_of_its_camera() -> None:
@@ -76,7 +76,7 @@ def test_rates_along_the_axes_of_a_robot_are_those_of_its_camera() -> None:
     assert np.allclose(Rotation.from_matrix(turn.R.T).as_rotvec(), [0, -0.3, 0])
 
 
-def test_a_clock_that_is_ahead_is_asked_for_later_stamps() -> None:
+def test_the_clock_offset_shifts_the_stamps() -> None:
     ahead = mounted(offset_ns=30_000_000)
     for i in range(201):
         ahead.add(i * 5_000_000, np.array([0, 0, i * 0.01]))
@@ -96,14 +96,14 @@ def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
             gyro.add(i * 5_000_000, bias + 0.01 * np.sqrt(200) * rng.standard_normal(3))
         turn = gyro.turn(2_000_000, 198_000_000)
         assert turn is not None
-        off.append(turn.off(np.eye(3)))
+        off.append(turn.correction(np.eye(3)))
     scatter = np.mean(np.square(off))
     assert scatter / np.diag(turn.covariance).mean() == pytest.approx(1, abs=0.25)
 
 
 # Invalid samples
 
-def test_without_a_mounting_or_with_a_hole_there_is_no_turn() -> None:
+def test_without_a_mounting_or_with_a_gap_there_is_no_rotation() -> None:
     unmounted = Gyro(NOISE)
     for i in range(100):
         unmounted.add(i * 5_000_000, np.zeros(3))
@@ -132,7 +132,7 @@ def test_samples_may_come_out_of_order_and_twice() -> None:
 
 
 @pytest.mark.parametrize('rate', [np.nan, np.inf, -np.inf, 1e30])
-def test_what_is_no_rate_is_left_out(rate: float) -> None:
+def test_invalid_rates_are_ignored(rate: float) -> None:
     gyro = constant(np.array([0, 0, 0.1]))
     gyro.add(500_000_001, np.array([0, rate, 0]))
     assert gyro.refused == {'not a rate': 1}
@@ -141,7 +141,7 @@ def test_what_is_no_rate_is_left_out(rate: float) -> None:
     assert np.allclose(Rotation.from_matrix(turn.R.T).as_rotvec(), [0, 0, 0.1])
 
 
-def test_a_gyro_at_the_end_of_its_range_tells_no_turn() -> None:
+def test_a_saturated_gyro_measures_no_rotation() -> None:
     gyro = mounted()
     for i in range(200):
         faster = 20 * np.sin(np.pi * i / 200)
@@ -151,7 +151,7 @@ def test_a_gyro_at_the_end_of_its_range_tells_no_turn() -> None:
     assert gyro.turn(0, PERIOD) is not None
 
 
-def test_late_samples_neither_hide_nor_feign_the_end_of_a_gyro_s_range() -> None:
+def test_late_samples_neither_hide_nor_feign_saturation() -> None:
     """Some samples come after later ones."""
     fast, slow, ms = np.array([0, 0, 9.0]), np.array([0, 0, 8.0]), 1_000_000
     at_its_end = mounted()
@@ -168,7 +168,7 @@ def test_late_samples_neither_hide_nor_feign_the_end_of_a_gyro_s_range() -> None
     assert turning.turn(12 * ms, 48 * ms) is not None
 
 
-def test_a_bag_that_begins_again_begins_the_samples_again_but_not_the_bias() -> None:
+def test_a_looping_bag_resets_the_samples_but_not_the_bias() -> None:
     gyro = constant(np.array([0, 0, 0.1]), seconds=2.0)
     gyro.learn(0, SECOND, np.eye(3), np.eye(3) * 1e-8)
     bias = gyro.bias.copy()
@@ -205,14 +205,14 @@ def test_after_30_s_of_pairs_the_bias_is_known_to_a_tenth_of_it(seed: int) -> No
     assert off @ np.linalg.solve(gyro.bias_covariance, off) < 16  # of 3 expected
 
 
-def test_standing_still_tells_the_bias() -> None:
+def test_a_standstill_determines_the_bias() -> None:
     gyro, biases = felt_by(np.tile(np.eye(4), (101, 1, 1)), Mems(), 3)
     for i in range(100):
         gyro.learn(i * PERIOD, (i + 1) * PERIOD, np.eye(3), np.eye(3) * 2e-4**2)
     assert np.linalg.norm(gyro.bias - biases[-1]) < 0.1 * np.linalg.norm(biases[-1])
 
 
-def test_rest_is_told_from_the_slowest_turn() -> None:
+def test_rest_is_distinguished_from_the_slowest_rotation() -> None:
     at_rest, _ = felt_by(np.tile(np.eye(4), (31, 1, 1)), Mems(), 4)
     turning, _ = felt_by(np.array([np.block([
         [rotation_exp(np.array([0, np.radians(0.05) * i, 0])), np.zeros((3, 1))],
@@ -227,7 +227,7 @@ def test_rest_is_told_from_the_slowest_turn() -> None:
     assert not any(told[1])
 
 
-def test_a_gyro_that_never_fits_is_not_gone_by() -> None:
+def test_a_gyro_that_never_agrees_is_not_trusted() -> None:
     gyro = mounted()
     for _ in range(60):
         gyro.judge(True)
@@ -248,7 +248,7 @@ def pair(R: Array, t: Array, covariance: Array) -> RelativePose:
     return RelativePose(Status.OK, R, t, covariance, lift @ covariance @ lift.T)
 
 
-def test_errors_after_fusion_are_as_large_as_the_covariance_says_and_smaller_than_before() -> None:
+def test_fused_errors_are_consistent_with_their_covariance_and_smaller() -> None:
     rng = np.random.default_rng(2)
     root = rng.normal(0, 1e-3, (5, 5))
     covariance, told = root @ root.T, np.eye(3) * 5e-4**2
@@ -258,9 +258,9 @@ def test_errors_after_fusion_are_as_large_as_the_covariance_says_and_smaller_tha
         error = root @ rng.standard_normal(5)
         seen = t + sphere_tangents(t) @ error[3:]
         visual = pair(rotation_exp(error[:3]) @ R, seen / np.linalg.norm(seen), covariance)
-        turn = Turn(rotation_exp(rng.normal(0, 5e-4, 3)) @ R, told)
+        turn = MeasuredRotation(rotation_exp(rng.normal(0, 5e-4, 3)) @ R, told)
         found = fused(visual, turn)
-        off = np.concatenate([Turn(found.R, told).off(R),
+        off = np.concatenate([MeasuredRotation(found.R, told).correction(R),
                               sphere_tangents(found.t).T @ (found.t - t)])
         before.append(error @ np.linalg.solve(covariance, error))
         after.append(off @ np.linalg.solve(found.covariance_5, off))
@@ -270,26 +270,26 @@ def test_errors_after_fusion_are_as_large_as_the_covariance_says_and_smaller_tha
     assert np.allclose(found.covariance_6[:, 3:] @ found.t, 0, atol=1e-12)
 
 
-def test_a_turn_without_any_certainty_changes_nothing() -> None:
+def test_a_rotation_without_information_changes_nothing() -> None:
     visual = pair(rotation_exp(np.array([0.01, 0, 0])), np.array([0, 0, 1.0]), np.eye(5) * 1e-6)
-    found = fused(visual, Turn(np.eye(3), np.eye(3) * 1e6))
+    found = fused(visual, MeasuredRotation(np.eye(3), np.eye(3) * 1e6))
     assert np.allclose(found.R, visual.R, atol=1e-9)
     assert np.allclose(found.covariance_5, visual.covariance_5, rtol=1e-5)
 
 
-def test_a_pair_that_turned_otherwise_does_not_agree() -> None:
+def test_a_pair_with_another_rotation_does_not_agree() -> None:
     visual = pair(np.eye(3), np.array([0, 0, 1.0]), np.eye(5) * np.radians(0.01)**2)
     sure = np.eye(3) * np.radians(0.004)**2
-    assert agrees(Turn(rotation_exp(np.radians([0.03, 0, 0])), sure), visual)
-    assert not agrees(Turn(rotation_exp(np.radians([0.3, 0, 0])), sure), visual)
+    assert agrees(MeasuredRotation(rotation_exp(np.radians([0.03, 0, 0])), sure), visual)
+    assert not agrees(MeasuredRotation(rotation_exp(np.radians([0.3, 0, 0])), sure), visual)
 
 
-def test_a_turn_decides_between_two_motions_only_as_far_as_it_is_known() -> None:
+def test_a_rotation_decides_between_two_motions_only_by_its_covariance() -> None:
     rng = np.random.default_rng(3)
     one, other = (rotation_exp(np.radians([0, angle, 0])) for angle in (0.0, 0.3))
     wrong = {}
     for sigma in np.radians([0.02, 0.1, 1.0]):
-        told = [Turn(rotation_exp(rng.normal(0, sigma, 3)) @ one, np.eye(3) * sigma**2)
+        told = [MeasuredRotation(rotation_exp(rng.normal(0, sigma, 3)) @ one, np.eye(3) * sigma**2)
                 for _ in range(500)]
         wrong[sigma] = np.mean([turn.prefers(other, one) for turn in told])
         right = np.mean([turn.prefers(one, other) for turn in told])
@@ -298,7 +298,7 @@ def test_a_turn_decides_between_two_motions_only_as_far_as_it_is_known() -> None
     assert right == 0  # with a sigma of a degree
 
 
-def test_a_bias_that_something_else_has_taught_is_unlearnt() -> None:
+def test_a_bias_estimated_from_a_moving_object_is_reset() -> None:
     """The images show the rotation of a lorry for a second, and then that of the world."""
     poses = way(frames=160)
     gyro, biases = felt_by(poses, Mems(), 6)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from djet_ros.core import jet
 from djet_ros.core.geometry import direction_angle, fundamental, rotation_angle, sphere_tangents
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     epipolar_residuals,
     jet_problem,
     Loss,
     median,
     minimise,
-    moved,
+    retract,
     robust_scale,
 )
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
@@ -64,7 +64,7 @@ def test_the_jacobian_is_that_of_central_differences(camera, kind, seed, blur):
 
     def at(parameter, distance):
         step = distance * np.eye(5)[parameter]
-        return epipolar_residuals(problem, *moved(R, t, tangents, step))
+        return epipolar_residuals(problem, *retract(R, t, tangents, step))
 
     for parameter in range(5):
         ahead, behind = at(parameter, step), at(parameter, -step)
@@ -145,7 +145,7 @@ def test_a_step_gives_a_valid_pose_at_its_own_distance(seed):
     rng = np.random.default_rng(seed)
     R, t = random_pose(rng)
     step = 1e-3 * rng.normal(size=5)
-    R_new, t_new = moved(R, t, sphere_tangents(t), step)
+    R_new, t_new = retract(R, t, sphere_tangents(t), step)
     assert np.allclose(R_new @ R_new.T, np.eye(3), atol=1e-12)
     assert np.linalg.norm(t_new) == pytest.approx(1, abs=1e-12)
     assert np.allclose(Rotation.from_matrix(R_new @ R.T).as_rotvec(), step[:3], atol=1e-12)
@@ -242,7 +242,7 @@ def test_at_the_minimum_the_gradient_of_the_summed_loss_vanishes(name, kind):
     found = minimise(problem, *moved_pose(seen.R, seen.t, 0.01, rng), loss, 100)
 
     def cost(step):
-        there = epipolar_residuals(problem, *moved(
+        there = epipolar_residuals(problem, *retract(
             found.R, found.t, found.residuals.tangents, step))
         return (there.sign * loss(there.r**2)[0]).sum()
 
@@ -281,16 +281,16 @@ def test_the_clipped_scale_is_that_of_the_inliers_even_if_most_are_outliers():
     rng = np.random.default_rng(13)
     right = rng.normal(0, 0.1, 10_000)
     false = rng.uniform(-20, 20, 15_000)
-    assert core_scale(np.concatenate([right, false])) == pytest.approx(0.1, rel=0.05)
-    assert core_scale(right) == pytest.approx(0.1, rel=0.05)
-    assert core_scale(np.full(30, 2.0)) == pytest.approx(robust_scale(np.full(30, 2.0)))
+    assert clipped_scale(np.concatenate([right, false])) == pytest.approx(0.1, rel=0.05)
+    assert clipped_scale(right) == pytest.approx(0.1, rel=0.05)
+    assert clipped_scale(np.full(30, 2.0)) == pytest.approx(robust_scale(np.full(30, 2.0)))
 
 
 @pytest.mark.parametrize('rounds', [1, 6, 7, 8, 9])
-def test_the_core_scale_of_exact_matches_is_zero_after_any_number_of_rounds(monkeypatch, rounds):
+def test_the_clipped_scale_of_exact_matches_is_zero_after_any_round(monkeypatch, rounds):
     monkeypatch.setattr(jet, '_CLIPPING_ROUNDS', rounds)
-    assert core_scale(np.zeros(10)) == 0.0
-    assert core_scale(np.append(np.zeros(10), [3.0, 5.0, 9.0])) == 0.0
+    assert clipped_scale(np.zeros(10)) == 0.0
+    assert clipped_scale(np.append(np.zeros(10), [3.0, 5.0, 9.0])) == 0.0
 
 
 def test_degenerate_matches_leave_the_pose_finite():

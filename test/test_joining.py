@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from djet_ros.core.geometry import fundamental, rotation_angle
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     epipolar_residuals,
     jet_problem,
     JetProblem,
@@ -14,9 +14,9 @@ from djet_ros.core.jet import (
     minimise,
     Solution,
 )
-from djet_ros.core.joining import joined_places, with_places
+from djet_ros.core.joining import fuse_alignment, fuse_positions
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import Placed
+from djet_ros.core.patches import Aligned
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose
 import numpy as np
@@ -43,8 +43,8 @@ def surfaces(centres: np.ndarray, S: np.ndarray) -> Paraboloids:
                        np.ones(len(centres), bool))
 
 
-def alike(places: np.ndarray) -> Placed:
-    return Placed(places, np.tile(np.eye(2), (len(places), 1, 1)))
+def alike(places: np.ndarray) -> Aligned:
+    return Aligned(places, np.tile(np.eye(2), (len(places), 1, 1)))
 
 
 def at(problem: JetProblem, R: np.ndarray, t: np.ndarray) -> Solution:
@@ -71,11 +71,11 @@ def test_two_measurements_are_fused_as_gaussians() -> None:
     found, T = ellipses(rng, y, 0.2)
     alone = jet_problem(K, x, surfaces(y_star, S))
     # Only the shapes and ratios of covariances are known.
-    joined = with_places(alone, at(alone, R, t), K, Placed(found, 7 * T))
+    joined = fuse_alignment(alone, at(alone, R, t), K, Aligned(found, 7 * T))
     # The standard deviation of each, in pixels, by the distances to the true lines.
     lines = np.c_[x, np.ones(len(x))] @ fundamental(K, R, t).T
     normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    S, T = (shape * core_scale(((at_places - y) * normals).sum(1) / np.sqrt(
+    S, T = (shape * clipped_scale(((at_places - y) * normals).sum(1) / np.sqrt(
         np.einsum('ni,nij,nj->n', normals, shape, normals)))**2
         for shape, at_places in ((S, y_star), (T, found)))
     S *= TOGETHER
@@ -102,9 +102,9 @@ def test_a_fused_pose_is_about_as_accurate_as_the_better_of_both(sigma: float
         y_star, S = ellipses(rng, views.y, 0.3)
         found = views.y + rng.normal(0, sigma, views.y.shape)
         problems = [jet_problem(K, views.x, surfaces(y_star, S)),
-                    jet_problem(K, views.x, ReprojectionSurface(views.x, found).around(found))]
+                    jet_problem(K, views.x, ReprojectionSurface(views.x, found).fit_around(found))]
         solutions = [minimise(problem, views.R, views.t, Loss()) for problem in problems]
-        joined = with_places(problems[0], solutions[0], K, alike(found))
+        joined = fuse_alignment(problems[0], solutions[0], K, alike(found))
         return [one.pose for one in (*solutions, minimise(joined, views.R, views.t, Loss()))]
 
     surface, place, both = rotation_errors(poses, 30, 150)
@@ -119,8 +119,8 @@ def test_measurements_are_weighted_by_their_precision() -> None:
         found = views.y + sigma[:, None] * rng.normal(size=views.y.shape)
         alone = jet_problem(K, views.x, surfaces(y_star, S))
         start = minimise(alone, views.R, views.t, Loss())
-        told = Placed(found, sigma[:, None, None]**2 * np.eye(2))
-        return [minimise(with_places(alone, start, K, placed), views.R, views.t, Loss()).pose
+        told = Aligned(found, sigma[:, None, None]**2 * np.eye(2))
+        return [minimise(fuse_alignment(alone, start, K, placed), views.R, views.t, Loss()).pose
                 for placed in (told, alike(found))]
 
     weighed, unweighed = rotation_errors(poses, 20, 200)
@@ -135,7 +135,7 @@ def test_agreeing_measurements_have_more_weight_if_the_noise_varies() -> None:
     off, S = ellipses(rng, np.zeros_like(y), 0.2)
     found = y + noise[:, None] * rng.normal(0, 0.2, y.shape)
     alone = jet_problem(K, x, surfaces(y + noise[:, None] * off, S))
-    joined = with_places(alone, at(alone, R, t), K, alike(found))
+    joined = fuse_alignment(alone, at(alone, R, t), K, alike(found))
     grown = np.median(joined.spread[::2], axis=0) / np.median(alone.spread[::2], axis=0)
     assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
 
@@ -148,8 +148,8 @@ def test_outliers_of_the_alignment_hardly_change_the_pose() -> None:
         alone = jet_problem(K, views.x, surfaces(y_star, S))
         start = minimise(alone, views.R, views.t, Loss('geman_mcclure', 0.6))
         for places in (found, found + elsewhere):
-            joined = with_places(alone, start, K, alike(places))
-            scale = 3 * core_scale(epipolar_residuals(joined, start.R, start.t).r)
+            joined = fuse_alignment(alone, start, K, alike(places))
+            scale = 3 * clipped_scale(epipolar_residuals(joined, start.R, start.t).r)
             yield minimise(joined, start.R, start.t, Loss('geman_mcclure', scale)).pose
 
     right, some_wrong = rotation_errors(poses, 20, 400)
@@ -164,7 +164,7 @@ def test_matches_without_a_minimum_are_not_fused() -> None:
     S[::3] *= -1
     S[1::3, 0, 0] *= -1
     problem = jet_problem(K, x, surfaces(y_star, S))
-    joined = with_places(problem, at(problem, R, t), K, alike(y))
+    joined = fuse_alignment(problem, at(problem, R, t), K, alike(y))
     saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
     saddles |= problem.spread[0] <= 0
     assert saddles.sum() > 10
@@ -183,7 +183,7 @@ def test_without_a_pose_the_differences_calibrate_the_covariances() -> None:
     alike_off = 0.05 * rng.normal(size=y.shape)
     y_star, found = y_star + alike_off, found + alike_off
     # Errors of the alignment are twice as large as stated.
-    places, C = joined_places(y_star, 1000 * S, Placed(found, T / 4))
+    places, C = fuse_positions(y_star, 1000 * S, Aligned(found, T / 4))
     errors = [np.sqrt(np.mean((one - y)**2)) for one in (y_star, found, places)]
     assert errors[2] < min(errors[:2])
     squared = ((places - y) * np.linalg.solve(C, (places - y)[..., None])[..., 0]).sum(1)
@@ -192,7 +192,7 @@ def test_without_a_pose_the_differences_calibrate_the_covariances() -> None:
 
 def test_equal_positions_have_a_covariance() -> None:
     y, eye = np.full((5, 2), 40.0), np.tile(np.eye(2), (5, 1, 1))
-    places, C = joined_places(y, 3 * eye, Placed(y, 1e-4 * eye))
+    places, C = fuse_positions(y, 3 * eye, Aligned(y, 1e-4 * eye))
     assert np.array_equal(places, y)
     assert (np.linalg.eigvalsh(C) > 1e-5).all()
 
@@ -200,6 +200,6 @@ def test_equal_positions_have_a_covariance() -> None:
 def test_exact_matches_stay_exact() -> None:
     views = two_views(np.random.default_rng(24), 60)
     problem = jet_problem(K, views.x, surfaces(views.y, np.tile(np.eye(2), (60, 1, 1))))
-    joined = with_places(problem, at(problem, views.R, views.t), K, alike(views.y))
+    joined = fuse_alignment(problem, at(problem, views.R, views.t), K, alike(views.y))
     assert np.isfinite(joined.spread).all()
     assert np.abs(epipolar_residuals(joined, views.R, views.t).r).max() < 1e-9

@@ -8,17 +8,18 @@ from pathlib import Path
 
 from djet_ros.cli.main import main
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.fusion import Turn
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import rotation_angle
-from djet_ros.core.starts import Known
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.lab.beside import GYRO, is_wrong, MASK, Moment, NOTHING, trial_rows
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult, VisualOdometry
-from djet_ros.replay.pair_errors import angles_off
+from djet_ros.odometry.result import camera_motion, OdometryResult
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.replay.pair_errors import angle_errors
 import numpy as np
 import pytest
 
@@ -48,7 +49,7 @@ def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None
     relative = estimator.estimate(
         previous, current, prior, felt_turn(poses[frame - 1:frame + 1]))
     true_motion = np.linalg.inv(poses[frame - 1]) @ poses[frame]
-    rotation, direction = angles_off(camera_motion(relative), true_motion)
+    rotation, direction = angle_errors(camera_motion(relative), true_motion)
     assert relative.status is Status.OK
     assert rotation < 0.1 and direction < 2
 
@@ -59,15 +60,15 @@ def test_of_two_bodies_that_may_turn_as_was_measured_each_is_led_to_its_end() ->
     views = [estimator.view(scene.render(pose, frame - 1 + i), scene.K)
              for i, pose in enumerate(poses)]
     relative = estimator.estimate(*views, known=felt_turn(poses))
-    rotation, direction = angles_off(camera_motion(relative), np.linalg.inv(poses[0]) @ poses[1])
+    rotation, direction = angle_errors(camera_motion(relative), np.linalg.inv(poses[0]) @ poses[1])
     assert relative.status is Status.OK
     assert rotation < 0.05 and direction < 1
 
 
-def felt_turn(poses: Array) -> Known:
+def felt_turn(poses: Array) -> KnownMotion:
     """Give the turn between two poses (2, 4, 4) as a gyro tells it, to a hundredth of a degree."""
     R = poses[1, :3, :3].T @ poses[0, :3, :3]
-    return Known(Turn(R, np.radians(0.01)**2 * np.eye(3)))
+    return KnownMotion(MeasuredRotation(R, np.radians(0.01)**2 * np.eye(3)))
 
 
 def test_traffic_passes_before_a_camera_that_stands() -> None:
@@ -156,7 +157,7 @@ def test_depths_of_a_lorry_do_not_speak_against_the_motion_that_a_gyro_confirms(
     poses = scene.trajectory(18)
     for result, (one, other) in zip(gone(scene, poses, seed)[1:], pairwise(poses), strict=True):
         assert result.status is Status.OK
-        assert angles_off(result.motion, np.linalg.inv(one) @ other)[1] < 2
+        assert angle_errors(result.motion, np.linalg.inv(one) @ other)[1] < 2
 
 
 def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands() -> None:

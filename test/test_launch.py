@@ -49,7 +49,7 @@ def test_every_launch_file_is_python() -> None:
         compile(path.read_text(), path, 'exec')
 
 
-def test_the_parameters_of_a_replay_are_the_defaults_without_loss_and_with_a_path() -> None:
+def test_replay_yaml_differs_from_the_defaults_in_queue_policy_and_path() -> None:
     assert load_yaml(ROOT / 'config' / 'replay.yaml') == from_flat(
         {'ros.queue_policy': 'every', 'ros.publish_path': True})
 
@@ -60,7 +60,7 @@ def test_rviz_shows_what_the_node_publishes() -> None:
                      '/vo_node/debug_image']
 
 
-def test_the_recipe_for_robot_localization_fuses_the_twist_of_our_odometry_alone() -> None:
+def test_robot_localization_example_fuses_only_the_twist() -> None:
     page = (ROOT / 'doc' / 'slam-backend.md').read_text()
     block, = re.findall(r'```yaml\n(ekf_filter_node:.*?)```', page, re.DOTALL)
     recipe = yaml.safe_load(block)['ekf_filter_node']['ros__parameters']
@@ -97,14 +97,14 @@ def test_foxglove_shows_what_the_nodes_publish_and_the_launch_files_camera() -> 
     assert 'vo_node: visual odometry' in texts(layout)
 
 
-def test_every_panel_of_foxglove_has_its_place() -> None:
+def test_every_foxglove_panel_is_in_the_layout() -> None:
     layout = json.loads((ROOT / 'config' / 'foxglove.json').read_text())
     placed = [text for text in texts(layout['layout']) if '!' in text]
     assert sorted(placed) == sorted(layout['configById'])
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
-def test_the_arguments_are_listed_and_explained(path: Path) -> None:
+def test_launch_arguments_have_descriptions(path: Path) -> None:
     pytest.importorskip('launch_ros', reason='launch comes with ROS 2')
     from launch.actions import DeclareLaunchArgument
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
@@ -191,7 +191,7 @@ def test_vo_launch_starts_the_node_on_the_topics_given(
 
 
 @pytest.mark.ros
-def test_vo_launch_names_the_node_and_starts_it_again_after_an_error(
+def test_vo_launch_names_and_respawns_the_node(
         environment: dict[str, str], tmp_path: Path) -> None:
     broken = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
     broken.write_text('#!/bin/sh\necho started with "$@"\nexit 1\n')
@@ -204,7 +204,7 @@ def test_vo_launch_names_the_node_and_starts_it_again_after_an_error(
 
 
 @pytest.mark.ros
-def test_a_file_of_parameters_that_is_not_there_ends_the_launch(
+def test_missing_parameter_file_ends_the_launch(
         environment: dict[str, str], tmp_path: Path) -> None:
     said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
                     until='params_file')
@@ -232,7 +232,7 @@ OWN = '/**: {ros__parameters: {use_sim_time: true, ros: {publish_tf: true}}}'
     ('vo.launch.py', ('publish_tf:=false',), True, False),
     ('slam.launch.py', (), True, True),
     ('slam.launch.py', ('publish_tf:=false',), True, False)])
-def test_what_a_file_of_parameters_says_holds_unless_the_launch_is_told_otherwise(
+def test_launch_arguments_override_the_parameter_file(
         environment: dict[str, str], tmp_path: Path, file: str, given: tuple[str, ...],
         clock: bool, tf: bool) -> None:
     own = tmp_path / 'own.yaml'
@@ -242,14 +242,14 @@ def test_what_a_file_of_parameters_says_holds_unless_the_launch_is_told_otherwis
 
 
 @pytest.mark.ros
-def test_a_slam_has_the_odometry_on_tf_as_it_stands(
+def test_slam_launch_publishes_tf_by_default(
         environment: dict[str, str], tmp_path: Path) -> None:
     assert parameters_of_launched(environment, tmp_path, 'slam.launch.py') == (False, True)
 
 
 @pytest.mark.ros
 @pytest.mark.parametrize('included', ['vo.launch.py', 'replay.launch.py'])
-def test_tf_and_compressed_images_can_be_asked_for_by_an_argument(
+def test_launch_arguments_set_tf_and_image_transport(
         environment: dict[str, str], tmp_path: Path, included: str) -> None:
     given = ['publish_tf:=true', 'image_transport:=compressed', 'image:=/eye/image_raw']
     told = [*given, 'bag:=/no/bag'] if included == 'replay.launch.py' else given
@@ -260,7 +260,7 @@ def test_tf_and_compressed_images_can_be_asked_for_by_an_argument(
 
 
 @pytest.mark.ros
-def test_an_outer_launch_file_can_set_the_clock_of_all(
+def test_including_launch_file_can_set_use_sim_time(
         environment: dict[str, str], tmp_path: Path) -> None:
     inner = tmp_path / 'share' / 'djet_ros' / 'launch' / 'vo.launch.py'
     inner.with_name('outer.launch.py').write_text(OUTER.format(str(inner)))
@@ -268,7 +268,7 @@ def test_an_outer_launch_file_can_set_the_clock_of_all(
 
 
 @pytest.mark.ros
-def test_an_rviz_that_is_not_there_is_said_in_a_line_and_nothing_is_started(
+def test_missing_rviz_ends_the_launch_with_one_line(
         environment: dict[str, str], tmp_path: Path) -> None:
     from ament_index_python.packages import get_packages_with_prefixes
     if 'rviz2' in get_packages_with_prefixes():
@@ -301,7 +301,7 @@ def with_player(environment: dict[str, str], folder: Path, does: str) -> dict[st
 
 
 @pytest.mark.ros
-def test_a_replay_ends_where_its_player_fails_and_goes_on_where_it_is_done(
+def test_replay_launch_ends_if_the_player_fails(
         environment: dict[str, str], tmp_path: Path) -> None:
     for code, until in ((3, 'NEVER'), (0, 'queue policy')):
         place = tmp_path / str(code)

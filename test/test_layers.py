@@ -161,7 +161,7 @@ def test_who_misses_a_module_of_ros_is_told_the_package_that_package_xml_asks_fo
 def test_a_live_node_loads_nothing_that_reads_recordings_draws_or_fills_terminals() -> None:
     # Ubuntu has no rosbags: a robot is to do without.
     done = subprocess.run(
-        [sys.executable, '-c', 'import sys, djet_ros.live.graph_face, djet_ros.live.odometry_face;'
+        [sys.executable, '-c', 'import sys, djet_ros.live.graph_node, djet_ros.live.odometry_node;'
          'print(*{name.partition(".")[0] for name in sys.modules})'],
         capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())

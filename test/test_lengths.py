@@ -18,8 +18,8 @@ from djet_ros.lab.lengths import (
     step_squares,
 )
 from djet_ros.lab.store import RecordStore
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import Common
-from djet_ros.odometry.visual_odometry import OdometryResult
 import numpy as np
 from numpy.typing import NDArray
 import pytest

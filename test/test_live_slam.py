@@ -13,9 +13,9 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, pose_of
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import UNKNOWN_LENGTH_SIGMA
 from djet_ros.odometry.uncertainty import compose, UNKNOWN_MOTION
-from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.posegraph.step_messages import StepMessages
 import numpy as np
@@ -94,7 +94,7 @@ def take(taker, message):
 
 
 @pytest.mark.parametrize('convention', ['optical', 'body'])
-def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
+def test_step_is_the_motion_of_the_camera_in_optical_axes(convention):
     odometry, steps, motion = Odometry(convention), StepMessages(convention), pose(z=1.0, yaw=0.1)
     covariance = np.diag(np.arange(1.0, 7)**2) * 1e-6
     first, = told(steps, *odometry.start())
@@ -108,7 +108,7 @@ def test_a_step_is_the_motion_of_the_camera_along_its_optical_axes(convention):
 
 
 @pytest.mark.parametrize('convention', ['optical', 'body'])
-def test_of_a_vehicle_too_a_step_is_the_motion_of_the_camera(convention):
+def test_step_of_a_base_frame_is_the_motion_of_the_camera(convention):
     motion, covariance = pose(z=1.0, yaw=0.1), np.diag(np.arange(1.0, 7)**2) * 1e-6
     odometry = Odometry(convention, 'base_link', MOUNTING)
     steps = StepMessages(convention, 'base_link', MOUNTING)
@@ -119,7 +119,7 @@ def test_of_a_vehicle_too_a_step_is_the_motion_of_the_camera(convention):
     assert np.allclose(step.covariance, covariance, atol=2e-9)
 
 
-def test_an_odometry_of_something_else_is_refused_with_what_helps():
+def test_odometry_of_another_frame_is_refused_with_the_remedy():
     odometry, steps = Odometry('body', 'base_link', MOUNTING), StepMessages('body')
     told(steps, *odometry.start())
     with pytest.raises(DjetError, match="is of 'base_link', and not of 'camera_body'; give both "
@@ -127,7 +127,7 @@ def test_an_odometry_of_something_else_is_refused_with_what_helps():
         told(steps, *odometry.move(pose(z=1.0)))
 
 
-def test_it_does_not_matter_in_which_order_the_messages_of_a_frame_come():
+def test_messages_of_a_frame_may_arrive_in_any_order():
     odometry, steps = Odometry(), StepMessages('optical')
     told(steps, *odometry.start())
     for order in permutations(range(3)):
@@ -138,7 +138,7 @@ def test_it_does_not_matter_in_which_order_the_messages_of_a_frame_come():
     assert steps.missing == 0
 
 
-def test_whoever_comes_late_begins_where_the_odometry_is():
+def test_late_start_begins_at_the_current_pose_of_the_odometry():
     odometry, steps = Odometry(), StepMessages('optical')
     odometry.start()
     odometry.move(pose(z=3.0))
@@ -146,7 +146,7 @@ def test_whoever_comes_late_begins_where_the_odometry_is():
     assert first.pose[2, 3] == 4.0
 
 
-def test_while_the_camera_stands_motions_are_told_from_where_it_came_to_stand():
+def test_motions_of_a_stationary_camera_start_at_its_first_frame():
     odometry, steps = Odometry(), StepMessages('optical')
     _, reference = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     for _ in range(3):
@@ -159,7 +159,7 @@ def test_while_the_camera_stands_motions_are_told_from_where_it_came_to_stand():
     assert after.previous_stamp_ns == step.stamp_ns
 
 
-def test_nothing_is_known_of_a_motion_over_a_gap():
+def test_motion_over_a_gap_is_unknown():
     odometry, steps = Odometry(), StepMessages('optical')
     told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     odometry.lose_track()
@@ -170,7 +170,7 @@ def test_nothing_is_known_of_a_motion_over_a_gap():
     assert after.previous_stamp_ns == step.stamp_ns
 
 
-def test_after_the_odometry_had_lost_track_the_next_motion_is_from_a_frame_without_one():
+def test_motion_after_lost_tracking_starts_at_a_frame_without_a_motion():
     """That frame comes with it, as from results, or one more motion would be lost."""
     odometry, steps = Odometry(), StepMessages('optical')
     known = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
@@ -186,14 +186,14 @@ def test_after_the_odometry_had_lost_track_the_next_motion_is_from_a_frame_witho
 
 
 @pytest.mark.parametrize('convention', ['optical', 'body'])
-def test_a_step_says_how_sure_the_rotation_of_its_pose_is(convention):
+def test_step_has_the_rotation_covariance_of_its_pose(convention):
     odometry, steps = Odometry(convention), StepMessages(convention)
     told(steps, *odometry.start())
     step, = told(steps, *odometry.move(pose(z=1.0), np.diag(np.arange(1.0, 7)**2) * 1e-6))
     assert np.allclose(step.rotation_covariance, odometry.covariance[3:, 3:], atol=2e-9)
 
 
-def test_a_bad_frame_that_is_bridged_is_no_step():
+def test_bridged_failed_frame_is_not_a_step():
     odometry, steps = Odometry(), StepMessages('optical')
     *_, before = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     told(steps, *odometry.lose_track(bridged=True))
@@ -202,7 +202,7 @@ def test_a_bad_frame_that_is_bridged_is_no_step():
 
 
 @pytest.mark.parametrize('lost', [0, 1, 2])
-def test_a_message_that_never_came_leaves_a_hole_which_is_counted(lost):
+def test_lost_message_leaves_a_counted_gap(lost):
     odometry, steps = Odometry(), StepMessages('optical')
     told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     assert not told(steps, *np.delete(np.array(odometry.move(pose(z=2.0)), object), lost))
@@ -212,7 +212,7 @@ def test_a_message_that_never_came_leaves_a_hole_which_is_counted(lost):
     assert steps.missing == (lost != 2)
 
 
-def test_the_status_says_whether_a_length_is_known():
+def test_status_gives_the_kind_of_scale():
     odometry, steps = Odometry(), StepMessages('optical')
     told(steps, *odometry.start())
     for known in (True, False, True):
@@ -225,7 +225,7 @@ def test_the_status_says_whether_a_length_is_known():
     lambda message: setattr(message.status[0].values[0], 'value', 'FINE'),
     lambda message: setattr(message.status[0].values[1], 'value', 'long ago'),
     lambda message: setattr(message.status[0].values[-1], 'value', 'nan')])
-def test_a_status_of_another_kind_is_refused(spoil):
+def test_invalid_status_message_is_refused(spoil):
     odometry, steps = Odometry(), StepMessages('optical')
     status, _ = odometry.start()
     spoil(status)
@@ -318,7 +318,7 @@ class Drive:
                           for stamp, _ in pairs]) for poses in (self.told, dict(pairs))]
 
 
-def test_keyframes_of_a_live_map_are_without_the_residual_distortion(live):
+def test_live_keyframes_have_the_residual_distortion_corrected(live):
     gray, k1 = Cards().gray(REST), -0.05
     slam = live(with_values(FEW_FEATURES, {'odometry.residual_k1': k1}), message_type,
                 'image_rect')
@@ -328,7 +328,7 @@ def test_keyframes_of_a_live_map_are_without_the_residual_distortion(live):
     assert np.array_equal(slam._frame(START).gray, undone)
 
 
-def test_an_image_that_waits_is_seen_by_the_camera_that_took_it(live):
+def test_waiting_image_keeps_its_camera(live):
     """Whoever zooms in says so before the odometry of the last image has come."""
     slam = live(FEW_FEATURES, message_type, 'image_rect')
     early, wide, near = START - PERIOD, START, START + PERIOD
@@ -344,7 +344,7 @@ def test_an_image_that_waits_is_seen_by_the_camera_that_took_it(live):
     assert np.array_equal(slam._frame(early).K, zoomed)
 
 
-def test_keyframes_of_a_live_map_have_the_masks_of_their_images(live):
+def test_live_keyframes_have_the_masks_of_their_images(live):
     """One for all images, and one by its stamp."""
     still = np.zeros(SIZE[::-1], bool)
     still[200:] = True
@@ -366,7 +366,7 @@ def driven(live):
     return drive
 
 
-def test_closing_a_loop_takes_the_drift_away(driven):
+def test_loop_closure_removes_drift(driven):
     before, after = driven.errors()
     assert before.max() > 0.12
     assert after.max() < before.max() / 2
@@ -375,7 +375,7 @@ def test_closing_a_loop_takes_the_drift_away(driven):
     assert driven.said['state'] == 'mapping'
 
 
-def test_map_to_odom_and_odom_to_camera_make_the_optimised_pose(driven):
+def test_map_to_odom_and_odom_to_camera_compose_to_the_optimised_pose(driven):
     """As in REP 105: only the odometry publishes the camera in the odometry frame."""
     optimised = dict(pose_of(one) for one in driven.path.poses)
     newest = max(optimised)
@@ -399,7 +399,7 @@ def test_the_messages_name_their_frames_and_carry_the_stamps_of_the_images(live)
     assert [pose_of(one)[0] for one in outgoing['path'].poses] == [START, START + PERIOD]
 
 
-def test_with_body_axes_the_map_is_the_same_along_other_axes(live, driven):
+def test_map_with_body_axes_is_the_same_in_other_axes(live, driven):
     drive = Drive(live, from_flat({'estimator.max_features': 800,
                                    'odometry.frame_convention': 'body'}))
     drive.to_and_fro()
@@ -412,7 +412,7 @@ def test_with_body_axes_the_map_is_the_same_along_other_axes(live, driven):
     assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
 
 
-def test_with_a_base_frame_the_map_is_that_of_the_vehicle_once_tf_knows_the_mounting(live, driven):
+def test_map_is_of_the_base_frame_once_tf_has_the_mounting(live, driven):
     drive = Drive(live, from_flat({'estimator.max_features': 800,
                                    'odometry.base_frame': 'base_link'}))
     frames = {('base_link', 'camera'): MOUNTING}
@@ -431,7 +431,7 @@ def test_with_a_base_frame_the_map_is_that_of_the_vehicle_once_tf_knows_the_moun
     assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
 
 
-def test_an_odometry_that_begins_anew_is_put_where_it_was_and_then_where_it_belongs(live):
+def test_odometry_reset_continues_at_the_last_pose_until_a_loop_corrects_it(live):
     """After a reset of vo_node: another odometry frame, and a motion of which nothing is known."""
     drive = Drive(live, drift=0.0)
     drive.start()
@@ -450,7 +450,7 @@ def test_an_odometry_that_begins_anew_is_put_where_it_was_and_then_where_it_belo
     assert after.max() < 0.1
 
 
-def test_a_step_back_in_time_begins_everything_anew(live):
+def test_step_back_in_time_starts_a_new_map(live):
     drive = Drive(live)
     drive.start()
     drive.go(pose(x=1.0))
@@ -466,7 +466,7 @@ def in_memory(kind):
     return sum(type(one) is kind for one in gc.get_objects())
 
 
-def test_the_memory_is_bounded(live):
+def test_map_memory_is_bounded(live):
     image_type = message_type('sensor_msgs/msg/Image')
     frames, messages = in_memory(Frame), in_memory(image_type)
     drive = Drive(live, slam=replace(QUICK, max_keyframes=7, image_buffer=3))
@@ -486,7 +486,7 @@ def test_the_memory_is_bounded(live):
 
 
 @pytest.mark.parametrize(('source', 'target'), [(0, 2), (2, 0)])
-def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target):
+def test_edges_of_a_removed_keyframe_are_transferred_to_its_successor(live, source, target):
     """With the forgotten one held relative to its heir, an edge costs what it cost before."""
     from djet_ros.posegraph.backend import factor_graph, initial_values
     from djet_ros.posegraph.keyframe_map import transferred
@@ -506,7 +506,7 @@ def test_what_a_forgotten_keyframe_told_is_told_by_its_heir(live, source, target
         assert costs[1] == pytest.approx(costs[0], rel=0.01)
 
 
-def test_without_a_scale_the_map_keeps_the_units_of_the_odometry(live):
+def test_map_of_unknown_scale_keeps_the_units_of_the_odometry(live):
     """Directions are corrected; lengths change, but no motion is reversed."""
     drive = Drive(live)
     move = drive.odometry.move
@@ -529,7 +529,7 @@ def test_without_a_scale_the_map_keeps_the_units_of_the_odometry(live):
         assert 0.3 < np.linalg.norm(ours) / np.linalg.norm(theirs) < 3
 
 
-def test_a_turn_on_the_spot_without_a_scale_leads_nowhere_else(live):
+def test_rotation_in_place_with_unknown_scale_does_not_translate(live):
     """Its way is unknown, but is no more than a step."""
     drive = Drive(live, drift=0.0)
     drive.start()
@@ -541,7 +541,7 @@ def test_a_turn_on_the_spot_without_a_scale_leads_nowhere_else(live):
     assert np.allclose(edge.covariance, np.diag([1, 1, 1, *SIGMAS[3:]**2]), atol=2e-9)
 
 
-def test_while_the_camera_stands_nothing_becomes_less_sure(live):
+def test_covariance_does_not_grow_while_stationary(live):
     drive = Drive(live, drift=0.0)
     drive.start()
     for _ in range(10):
@@ -553,7 +553,7 @@ def test_while_the_camera_stands_nothing_becomes_less_sure(live):
 
 @pytest.mark.parametrize(('told', 'believed', 'kept'), [
     (0.05, 0.05, 0.02), (0.01, 0.01, 0.01), (0.05, 0.5, 0.02), (0.1, 0.05, 0.0889)])
-def test_an_error_common_to_all_lengths_bends_no_loop(live, told, believed, kept):
+def test_common_length_error_does_not_distort_a_loop(live, told, believed, kept):
     """Shares of the length: as the odometry says, as the parameter has it, and in the map."""
     config = from_flat({'estimator.max_features': 800, 'odometry.scale_uncertainty': believed})
     drive = Drive(live, config, drift=0.0)
@@ -566,7 +566,7 @@ def test_an_error_common_to_all_lengths_bends_no_loop(live, told, believed, kept
     assert np.sqrt(edge.covariance[0, 0]) / 2.0 == pytest.approx(kept, rel=1e-3)
 
 
-def test_only_a_frame_whose_image_is_there_becomes_a_keyframe(live):
+def test_keyframe_needs_its_image(live):
     drive = Drive(live)
     drive.start()
     drive.go(pose(x=0.6), seen=False)
@@ -577,7 +577,7 @@ def test_only_a_frame_whose_image_is_there_becomes_a_keyframe(live):
     assert np.allclose(edge.motion, np.linalg.inv(drive.told[START]) @ drive.odometry.here)
 
 
-def test_diagnostics_come_once_a_second_and_when_the_state_changes(live):
+def test_diagnostics_once_a_second_and_at_state_changes(live):
     drive = Drive(live)
     times = []
     for i in range(25):
@@ -589,7 +589,7 @@ def test_diagnostics_come_once_a_second_and_when_the_state_changes(live):
     assert times == [0.0, 1.0, 2.0]
 
 
-def test_it_says_what_it_waits_for(live):
+def test_diagnostics_say_what_is_missing(live):
     slam = live(Config(slam=QUICK), message_type)
     assert slam.state == ('WARN', 'waiting for odometry')
     odometry = Odometry()
@@ -602,7 +602,7 @@ def test_it_says_what_it_waits_for(live):
     assert slam.state == ('WARN', 'waiting for the images of the odometry')
 
 
-def test_messages_that_say_nothing_are_counted_and_named_and_leave_a_hole(live):
+def test_invalid_messages_are_counted_and_named_and_leave_a_gap(live):
     drive = Drive(live)
     drive.start()
     relative, status, odometry = drive.odometry.move(pose(x=1.0))

@@ -34,7 +34,7 @@ def block(tmp_path_factory):
 
 
 @pytest.mark.parametrize('keyframes', ['distance', 'odometry'])
-def test_closing_the_loop_halves_the_trajectory_error(block, tmp_path, keyframes):
+def test_loop_closure_halves_the_trajectory_error(block, tmp_path, keyframes):
     done = subprocess.run(
         [*DJET, 'slam', block, '--output', tmp_path / 'slam',
          '--keyframes', keyframes, '--scale', 'ground_truth', '--scale-uncertainty', '0.01'],
@@ -58,7 +58,7 @@ def test_closing_the_loop_halves_the_trajectory_error(block, tmp_path, keyframes
         assert after['evo_rpe_m'] < np.hypot(before['evo_rpe_m'], 0.01 * step)
 
 
-def test_live_it_shrinks_by_a_factor_too(block):
+def test_live_loop_closure_reduces_the_trajectory_error(block):
     """With every second image: what is live may be slower than the camera."""
     from djet_ros.posegraph.live_slam import LiveSlam
     config = from_flat({'odometry.scale': 'ground_truth', 'odometry.scale_uncertainty': 0.01,

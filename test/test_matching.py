@@ -10,7 +10,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.matching import match_predicted, match_widely
-from djet_ros.core.starts import Known
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, RelativePose, Status, View
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_corners_are_tracked_to_a_tenth_of_a_pixel():
     there = cv2.perspectiveTransform(previous.features.points[None], H)[0]
     seen = ((there > 20) & (there < np.array(SIZE) - 20)).all(1)
     for view in (current, replace(current, features=some(current.features, slice(0, 0)))):
-        x, y = match_widely(previous, view, None, Known(), 0.15)
+        x, y = match_widely(previous, view, None, KnownMotion(), 0.15)
         assert len(x) > 0.9 * seen.sum()
         assert np.median(misses(H, x, y)) < 0.1
         assert np.quantile(misses(H, x, y), 0.95) < 0.3
@@ -49,7 +49,7 @@ def test_corners_are_tracked_to_a_tenth_of_a_pixel():
 def test_the_most_similar_matches_come_first():
     previous, current, _ = turned_views(600)
     bits = match_distances(previous.smoothed, (matches := match_widely(
-        previous, current, None, Known(), 0.15)).x, current.smoothed, matches.y)
+        previous, current, None, KnownMotion(), 0.15)).x, current.smoothed, matches.y)
     assert (np.diff(bits) >= 0).all()
 
 
@@ -57,12 +57,12 @@ def test_corners_are_matched_by_descriptors_if_the_lighting_changes():
     previous, current, H = turned_views(600)
     darker = TwoViewEstimator(EstimatorConfig(max_features=600)).view(
         cv2.convertScaleAbs(current.gray, alpha=0.5), K)
-    x, y = match_widely(previous, darker, None, Known(), 0.15)
+    x, y = match_widely(previous, darker, None, KnownMotion(), 0.15)
     assert len(x) > 0.25 * len(previous.features)
     # As accurate as the corners.
     assert np.median(misses(H, x, y)) < 0.7
     lost, _ = match_widely(previous, replace(darker, features=some(darker.features, slice(0, 0))),
-                           None, Known(), 0.15)
+                           None, KnownMotion(), 0.15)
     assert len(lost) < 0.5 * len(x)
 
 
@@ -74,7 +74,7 @@ def test_the_more_similar_of_two_places_is_kept():
     wall[:, 180:220] = textured(rng, (40, 300))
     estimator = TwoViewEstimator(EstimatorConfig(max_features=600))
     previous, current = estimator.view(wall, K), estimator.view(np.roll(wall, 16, axis=1), K)
-    x, y = match_widely(previous, current, None, Known(), 0.15)
+    x, y = match_widely(previous, current, None, KnownMotion(), 0.15)
     special = np.abs(x[:, 0] - 200) < 15
     assert special.sum() > 20
     assert np.median(np.abs((y - x)[special] - (16, 0)).sum(1)) < 0.2
@@ -88,7 +88,7 @@ def test_nothing_is_tracked_into_an_unrelated_image(what: str):
              else rng.integers(0, 256, current.gray.shape).astype(np.uint8))
     none = some(current.features, np.zeros(len(current.features), bool))
     view = replace(TwoViewEstimator().view(other, K), features=none)
-    x, _ = match_widely(previous, view, None, Known(), 0.15)
+    x, _ = match_widely(previous, view, None, KnownMotion(), 0.15)
     assert len(x) < 0.05 * len(previous.features)
 
 
@@ -96,7 +96,7 @@ def test_no_features_give_no_matches():
     previous, current, _ = turned_views(200)
     none = replace(previous, features=some(
         previous.features, np.zeros(len(previous.features), bool)))
-    x, y = match_widely(none, current, None, Known(), 0.15)
+    x, y = match_widely(none, current, None, KnownMotion(), 0.15)
     assert x.shape == y.shape == (0, 2)
 
 
@@ -108,7 +108,7 @@ def test_the_required_number_of_matches_scales_with_the_features(more: int) -> N
     places = np.tile(previous.features.points, (more, 1))
     before = RelativePose(Status.OK, R=rotation_exp(TURN), x=places, y=places, y_opt=places,
                           inliers=np.ones(more * count, bool), sought=more * count)
-    assert match_predicted(previous, current, before, Known(), 0.15) is not None
+    assert match_predicted(previous, current, before, KnownMotion(), 0.15) is not None
     # With a third as many features in the previous pair, three times as many are expected.
-    assert match_predicted(previous, current, replace(before, sought=count // 3), Known(),
+    assert match_predicted(previous, current, replace(before, sought=count // 3), KnownMotion(),
                            0.15) is None

@@ -13,7 +13,7 @@ from djet_ros.odometry.messages import (
     stamp_ns,
     twist,
 )
-from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult
+from djet_ros.odometry.result import camera_motion, OdometryResult
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -118,7 +118,7 @@ def test_body_axes_are_forward_left_up_at_both_ends_of_a_pose(family):
     assert np.allclose(np.diag(np.reshape(message.pose.covariance, (6, 6))), [3, 1, 2, 6, 4, 5])
 
 
-def test_as_it_stands_whoever_drives_ahead_goes_along_x_and_stays_level(family):
+def test_by_default_driving_ahead_is_along_x_and_level(family):
     ahead = np.eye(4)
     # a camera that looks ahead, after 2 m and a turn to the left
     ahead[:3, :3], ahead[:3, 3] = rotation_exp(np.array([0, -0.1, 0])), (0.0, 0.0, 2.0)
@@ -135,7 +135,7 @@ def test_as_it_stands_whoever_drives_ahead_goes_along_x_and_stays_level(family):
     ({}, 'cam_optical_frame', [0, 0, 1]),
     ({'camera_frame': 'mine'}, 'mine', [1, 0, 0]),
     ({'camera_frame': 'mine', 'frame_convention': 'optical'}, 'mine', [0, 0, 1])])
-def test_the_mounting_is_asked_of_a_frame_along_the_axes_that_it_has(config, frame, ahead):
+def test_the_mounting_is_looked_up_for_a_frame_with_its_own_axes(config, frame, ahead):
     name, axes = mounted_frame(OdometryConfig(**config), 'cam_optical_frame')
     assert name == frame
     assert np.allclose(axes[:3, :3] @ [0, 0, 1], ahead)

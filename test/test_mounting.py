@@ -80,7 +80,7 @@ def test_a_frame_is_found_along_the_tree_upwards_and_downwards():
     assert np.array_equal(told(('base', 'cam', AHEAD)).transform('base', 'cam'), AHEAD)
 
 
-def test_who_is_told_last_counts_and_nonsense_does_no_harm():
+def test_the_last_transform_counts_and_invalid_ones_are_ignored():
     nonsense = MAKE.frame(0, 'base', 'cam', np.eye(4))
     nonsense.transforms[0].transform.rotation.w = 0.0
     frames = told(('base', 'cam', np.eye(4)), ('base', 'cam', AHEAD), ('a', 'b', np.eye(4)),

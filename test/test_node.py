@@ -157,7 +157,7 @@ def filmed(images: list[Any], folder: Path) -> FrameSequence:
 
 @pytest.mark.parametrize(('base_frame', 'imu'), [
     ('', False), ('base_link', False), ('', True)], ids=['camera', 'base_frame', 'imu'])
-def test_a_bag_played_live_gives_the_poses_of_djet_replay_to_the_last_bit(
+def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         node, publisher, subscriber, drive, tmp_path, base_frame, imu):
     if base_frame or imu:
         pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
@@ -217,12 +217,12 @@ def test_only_the_images_need_a_name(node, publisher, subscriber, drive):
                       '/robot/left/camera_info')
 
 
-def test_a_camera_info_that_is_named_as_it_would_be_anyway_is_heard_there(node):
+def test_remapping_of_camera_info_to_its_default_name_is_respected(node):
     one = node('-r', 'image:=/front/image_raw', '-r', 'camera_info:=/camera_info', **FAST)
     wait_for_log(one, 'images from /front/image_raw, camera_info from /camera_info')
 
 
-def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
+def test_missing_inputs_are_logged_with_their_resolved_names(node, publisher, drive):
     one = node('-r', 'camera_info:=/elsewhere/info', **FAST)
     # Its own debug_image is an image, too, and not meant.
     for what, topic in (('image', IMAGE), ('camera_info', '/elsewhere/info')):
@@ -234,14 +234,14 @@ def test_what_is_missing_is_said_with_its_resolved_name(node, publisher, drive):
 
 
 @pytest.mark.parametrize('case', SEEN)
-def test_what_is_seen_instead_is_said_with_the_remedy(node, publisher, case):
+def test_missing_input_is_logged_with_a_likely_topic_or_parameter(node, publisher, case):
     topic, kind, line = SEEN[case]
     one = node(**FAST)
     publisher.advertise(topic, kind, listeners=0)
     wait_for_log(one, line)
 
 
-def test_a_latched_camera_info_from_before_the_node_is_heard(
+def test_latched_camera_info_from_before_the_start_is_received(
         node, publisher, subscriber, drive):
     publisher.advertise(INFO, INFO_TYPE, listeners=0, durability='transient_local', depth=1)
     publisher.send(INFO, camera_info(K, SIZE))
@@ -252,7 +252,7 @@ def test_a_latched_camera_info_from_before_the_node_is_heard(
     subscriber.wait('a pair', paired(2))
 
 
-def test_a_late_camera_info_and_then_a_periodic_one(node, publisher, subscriber, drive):
+def test_late_and_periodic_camera_info(node, publisher, subscriber, drive):
     node(**EVERY)
     publisher.advertise(INFO, INFO_TYPE)
     publisher.advertise(IMAGE, IMAGE_TYPE)
@@ -270,7 +270,7 @@ def test_a_late_camera_info_and_then_a_periodic_one(node, publisher, subscriber,
     assert 'status: SIZE_CHANGED' not in last
 
 
-def test_camera_and_camera_info_may_be_killed_and_come_again(
+def test_camera_driver_may_be_restarted(
         node, publisher, subscriber, drive):
     one = node(**EVERY)
     for i, victim in enumerate((publisher, Peer('camera_driver'))):
@@ -305,7 +305,7 @@ def test_compressed_images_are_tracked(node, publisher, subscriber, drive):
     subscriber.wait('a pair', paired(2))
 
 
-def test_a_camera_that_sends_with_best_effort_is_heard(node, publisher, subscriber, drive):
+def test_best_effort_camera_is_received(node, publisher, subscriber, drive):
     node(**FAST)
     camera(publisher, reliability='best_effort')
     play(publisher, drive[:4], pause=0.3)
@@ -316,7 +316,7 @@ def test_a_camera_that_sends_with_best_effort_is_heard(node, publisher, subscrib
     ({**FAST, f'qos_overrides.{IMAGE}.subscription.reliability': 'reliable'},
      'ros.qos_reliability to best_effort'),
     (EVERY, 'ros.queue_policy to latest')], ids=['override', 'every'])
-def test_a_qos_that_does_not_fit_is_said_with_both_sides(
+def test_incompatible_qos_is_logged_with_both_profiles(
         node, publisher, subscriber, drive, parameters, remedy):
     one = node(**parameters)
     publisher.advertise(IMAGE, IMAGE_TYPE, listeners=0, reliability='best_effort')
@@ -341,7 +341,7 @@ BAD_IMAGES = {
 }
 
 
-def test_each_bad_image_is_said_once_and_the_next_good_pair_is_tracked(
+def test_bad_image_is_logged_once_and_tracking_continues(
         node, publisher, subscriber, drive):
     one = node(**EVERY)
     camera(publisher)
@@ -362,7 +362,7 @@ def test_each_bad_image_is_said_once_and_the_next_good_pair_is_tracked(
         assert one.log.count(f'message rejected: {reason}: ') == 1
 
 
-def test_black_and_noisy_images_end_in_lost_and_good_ones_end_that(
+def test_black_images_lead_to_lost_and_good_ones_recover(
         node, publisher, subscriber, drive):
     node(**EVERY)
     camera(publisher)
@@ -373,7 +373,7 @@ def test_black_and_noisy_images_end_in_lost_and_good_ones_end_that(
     subscriber.wait('a pair', paired(7))
 
 
-def test_bad_camera_infos_are_said_and_a_good_one_ends_that(
+def test_bad_camera_info_is_reported_until_a_good_one_arrives(
         node, publisher, subscriber, drive):
     one = node(**EVERY)
     publisher.advertise(INFO, INFO_TYPE)
@@ -402,7 +402,7 @@ def test_bad_camera_infos_are_said_and_a_good_one_ends_that(
 
 # Time
 
-def test_a_bag_that_loops_begins_anew(node, publisher, subscriber, drive):
+def test_looping_bag_resets_the_odometry(node, publisher, subscriber, drive):
     node(**EVERY)
     camera(publisher)
     play(publisher, drive[:8])
@@ -413,7 +413,7 @@ def test_a_bag_that_loops_begins_anew(node, publisher, subscriber, drive):
     assert said('restarted: TIME_JUMP')(subscriber.heard)
 
 
-def test_a_late_image_leaves_the_odometry_where_it_is(node, publisher, subscriber, drive):
+def test_late_image_does_not_reset_the_odometry(node, publisher, subscriber, drive):
     one = node(**EVERY)
     camera(publisher)
     play(publisher, drive[:6])
@@ -426,7 +426,7 @@ def test_a_late_image_leaves_the_odometry_where_it_is(node, publisher, subscribe
     assert 'restarted' not in one.log
 
 
-def test_a_camera_that_stamps_nothing_is_said(node, publisher, subscriber, drive):
+def test_camera_with_zero_stamps_is_reported(node, publisher, subscriber, drive):
     one = node(**EVERY)
     camera(publisher)
     for gray in drive:
@@ -436,7 +436,7 @@ def test_a_camera_that_stamps_nothing_is_said(node, publisher, subscriber, drive
     wait_for_log(one, 'stamps stand still: ')
 
 
-def test_stamps_are_the_images_and_diagnostics_follow_simulated_time(
+def test_messages_have_image_stamps_and_diagnostics_simulated_time(
         node, publisher, subscriber, drive):
     node(**EVERY, use_sim_time=True)
     publisher.advertise('/clock', 'rosgraph_msgs/msg/Clock')
@@ -476,7 +476,7 @@ def test_pause_and_resume(node, publisher, subscriber, drive):
     assert last['frames dropped: paused'] == '3'
 
 
-def test_a_reset_in_mid_stream_forgets_everything(node, publisher, subscriber, drive):
+def test_reset_during_a_stream_discards_everything(node, publisher, subscriber, drive):
     node(**EVERY)
     camera(publisher)
     play(publisher, drive[:6])
@@ -496,7 +496,7 @@ def test_a_reset_in_mid_stream_forgets_everything(node, publisher, subscriber, d
 
 # Parameters
 
-def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
+def test_parameters_from_file_and_command_line(
         node, publisher, tmp_path):
     path = tmp_path / 'own.yaml'
     path.write_text('vo_node: {ros__parameters: {preset: paper, odometry: {max_gap: 3, '
@@ -515,7 +515,7 @@ def test_parameters_come_from_file_and_command_line_with_integers_for_floats(
     assert 'so it is ignored' not in one.log
 
 
-def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
+def test_parameter_file_for_other_nodes_gives_a_warning(tmp_path):
     path = tmp_path / 'own.yaml'
     path.write_text('vo_node: {ros__parameters: {odometry: {max_gap: 3}}}')
     with nodes(tmp_path, IMAGE) as start:
@@ -525,7 +525,7 @@ def test_a_file_of_parameters_for_other_nodes_alone_is_said(tmp_path):
                           'nodes')
 
 
-def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
+def test_parameter_change_is_applied_or_rejected_with_the_reason(
         node, publisher, subscriber, drive):
     node(**EVERY)
     camera(publisher)
@@ -558,7 +558,7 @@ def test_a_change_is_applied_between_frames_or_refused_with_the_reason(
 @pytest.mark.parametrize(('values', 'topic'), [
     ({'ros.publish_path': True}, f'{NODE}/path.publisher'),
     ({'odometry.mask': True}, '/mask.subscription')])
-def test_a_topic_that_can_not_be_had_is_refused_each_time_and_the_node_works_on(
+def test_topic_that_cannot_be_created_is_rejected_and_the_node_continues(
         node, publisher, subscriber, drive, values, topic):
     node('-p', f'qos_overrides.{topic}.reliability:=perhaps', **EVERY)
     camera(publisher)
@@ -575,7 +575,7 @@ def test_a_topic_that_can_not_be_had_is_refused_each_time_and_the_node_works_on(
     ({'odometry.imu': True}, 'odometry.imu is true without an odometry.imu_rotation'),
     ({'odometry.guess': True}, 'odometry.guess is true'),
     ({'odometry.scale': 'guess'}, 'odometry.scale is guess')])
-def test_what_needs_a_module_that_is_not_there_is_refused_and_the_node_works_on(
+def test_parameter_that_needs_a_missing_module_is_rejected(
         node, publisher, subscriber, drive, values, asks):
     one = node(before='import sys; sys.modules["tf2_ros"] = None; ', **EVERY)
     camera(publisher)
@@ -588,7 +588,7 @@ def test_what_needs_a_module_that_is_not_there_is_refused_and_the_node_works_on(
     assert one.process.poll() is None
 
 
-def test_the_start_is_refused_in_one_line_where_a_module_is_not_there(tmp_path):
+def test_missing_module_prevents_the_start_with_one_line(tmp_path):
     done = subprocess.run(
         [*command('vo_node', 'import sys; sys.modules["tf2_ros"] = None; '), '--ros-args',
          '-p', 'odometry.base_frame:=base_link'], env=ENVIRONMENT, capture_output=True,
@@ -599,7 +599,7 @@ def test_the_start_is_refused_in_one_line_where_a_module_is_not_there(tmp_path):
                            'Python module tf2_ros: ')
 
 
-def test_a_scale_at_run_time_needs_its_length_first(node, publisher):
+def test_scale_change_at_run_time_requires_its_length(node, publisher):
     node()
     for given, taken in (({'odometry.scale': 'camera_height'}, False),
                          ({'odometry.camera_height': 1.65}, True),
@@ -612,7 +612,7 @@ def test_a_scale_at_run_time_needs_its_length_first(node, publisher):
         'odometry.scale', 'odometry.camera_height']) == ['camera_height', 1.65]
 
 
-def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
+def test_preset_change_at_run_time_sets_the_estimator(node, publisher):
     node()
     answers = publisher.ask('configure', node=NODE, values={'preset': 'paper'})
     assert answers == [[True, '']]
@@ -620,7 +620,7 @@ def test_a_preset_at_run_time_sets_the_estimator(node, publisher):
         'paper', 'five_point']
 
 
-def test_what_was_dumped_is_loaded_as_it_was(node, publisher):
+def test_param_dump_and_load_round_trip(node, publisher):
     node()
     features = 'estimator.max_features'
     # in the order of ros2 param load, which sets them one by one
@@ -650,7 +650,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-p', 'qos_overrides./image.subscription.depth:=many'],
      "{'subscription.depth': 'many'"),
 ])
-def test_what_the_user_can_mend_ends_it_with_one_line_and_code_2(tmp_path, words, reason):
+def test_user_error_ends_the_node_with_one_line_and_exit_code_2(tmp_path, words, reason):
     (tmp_path / 'broken.yaml').write_text(BROKEN_YAML)
     done = subprocess.run([*command('vo_node'), '--ros-args', *words], env=ENVIRONMENT,
                           capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
@@ -664,7 +664,7 @@ def test_what_the_user_can_mend_ends_it_with_one_line_and_code_2(tmp_path, words
     ('ROS_DOMAIN_ID', 'abc', 'ROS_DOMAIN_ID is not an integral number'),
     ('CYCLONEDDS_URI', '<bad', 'error creating node; check'),
     ('ROS_LOG_DIR', '/proc/none', "log directory '/proc/none'")])
-def test_a_fault_of_the_environment_is_not_blamed_on_the_command_line(variable, value, reason):
+def test_environment_error_is_not_reported_as_command_line_error(variable, value, reason):
     if variable == 'CYCLONEDDS_URI' and 'cyclone' not in ENVIRONMENT.get('RMW_IMPLEMENTATION', ''):
         pytest.skip('another middleware')
     done = subprocess.run(command('vo_node'), env={**ENVIRONMENT, variable: value},
@@ -679,7 +679,7 @@ def test_a_fault_of_the_environment_is_not_blamed_on_the_command_line(variable, 
 
 # Outputs on demand
 
-def test_path_transform_and_debug_image_come_on_demand(
+def test_path_tf_and_debug_image_are_published_on_demand(
         node, publisher, subscriber, drive):
     node(**EVERY, **{'ros.publish_path': True, 'ros.path_period': 0.0,
                      'ros.publish_tf': True})
@@ -706,7 +706,7 @@ def test_path_transform_and_debug_image_come_on_demand(
     viewer.close()
 
 
-def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_parent(
+def test_odometry_is_of_the_base_frame_and_the_camera_keeps_its_tf_parent(
         node, publisher, subscriber, drive):
     pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     one = node(**EVERY, **{'odometry.base_frame': 'base_link', 'ros.publish_tf': True})
@@ -740,7 +740,7 @@ def test_with_a_base_frame_the_vehicle_moves_in_odom_and_the_camera_keeps_its_pa
     listener.close()
 
 
-def test_speeds_on_the_graph_give_the_length(node, publisher, subscriber, drive):
+def test_speed_topic_gives_the_length(node, publisher, subscriber, drive):
     node('-r', 'speed_odometry:=/wheels/odom', **EVERY, **{'odometry.scale': 'speed'})
     camera(publisher)
     publisher.advertise('/wheels/odom', TYPES[f'{NODE}/odometry'])
@@ -777,7 +777,7 @@ def test_every_image_is_accounted_for_under_load(node, publisher, subscriber, dr
     assert int(last['frames processed']) + int(last['frames dropped']) == 48
 
 
-def test_what_comes_beyond_the_room_is_dropped_counted_and_complained_of(
+def test_images_beyond_the_queue_limit_are_dropped_and_reported(
         node, publisher, subscriber, drive):
     room, sent = 10 * drive[0].nbytes, 60
     node(before=f'from djet_ros.live import session; session.MAX_QUEUE_BYTES = {room}; ',
@@ -798,7 +798,7 @@ def test_what_comes_beyond_the_room_is_dropped_counted_and_complained_of(
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('policy', ['latest', 'every'])
-def test_a_signal_in_mid_stream_ends_it_cleanly_within_a_second(
+def test_signal_during_a_stream_ends_the_node_within_a_second(
         node, publisher, subscriber, drive, number, policy):
     one = node(**FAST, **{'ros.queue_policy': policy, 'ros.queue_size': 1})
     camera(publisher)

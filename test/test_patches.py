@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.patches import expect, place_exactly
+from djet_ros.core.patches import align_patches, templates
 import numpy as np
 import pytest
 
@@ -51,7 +51,7 @@ def test_warped_patches_are_aligned_to_a_fiftieth_of_a_pixel(
     there, here = image(np.eye(2), np.zeros(2)), image(warp, shift)
     true = seen(warp, shift, points)
     near = true + np.random.default_rng(2).uniform(-0.3, 0.3, true.shape)
-    found = place_exactly(there, here, points, near, as_seen(warp, len(points))).places
+    found = align_patches(there, here, points, near, as_seen(warp, len(points))).places
     off = np.linalg.norm(found - true, axis=1)
     assert np.median(off) < 0.02
     assert np.quantile(off, 0.95) < 0.06
@@ -62,9 +62,9 @@ def test_templates_of_two_images_in_one_pass_equal_those_of_each(
     images = [image(warp, np.zeros(2)).astype(np.float32)
               for warp in (WARPS['none'], WARPS['a roll'])]
     warps = as_seen(WARPS['larger'], len(points))
-    together = expect([(images[0], 100), (images[1], len(points) - 100)], points, warps)
+    together = templates([(images[0], 100), (images[1], len(points) - 100)], points, warps)
     for there, some in zip(images, (slice(100), slice(100, None))):
-        alone = expect([(there, len(points[some]))], points[some], warps[some])
+        alone = templates([(there, len(points[some]))], points[some], warps[some])
         np.testing.assert_allclose(together.gray[:, some], alone.gray, atol=1e-3)
         np.testing.assert_allclose(together.inverses[some], alone.inverses, rtol=1e-3)
 
@@ -74,26 +74,26 @@ def test_the_flow_is_biased_where_the_image_grows(points: np.ndarray) -> None:
     warp = WARPS['a road']
     there, here = image(np.eye(2), np.zeros(2)), image(warp, np.zeros(2))
     true = seen(warp, np.zeros(2), points)
-    as_a_whole = place_exactly(there, here, points, true, as_seen(np.eye(2), len(points))).places
+    as_a_whole = align_patches(there, here, points, true, as_seen(np.eye(2), len(points))).places
     assert np.median(np.linalg.norm(as_a_whole - true, axis=1)) > 0.1
 
 
 def test_haze_does_not_bias_the_alignment(points: np.ndarray) -> None:
     there = image(np.eye(2), np.zeros(2))
     hazy = (there * 0.8 + 40).astype(np.uint8)
-    found = place_exactly(there, hazy, points, points, as_seen(np.eye(2), len(points))).places
+    found = align_patches(there, hazy, points, points, as_seen(np.eye(2), len(points))).places
     assert np.median(np.linalg.norm(found - points, axis=1)) < 0.02
 
 
 def test_patches_that_would_move_far_or_are_at_the_border_stay(points: np.ndarray) -> None:
     there, here = image(np.eye(2), np.zeros(2)), image(np.eye(2), np.array([4.0, 0.0]))
     eye = as_seen(np.eye(2), len(points))
-    found = place_exactly(there, here, points, points, eye).places
+    found = align_patches(there, here, points, points, eye).places
     assert (np.abs(found - points).max(1) < 1).all()
     border = points * 0 + [3.0, 150.0]
-    assert (place_exactly(there, here, border, border, eye).places == border).all()
+    assert (align_patches(there, here, border, border, eye).places == border).all()
     flat = np.full_like(there, 90)
-    assert (place_exactly(flat, flat, points, points, eye).places == points).all()
+    assert (align_patches(flat, flat, points, points, eye).places == points).all()
 
 
 def test_errors_are_proportional_to_covariances_over_the_image(points: np.ndarray) -> None:
@@ -103,7 +103,7 @@ def test_errors_are_proportional_to_covariances_over_the_image(points: np.ndarra
     there[:, 200:] = there[120, 200:] + 0.2 * (there[:, 200:] - there[120, 200:])
     here = there + np.random.default_rng(3).normal(size=there.shape) * np.linspace(1, 6, SIZE[0])
     there, here = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (there, here))
-    found, covariances = place_exactly(there, here, points, points,
+    found, covariances = align_patches(there, here, points, points,
                                        as_seen(np.eye(2), len(points)))
     told = (found != points).any(1) & (np.abs(points[:, 0] - 200) > 10)
     assert told.mean() > 0.9
@@ -122,7 +122,7 @@ def test_a_patch_without_gradient_is_undetermined(points: np.ndarray) -> None:
     flat = np.full(SIZE[::-1], 90, np.uint8)
     there = image(np.eye(2), np.zeros(2))
     eye = as_seen(np.eye(2), len(points))
-    told, untold = (place_exactly(one, one, points, points, eye).covariances[:, 0, 0]
+    told, untold = (align_patches(one, one, points, points, eye).covariances[:, 0, 0]
                     for one in (there, flat))
     assert untold.min() > 1e3 * told.max()
 
@@ -136,6 +136,6 @@ def test_threads_change_nothing(points: np.ndarray) -> None:
     results = []
     for threads in (1, 2):
         cv2.setNumThreads(threads)
-        results.append(place_exactly(there, here, many, true, warp).places)
+        results.append(align_patches(there, here, many, true, warp).places)
     cv2.setNumThreads(before)
     assert (results[0] == results[1]).all()

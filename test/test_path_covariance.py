@@ -11,7 +11,7 @@ from djet_ros.odometry.uncertainty import (
     _CORRELATED,
     _PERSISTENCE,
     compose,
-    in_a_chain,
+    inflated_for_chain,
     PathCovariance,
 )
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -57,7 +57,7 @@ def same(one, other):
     assert ratios == pytest.approx(np.ones(6), abs=0.15)
 
 
-def test_a_scale_that_wanders_and_is_measured_again_swings_the_whole_way():
+def test_a_drifting_and_remeasured_scale_has_a_consistent_covariance():
     rng = np.random.default_rng(0)
     factor, share = np.zeros(SAMPLES), rng.normal(0, 0.02, SAMPLES)
     variance, scales, commons = 0.0, [], []
@@ -71,7 +71,7 @@ def test_a_scale_that_wanders_and_is_measured_again_swings_the_whole_way():
     same(integrated(ROOT**2, commons, by_pairs=False), sampled(scales, own))
 
 
-def test_pairs_that_see_the_same_err_alike():
+def test_consecutive_pairs_have_correlated_errors():
     rng = np.random.default_rng(1)
     lasting, own = np.zeros((SAMPLES, 6)), []
     for number in range(COUNT):
@@ -85,7 +85,7 @@ def test_pairs_that_see_the_same_err_alike():
     assert np.trace(found[3:, 3:]) > 2 * np.trace(alone[3:, 3:])
 
 
-def test_the_same_steps_seen_from_another_first_camera_are_as_sure():
+def test_the_covariance_does_not_depend_on_the_first_camera():
     common = Common(np.array([1e-4, 1e-3]), np.ones(2))
     turned = np.eye(4)
     turned[:3, :3] = rotation_exp(np.array([0.3, -1.2, 2.0]))
@@ -99,14 +99,14 @@ def test_the_same_steps_seen_from_another_first_camera_are_as_sure():
     assert paths[1] == pytest.approx(turn @ paths[0] @ turn.T, abs=1e-15)
 
 
-def test_what_lengths_have_in_common_is_in_the_sigma_of_metres_alone():
+def test_common_errors_are_in_the_sigma_of_metric_lengths_only():
     common = Common(np.array([0.03**2, 0.04**2]), np.ones(2))
     metric = Length(2.0, 2 * np.sqrt(0.05**2 + 0.01**2), True, common=common)
     assert metric.own.sigma == pytest.approx(0.02)
     assert replace(metric, metric=False).own.sigma == metric.sigma
 
 
-def test_a_path_of_metres_of_a_wrong_share_is_wrong_by_that_share():
+def test_a_metric_path_has_the_relative_error_of_its_source():
     common = Common(np.array([0.0, 0.05**2]), np.ones(2))
     path, here, way = PathCovariance(), np.eye(4), np.eye(4)
     way[2, 3] = 1.0
@@ -139,12 +139,12 @@ def test_the_covariance_that_is_published_is_that_of_its_steps():
     assert all(np.diff(wandered) > 0)
 
 
-def test_independent_edges_of_a_graph_are_together_as_unsure_as_the_integrated_pose():
+def test_independent_edges_of_a_graph_add_up_to_the_integrated_covariance():
     ahead, covariance = pose(z=1.0), ROOT @ ROOT
     path, chain, here = PathCovariance(), np.zeros((6, 6)), np.eye(4)
     for _ in range(300):
         path = path.moved_by_pair(here, ahead, covariance)
-        chain = compose(here, chain, ahead, in_a_chain(covariance))
+        chain = compose(here, chain, ahead, inflated_for_chain(covariance))
         here = here @ ahead
     assert np.linalg.eigvals(np.linalg.solve(chain, path.pose)).real == pytest.approx(
         np.ones(6), abs=0.1)

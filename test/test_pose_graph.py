@@ -116,7 +116,7 @@ def exact_graph(vertices=6):
 
 # From results
 
-def test_a_replay_becomes_a_chain_of_its_frames(results):
+def test_replay_gives_a_chain_of_its_frames(results):
     graph = read_results(results)
     stamps, poses = read_tum(results / 'trajectory_tum.txt')
     assert np.array_equal(graph.stamps_ns, stamps)
@@ -138,7 +138,7 @@ def test_body_axes_in_the_messages_do_not_change_the_graph(results, tmp_path):
         assert np.allclose(edge.covariance, other.covariance, atol=1e-12)
 
 
-def test_an_unknown_scale_is_weak_information_along_the_translation_alone(unscaled):
+def test_unknown_scale_weakens_the_information_only_along_the_translation(unscaled):
     graph = read_results(unscaled)
     for edge in graph.edges:
         assert not edge.scale_known
@@ -149,14 +149,14 @@ def test_an_unknown_scale_is_weak_information_along_the_translation_alone(unscal
         assert np.linalg.eigvalsh(information)[1] > 1
 
 
-def test_a_bad_frame_is_no_vertex_and_is_bridged(tmp_path):
+def test_failed_frame_is_bridged_without_a_vertex(tmp_path):
     graph = read_results(replayed(tmp_path / 'results', Drive(black=[2])))
     assert len(graph.poses) == FRAMES - 1
     assert [(edge.source, edge.target, edge.kind) for edge in graph.edges] == [
         (i, i + 1, 'odometry') for i in range(FRAMES - 2)]
 
 
-def test_stamps_that_come_again_after_a_reset_are_of_the_motions_of_their_time(tmp_path):
+def test_repeated_stamps_after_a_reset_get_their_own_motions(tmp_path):
     """As those of a simulation that is reset: what was first is not what came second."""
     # Less of a step back would be taken for late images.
     runs = Drive(gaps=[4]), Drive(black=[2], gaps=[4], step=np.linalg.inv(STEP))
@@ -177,7 +177,7 @@ def test_stamps_that_come_again_after_a_reset_are_of_the_motions_of_their_time(t
         assert np.array_equal(edge.covariance, one.covariance)
 
 
-def test_a_hole_in_time_is_an_edge_about_which_nothing_is_known(tmp_path):
+def test_time_gap_is_an_edge_with_unknown_motion(tmp_path):
     graph = read_results(replayed(tmp_path / 'results', Drive(gaps=[3])))
     assert [edge.kind for edge in graph.edges] == ['odometry', 'odometry', 'unknown', 'odometry']
     assert np.array_equal(graph.edges[2].covariance, UNKNOWN_MOTION)
@@ -201,7 +201,7 @@ def test_other_folders_and_damaged_results_are_refused(results, tmp_path):
 
 # Information matrices
 
-def test_the_information_is_the_inverse_covariance_of_small_errors_at_the_target():
+def test_information_is_the_inverse_covariance_in_the_target_frame():
     """By sampling: errors in ROS's sense, as g2o and GTSAM see them."""
     graph = random_graph(1)
     edge = replace(graph.edges[0], covariance=graph.edges[0].covariance * 1e-6)
@@ -225,7 +225,7 @@ def test_the_information_is_the_inverse_covariance_of_small_errors_at_the_target
     (lambda C: np.ones((6, 6)), 'is singular'),
     (lambda C: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
     (lambda C: C[:5, :5], 'is not a finite 6x6 matrix')])
-def test_covariances_that_have_no_inverse_are_refused_with_the_name_of_the_edge(
+def test_singular_covariance_is_refused_with_the_edge_name(
         spoil, said, tmp_path):
     graph = random_graph(2)
     bad = replace(graph.edges[4], covariance=spoil(graph.edges[4].covariance))
@@ -269,7 +269,7 @@ SPOILT = [(lambda C, _: C * np.nan, 'is not a finite 6x6 matrix'),
 
 
 @pytest.mark.parametrize(('spoil', 'said'), SPOILT)
-def test_results_that_were_edited_by_hand_are_refused_with_the_name_of_the_edge(
+def test_edited_results_are_refused_with_the_edge_name(
         results, spoil, said, tmp_path):
     graph = read_results(spoilt(results, tmp_path / 'spoilt', spoil))
     with pytest.raises(DjetError, match=r'odometry edge 1 -> 2 \(1200000000 ns') as refused:
@@ -279,7 +279,7 @@ def test_results_that_were_edited_by_hand_are_refused_with_the_name_of_the_edge(
         write_graph(graph, tmp_path / 'graph', 'g2o')
 
 
-def test_the_commands_say_so_in_a_line_and_write_nothing(results, tmp_path):
+def test_invalid_edge_gives_one_line_and_no_output(results, tmp_path):
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     folder, out = spoilt(results, tmp_path / 'spoilt', asymmetric), tmp_path / 'out'
     sequence = write_small_kitti(tmp_path / 'dataset')
@@ -334,7 +334,7 @@ def test_the_files_read_back_to_the_graph(results, tmp_path):
     assert np.array_equal(np.loadtxt(tmp_path / 'kitti').reshape(-1, 3, 4), graph.poses[:, :3])
 
 
-def test_in_a_graph_steps_are_as_unsure_as_long_chains_of_them_are(results, tmp_path):
+def test_exported_covariances_are_inflated_for_correlated_errors(results, tmp_path):
     graph, out = read_results(results), tmp_path / 'chained.csv'
     djet('export', results, '--format', 'csv', '--chained', '--output', out)
     # Errors that agree by 0.25 with those of the next pair, by nine tenths of that with those of
@@ -349,7 +349,7 @@ def test_in_a_graph_steps_are_as_unsure_as_long_chains_of_them_are(results, tmp_
     assert unknown.inflated() is unknown
 
 
-def test_the_command_refuses_to_overwrite_and_says_of_lengths_that_are_unknown(
+def test_export_refuses_to_overwrite_and_warns_of_unknown_scale(
         unscaled, tmp_path):
     out = tmp_path / 'graph.g2o'
     done = djet('export', unscaled, '--output', out)
@@ -405,7 +405,7 @@ def test_the_errors_stay_the_same_through_a_file_that_gtsam_writes(tmp_path):
         assert again.error(poses) == pytest.approx(factors.error(values), rel=1e-3)
 
 
-def test_a_graph_that_agrees_with_itself_has_no_error(tmp_path):
+def test_consistent_graph_has_zero_error(tmp_path):
     gtsam = pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     write_graph(exact_graph(), tmp_path / 'graph.g2o', 'g2o')
     factors, values = gtsam.readG2o(str(tmp_path / 'graph.g2o'), True)

@@ -21,9 +21,10 @@ from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.diagnostics import StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages, pose_of, stamp_ns, twist
+from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import GroundTruthScale, SpeedScale
 from djet_ros.odometry.uncertainty import compose
-from djet_ros.odometry.visual_odometry import camera_motion, OdometryResult, VisualOdometry
+from djet_ros.odometry.visual_odometry import VisualOdometry
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np

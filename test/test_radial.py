@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.radial import bending, bent, straight_image, straightened
+from djet_ros.core.radial import distort, distortion_jacobian, undistort, undistort_image
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -16,7 +16,7 @@ def test_undistorted_pixels_are_those_of_a_pinhole(k1: float) -> None:
     pixels = np.random.default_rng(16).uniform((0, 0), (640, 480), (100, 2))
     where = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K)
     # Not exactly: a landmark's point only starts there, and its residual in the anchor holds it.
-    assert straightened(K, pixels, k1) == pytest.approx(where[:, 0], abs=0.05)
+    assert undistort(K, pixels, k1) == pytest.approx(where[:, 0], abs=0.05)
 
 
 @pytest.mark.parametrize('k1', [-0.05, 0.0, 0.05])
@@ -24,10 +24,10 @@ def test_distorted_pixels_and_their_jacobians_are_those_of_the_lens(k1: float) -
     pixels = np.random.default_rng(17).uniform((0, 0), (640, 480), (100, 2))
     places = np.column_stack([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones(100)])
     where = cv2.projectPoints(places, np.zeros(3), np.zeros(3), K, np.array([k1, 0, 0, 0]))[0]
-    assert bent(K, pixels, k1) == pytest.approx(where[:, 0], abs=1e-9)
+    assert distort(K, pixels, k1) == pytest.approx(where[:, 0], abs=1e-9)
     for axis, step in enumerate(np.eye(2) * 1e-4):
-        moved = (bent(K, pixels + step, k1) - bent(K, pixels - step, k1)) / 2e-4
-        found = bending(K, places[:, :2], k1)[:, :, axis]
+        moved = (distort(K, pixels + step, k1) - distort(K, pixels - step, k1)) / 2e-4
+        found = distortion_jacobian(K, places[:, :2], k1)[:, :, axis]
         assert found == pytest.approx(moved, abs=1e-6)
 
 
@@ -41,7 +41,7 @@ def clouds() -> NDArray[np.uint8]:
 @pytest.mark.parametrize('k1', [-0.05, 0.05])
 def test_an_image_is_undistorted_as_by_opencv(k1: float) -> None:
     gray = clouds()
-    straight, unseen = straight_image(gray, K, k1)
+    straight, unseen = undistort_image(gray, K, k1)
     expected, whole = (cv2.undistort(image, K, np.array([k1, 0, 0, 0]))
                        for image in (gray, np.full_like(gray, 255)))
     # Beyond the border OpenCV fills with black.
@@ -54,9 +54,9 @@ def test_an_image_is_undistorted_as_by_opencv(k1: float) -> None:
 
 def test_undistortion_in_steps_equals_one_step() -> None:
     gray = clouds()
-    once, _ = straight_image(gray, K, 0.03)
-    partly, _ = straight_image(gray, K, 0.02)
-    twice, _ = straight_image(partly, K, 0.03, before=0.02)
+    once, _ = undistort_image(gray, K, 0.03)
+    partly, _ = undistort_image(gray, K, 0.02)
+    twice, _ = undistort_image(partly, K, 0.03, before=0.02)
     inner = np.s_[40:-40, 40:-40]
     assert np.abs(once.astype(int) - twice)[inner].max() <= 3
 
@@ -64,9 +64,9 @@ def test_undistortion_in_steps_equals_one_step() -> None:
 def test_the_mask_is_undistorted_with_the_image() -> None:
     left_out = np.zeros((480, 640), bool)
     left_out[30:90, 40:120] = True
-    _, hidden = straight_image(clouds(), K, -0.05, left_out)
+    _, hidden = undistort_image(clouds(), K, -0.05, left_out)
     assert hidden is not None
-    corners = straightened(K, np.array([[40.0, 30], [119, 89]]), -0.05)
+    corners = undistort(K, np.array([[40.0, 30], [119, 89]]), -0.05)
     rows, columns = np.nonzero(hidden)
     found = np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]])
     assert np.abs(found - corners).max() < 3

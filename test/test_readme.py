@@ -16,7 +16,7 @@ from typing import Any
 import djet_ros
 from djet_ros.cli.main import main
 from djet_ros.core.geometry import direction_angle, rotation_angle
-from djet_ros.core.matching import RIGID
+from djet_ros.core.matching import MIN_RIGID_SHARE
 from djet_ros.lab.scenes import make_scene
 import numpy as np
 import pytest
@@ -190,7 +190,7 @@ def test_the_packages_on_the_design_page_are_the_folders_in_order_of_imports():
 
 
 def test_the_design_page_states_the_share_of_inliers_that_predicted_matches_need():
-    assert f'no more than {RIGID * 100:.0f} % of its matches agree' in (
+    assert f'no more than {MIN_RIGID_SHARE * 100:.0f} % of its matches agree' in (
         DOC / 'design.md').read_text()
 
 

@@ -109,7 +109,7 @@ def summary(results):
     return json.loads((results / 'summary.json').read_text())
 
 
-def test_images_of_keyframes_have_the_masks_that_the_odometry_had(tmp_path):
+def test_keyframe_images_have_the_masks_of_the_odometry(tmp_path):
     """Each mask is recorded a little after its image; those of one image are missing."""
     def messages():
         for i, (topic, message, stamp) in enumerate(drive()):
@@ -128,7 +128,7 @@ def test_images_of_keyframes_have_the_masks_that_the_odometry_had(tmp_path):
             assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
 
 
-def test_images_of_keyframes_are_without_the_residual_distortion(tmp_path):
+def test_keyframe_images_have_the_residual_distortion_corrected(tmp_path):
     k1 = -0.05
     with open_recording(record(tmp_path / 'bag', drive()), IMAGE_TOPIC) as recording:
         frame = frame_finder(recording, from_flat({'odometry.residual_k1': k1}))(SECOND)
@@ -150,7 +150,7 @@ def on_a_robot():
 
 
 @pytest.mark.slow
-def test_with_a_base_frame_the_odometry_is_that_of_the_vehicle_by_the_bags_own_tf(tmp_path):
+def test_odometry_is_of_the_base_frame_with_the_mounting_from_the_bag(tmp_path):
     path = record(tmp_path / 'bag', on_a_robot())
     for name, words in (('camera', ()), ('base', ('--base-frame', 'base_link'))):
         djet('replay', path, '--output', tmp_path / name, *words)
@@ -165,7 +165,7 @@ def test_with_a_base_frame_the_odometry_is_that_of_the_vehicle_by_the_bags_own_t
     assert np.array_equal(read_tum(tmp_path / 'base' / 'trajectory_tum.txt')[1], camera)
 
 
-def test_tf_of_a_recording_gives_the_lengths_through_a_frame_that_moves(tmp_path):
+def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
     """Messages of tf are recorded between the images, a little after the image they cover."""
     here = np.eye(4)
 
@@ -189,7 +189,7 @@ def test_tf_of_a_recording_gives_the_lengths_through_a_frame_that_moves(tmp_path
     assert 'has no /tf, which odometry.guess_frame asks for' in without.stderr
 
 
-def test_a_recording_that_does_not_tell_the_mounting_says_so_in_a_line(tmp_path, folder):
+def test_missing_mounting_in_a_recording_is_one_line(tmp_path, folder):
     path = record(tmp_path / 'bag', drive())
     for source in (path, folder):
         done = djet('replay', source, '--output', tmp_path / f'of_{source.name}', '--base-frame',
@@ -200,7 +200,7 @@ def test_a_recording_that_does_not_tell_the_mounting_says_so_in_a_line(tmp_path,
         assert not (tmp_path / f'of_{source.name}').exists()
 
 
-def test_a_sequence_with_an_imu_tells_the_odometry_of_the_imu(tmp_path):
+def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(tmp_path):
     folder = render_sequence('road', tmp_path, 4, size=(480, 160))
     words = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
     assert "has no transform from it to 'camera'" in djet(*words, expect=2).stderr
@@ -210,7 +210,7 @@ def test_a_sequence_with_an_imu_tells_the_odometry_of_the_imu(tmp_path):
     assert [message.child_frame_id for message in told] == ['imu'] * 4
 
 
-def test_results_stay_where_the_mounting_that_is_asked_for_is_not_told(tmp_path):
+def test_missing_mounting_keeps_earlier_results(tmp_path):
     path, results = record(tmp_path / 'bag', on_a_robot()), tmp_path / 'results'
     results.mkdir()
     for name in ('summary.json', 'config.yaml'):
@@ -231,7 +231,7 @@ def replayed(bag, tmp_path_factory):
     return results, djet('replay', bag, '--output', results)
 
 
-def test_the_summary_holds_counts_and_errors(replayed):
+def test_summary_has_counts_and_errors(replayed):
     results, _ = replayed
     said = summary(results)
     assert said['complete'] is True
@@ -247,7 +247,7 @@ def test_the_summary_holds_counts_and_errors(replayed):
         assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
 
 
-def test_positions_are_held_against_the_true_ones_in_the_best_unit(replayed, folder):
+def test_position_error_is_after_alignment_with_scale(replayed, folder):
     results, _ = replayed
     said = summary(results)
     truth = KittiSequence(folder).poses[:, :3, 3]
@@ -263,7 +263,7 @@ def test_positions_are_held_against_the_true_ones_in_the_best_unit(replayed, fol
 
 
 @pytest.mark.slow
-def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
+def test_drift_is_given_for_paths_over_100_metres(replayed, folder, tmp_path):
     results, _ = replayed
     assert summary(results)['drift'] is None
     truth = KittiSequence(folder).poses
@@ -292,7 +292,7 @@ def test_drift_is_told_of_a_way_of_over_100_metres(replayed, folder, tmp_path):
     assert places['ground_truth']['scale_change'] == pytest.approx(1, abs=1e-6)
 
 
-def test_the_scale_at_the_end_is_told_over_that_at_the_start():
+def test_scale_change_is_the_scale_at_the_end_over_that_at_the_start():
     rng = np.random.default_rng(4)
     steps = rng.uniform(0.5, 2, (200, 1)) * [[0.6, 0.0, 0.8]]
     truth = np.cumsum(steps, axis=0)
@@ -350,7 +350,7 @@ def test_landmarks_lie_on_the_cards(replayed):
     assert np.quantile(off, 0.9) < 0.1
 
 
-def test_each_image_has_a_row(replayed):
+def test_frames_csv_has_a_row_for_each_image(replayed):
     results, _ = replayed
     rows = list(csv.DictReader((results / 'frames.csv').open()))
     assert [row['status'] for row in rows] == ['FIRST_FRAME'] + ['OK'] * (FRAMES - 1)
@@ -362,7 +362,7 @@ def test_each_image_has_a_row(replayed):
     assert float(errors[0]['rotation_error_deg']) < 0.5
 
 
-def test_the_table_is_short_and_says_where_the_plot_is(replayed):
+def test_printed_table_is_short_and_names_the_plot(replayed):
     results, done = replayed
     assert done.stderr == ''
     assert 'rotation' in done.stdout
@@ -373,7 +373,7 @@ def test_the_table_is_short_and_says_where_the_plot_is(replayed):
 
 @pytest.mark.parametrize('name', [b'drive \xff', rb'a$\nope{$b', b'[red]x'],
                          ids=['no text', 'formula', 'markup'])
-def test_whatever_a_recording_is_called_its_plot_is_drawn(folder, tmp_path, monkeypatch, name):
+def test_plot_works_for_any_recording_name(folder, tmp_path, monkeypatch, name):
     monkeypatch.setenv('PYTHONIOENCODING', 'utf-8:strict')
     source, results = (Path(os.fsdecode(os.fsencode(tmp_path) + b'/' + word))
                        for word in (name, b'of ' + name))
@@ -383,7 +383,7 @@ def test_whatever_a_recording_is_called_its_plot_is_drawn(folder, tmp_path, monk
     assert (results / 'trajectory.png').exists()
 
 
-def test_a_folder_and_its_bag_give_the_same_bytes_each_time(folder, replayed, tmp_path):
+def test_folder_and_bag_give_identical_results(folder, replayed, tmp_path):
     djet('replay', folder, '--output', tmp_path / 'a')
     places = tmp_path / 'a', replayed[0]
     for name in ('trajectory_tum.txt', 'trajectory_kitti.txt', 'errors.csv', 'landmarks.ply',
@@ -420,7 +420,7 @@ class Stream:
 
 @pytest.mark.parametrize('broken', [False, True])
 @pytest.mark.parametrize('names', ['', 'i1', 'a1', 'i1 i2', 'a1 i1 a2 a3 i2 i3 a4'])
-def test_messages_come_in_order_with_the_next_image_before_it_comes(names, broken):
+def test_messages_are_in_order_with_the_next_image_ahead(names, broken):
     names, seen = names.split(), []
     try:
         for message, following in with_next_image(Stream(names, broken)):
@@ -435,13 +435,13 @@ def test_messages_come_in_order_with_the_next_image_before_it_comes(names, broke
     assert seen == names
 
 
-def test_little_is_read_ahead_where_no_image_comes_any_more():
+def test_lookahead_is_bounded_without_images():
     stream = Stream(['i1', *['a'] * 10_000])
     assert next(with_next_image(stream))[0].message == 'i1'
     assert stream.read < 2_000
 
 
-def test_flags_and_file_make_the_configuration_that_is_written(bag, tmp_path):
+def test_written_configuration_combines_flags_and_file(bag, tmp_path):
     parameters = tmp_path / 'mine.yaml'
     parameters.write_text('estimator: {max_features: 400, method: pjet}\n')
     djet('replay', bag, '--output', tmp_path / 'r', '--config', parameters, '--method', 'rpe',
@@ -456,7 +456,7 @@ def test_flags_and_file_make_the_configuration_that_is_written(bag, tmp_path):
     assert np.allclose(lengths[moved], np.linalg.norm(STEP[:3, 3]), atol=1e-6)
 
 
-def test_results_are_replaced_only_on_demand_and_nothing_else_is(bag, replayed, tmp_path):
+def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_path):
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
     (results / 'notes.txt').write_text('mine')
@@ -568,7 +568,7 @@ def bad_config(tmp_path, bag):
        f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
       for what in ('speed', 'imu', 'guess', 'mask')],
 ])
-def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
+def test_invalid_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     done = djet('replay', *make(tmp_path, bag), '--output', tmp_path / 'results', expect=2)
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith('djet: error: ')
@@ -576,7 +576,7 @@ def test_a_bad_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
 
 
 @pytest.mark.parametrize('verb', [('replay',), ('lab', 'evaluate'), ('lab', 'surfaces')])
-def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_of(
+def test_unwritable_output_is_one_line_without_results(
         verb, folder, tmp_path):
     file = tmp_path / 'bad.yaml'
     file.write_text('')
@@ -589,7 +589,7 @@ def test_a_place_where_nothing_can_be_written_is_said_and_no_results_are_spoken_
     assert file.read_text() == ''
 
 
-def test_a_place_that_is_a_link_to_nothing_or_has_no_name_is_said(folder, tmp_path):
+def test_dangling_link_or_empty_output_path_is_reported(folder, tmp_path):
     (tmp_path / 'link').symlink_to(tmp_path / 'gone')
     for place, why in ((tmp_path / 'link', f'is a link to {tmp_path}/gone, which does not exist'),
                        ('', 'argument --output: it is empty; name a place')):
@@ -597,7 +597,7 @@ def test_a_place_that_is_a_link_to_nothing_or_has_no_name_is_said(folder, tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == ['link']
 
 
-def test_a_scale_of_a_file_may_have_its_length_from_the_command_line(bag, tmp_path):
+def test_scale_of_a_file_may_have_its_length_from_a_flag(bag, tmp_path):
     file = tmp_path / 'car.yaml'
     file.write_text('odometry: {scale: constant}\n')
     djet('replay', bag, '--config', file, '--scale-value', '0.5', '--output', tmp_path / 'out')
@@ -617,7 +617,7 @@ def seen(tmp_path, frames):
     return record(tmp_path / 'bag', messages), poses
 
 
-def test_a_recording_in_which_nothing_can_be_tracked_is_no_silent_success(tmp_path):
+def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
     source, poses = seen(tmp_path, [np.zeros(SIZE[::-1], np.uint8)] * FRAMES)
     done = djet('replay', source, '--poses', poses, '--output', tmp_path / 'out')
     assert (f'djet: warning: none of {FRAMES - 1} pairs could be tracked (mostly '
@@ -629,14 +629,14 @@ def test_a_recording_in_which_nothing_can_be_tracked_is_no_silent_success(tmp_pa
     assert told['failures'] == FRAMES - 1
 
 
-def test_a_camera_that_stands_has_words_of_its_own(tmp_path):
+def test_stationary_camera_gives_a_warning(tmp_path):
     source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert (f'djet: warning: all {FRAMES - 1} pairs have no parallax (NO_PARALLAX): the camera '
             'was stationary or only rotated') in done.stderr
 
 
-def test_images_too_far_apart_for_a_pair_are_said(tmp_path, bag):
+def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):
     file = tmp_path / 'slow.yaml'
     file.write_text('odometry: {max_gap: 0.05}\n')
     done = djet('replay', bag, '--config', file, '--output', tmp_path / 'out')
@@ -644,7 +644,7 @@ def test_images_too_far_apart_for_a_pair_are_said(tmp_path, bag):
     assert 'exceeds odometry.max_gap; set it to a larger value' in done.stderr
 
 
-def test_a_camera_of_12_bits_is_said_and_its_range_mends_it(tmp_path):
+def test_12_bit_camera_gives_a_warning_that_gray_range_resolves(tmp_path):
     cards = Cards()
     frames = [cards.gray(np.linalg.matrix_power(STEP, i)).astype('<u2') * 4 for i in range(FRAMES)]
     source = record(tmp_path / 'bag', [
@@ -659,7 +659,7 @@ def test_a_camera_of_12_bits_is_said_and_its_range_mends_it(tmp_path):
     assert summary(tmp_path / 'told')['status'][Status.OK.value] == FRAMES - 1
 
 
-def test_a_truncated_bag_leaves_what_was_before_the_cut(bag, tmp_path):
+def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
     cut = tmp_path / 'cut.mcap'
     whole = next(bag.glob('*.mcap')).read_bytes()
     cut.write_bytes(whole[:len(whole) * 6 // 10])
@@ -683,7 +683,7 @@ def test_a_truncated_bag_leaves_what_was_before_the_cut(bag, tmp_path):
     (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999,
                         stamp_ns=SECOND + i * SECOND // 10) if i in (2, 4) else m,
      'size_mismatch|short_data', FRAMES - 2)])
-def test_a_bad_image_in_the_middle_is_named_and_the_rest_is_tracked(
+def test_bad_image_is_named_and_the_rest_is_tracked(
         damage, reason, frames, tmp_path):
     results = tmp_path / 'results'
     said = djet('replay', record(tmp_path / 'bag', drive(damage)), '--output', results,
@@ -699,7 +699,7 @@ def test_a_bad_image_in_the_middle_is_named_and_the_rest_is_tracked(
 
 
 @pytest.mark.parametrize('bad', [{'data': np.zeros(9, np.uint8)}, {'height': 0, 'width': 0}])
-def test_a_bad_first_image_is_named_and_the_rest_has_the_poses_that_are_without_it(bad, tmp_path):
+def test_bad_first_image_is_named_and_does_not_change_the_other_poses(bad, tmp_path):
     def damage(i, message):
         return image(np.zeros(SIZE[::-1], np.uint8), **bad) if i == 0 else message
 
@@ -716,7 +716,7 @@ def test_a_bad_first_image_is_named_and_the_rest_has_the_poses_that_are_without_
 
 
 @pytest.mark.parametrize('at', [0, 3])
-def test_a_damaged_file_of_a_folder_is_counted_as_a_bad_image_of_a_bag_is(at, folder, tmp_path):
+def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(at, folder, tmp_path):
     shutil.copytree(folder, tmp_path / '00')
     cut = tmp_path / '00' / 'image_0' / f'{at:06d}.png'
     cut.write_bytes(cut.read_bytes()[:500])
@@ -733,7 +733,7 @@ def test_a_damaged_file_of_a_folder_is_counted_as_a_bad_image_of_a_bag_is(at, fo
 
 
 @pytest.mark.parametrize('at', [0, 3])
-def test_a_camera_info_of_zeros_costs_the_images_up_to_the_next_one(at, tmp_path):
+def test_zero_camera_info_loses_the_images_up_to_the_next_one(at, tmp_path):
     messages, zero = list(drive()), camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
     messages.insert(2 * at + 1, (INFO_TOPIC, zero, messages[2 * at][2]))
     path = record(tmp_path / 'bag', messages)
@@ -751,7 +751,7 @@ def test_a_camera_info_of_zeros_costs_the_images_up_to_the_next_one(at, tmp_path
     assert frame.gray.shape == SIZE[::-1]
 
 
-def test_another_image_size_in_the_middle_is_named(tmp_path):
+def test_change_of_image_size_is_reported(tmp_path):
     messages = list(drive())
     for i, (topic, message, _) in enumerate(messages):
         if i >= 6 and topic == IMAGE_TOPIC:
@@ -764,7 +764,7 @@ def test_another_image_size_in_the_middle_is_named(tmp_path):
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
 
 
-def test_images_before_the_first_camera_info_are_told(tmp_path):
+def test_images_before_the_first_camera_info_give_a_warning(tmp_path):
     def messages():
         for i, (topic, message, stamp) in enumerate(drive(info=False)):
             if i == 2:
@@ -788,7 +788,7 @@ def shifted(frames, seconds):
         yield topic, message, SECOND + i
 
 
-def test_stamps_that_go_back_are_said_with_where_poses_begin_again(tmp_path):
+def test_stamps_that_go_back_are_reported_with_the_restart(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3), 10))
     said = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
     assert said == (f'djet: error: {path}: the stamps go back once; the poses restart at the '
@@ -798,7 +798,7 @@ def test_stamps_that_go_back_are_said_with_where_poses_begin_again(tmp_path):
     assert np.array_equal(poses[3], np.eye(4))
 
 
-def test_an_image_stamped_ahead_leaves_no_trace_in_the_poses(tmp_path):
+def test_image_stamped_ahead_does_not_change_the_poses(tmp_path):
     for name, messages in (('ahead', shifted({3}, 5)),
                            ('without', drive(lambda i, message: None if i == 3 else message))):
         djet('replay', record(tmp_path / name, messages), '--output', tmp_path / f'{name}_r')
@@ -808,7 +808,7 @@ def test_an_image_stamped_ahead_leaves_no_trace_in_the_poses(tmp_path):
     assert summary(tmp_path / 'ahead_r')['dropped'] == {'ahead': 1}
 
 
-def test_a_gap_over_which_the_motion_is_missing_is_said_with_its_length(tmp_path):
+def test_gap_gives_a_warning_with_its_length(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3, FRAMES), 5))
     said = djet('replay', path, '--output', tmp_path / 'r').stderr
     assert said == (
@@ -818,7 +818,7 @@ def test_a_gap_over_which_the_motion_is_missing_is_said_with_its_length(tmp_path
 
 
 @pytest.mark.parametrize('goes_on', [False, True])
-def test_stamps_that_stand_still_are_said(goes_on, tmp_path):
+def test_constant_stamps_give_a_warning(goes_on, tmp_path):
     def messages():
         yield INFO_TOPIC, camera_info(K, SIZE, SECOND), SECOND
         stamps = [1] * 8 + [2] * goes_on
@@ -833,7 +833,7 @@ def test_stamps_that_stand_still_are_said(goes_on, tmp_path):
 
 @pytest.mark.parametrize('sign, code', [
     (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGKILL, -9)])
-def test_an_interrupted_run_is_readable_and_known_as_incomplete(folder, tmp_path, sign, code):
+def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sign, code):
     endless = tmp_path / 'sequences' / '01'
     shutil.copytree(folder, endless)
     for i in range(FRAMES, 2000):
@@ -889,7 +889,7 @@ def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
      'those of the images 1.000000000 to 1.500000000; give ground truth with the same clock'),
     (0.95, 0.2, 'no errors were computed: no image lies between two poses of {} that are at most '
      '0.1 s apart; give ground truth with a higher rate')])
-def test_ground_truth_of_another_time_is_said_in_a_line(first, apart, why, tmp_path):
+def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_path):
     poses = tmp_path / 'poses.txt'
     with TumWriter(poses) as truth:
         for i in range(FRAMES):
@@ -944,7 +944,7 @@ def test_a_speed_topic_gives_metres(tmp_path):
     assert np.allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 0.2, rtol=0.01)
 
 
-def test_a_source_of_metres_that_measured_nothing_is_said(tmp_path):
+def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
     source = record(tmp_path / 'bag', with_speeds(late=3600))
     poses = tmp_path / 'another_day.txt'
     with TumWriter(poses) as truth:
@@ -994,7 +994,7 @@ def test_errors_follow_the_stated_rules():
     assert (errors.compared, errors.failures, errors.translation_failures) == (4, 1, 2)
 
 
-def test_statistics_leave_out_what_is_not_known():
+def test_statistics_ignore_nan():
     assert statistics(np.array([np.nan])) is None
     assert statistics(np.array([1.0, np.nan, 3.0])) == {
         'mean': 2.0, 'median': 2.0, 'p95': pytest.approx(2.9), 'max': 3.0}
@@ -1018,14 +1018,14 @@ def test_real_frames_are_replayed_within_a_degree(kitti, tmp_path):
     assert said['translation_error_deg']['max'] < 2
 
 
-def test_the_documented_call_is_understood():
+def test_documented_command_is_valid():
     parsed = djet('replay', '--help').stdout
     for flag in ('--output', '--method', '--preset', '--overwrite', '--config', '--image-topic',
                  '--info-topic', '--poses', '--scale'):
         assert flag in parsed
 
 
-def test_what_was_of_no_use_beside_the_images_is_told(tmp_path):
+def test_unused_side_inputs_give_a_warning(tmp_path):
     folder = render_sequence('road', tmp_path, 8, size=(480, 160))
     for told in (False, True):
         if told:

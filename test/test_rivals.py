@@ -27,7 +27,7 @@ from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import hemisphere_starts
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
-from djet_ros.core.verdict import _compare_with_rivals, as_turn
+from djet_ros.core.verdict import _compare_with_rivals, as_pure_rotation
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -207,7 +207,7 @@ def test_as_pure_rotation_fits_the_rotation_and_widens_the_covariance() -> None:
     seen = estimate(x, y + rng.normal(0, NOISE, y.shape))
     wrong = rotation_exp(np.array([0.002, -0.003, 0.001])) @ seen.R
     biased = replace(seen, status=Status.OK, R=wrong, t=unit(np.asarray(SIDEWAYS)))
-    turn = as_turn(biased, K)
+    turn = as_pure_rotation(biased, K)
     assert turn.status is Status.NO_PARALLAX and not turn.t.any()
     assert rotation_angle(turn.R, R) < 1e-4
     off = Rotation.from_matrix(wrong @ R.T).as_rotvec()
@@ -331,7 +331,7 @@ def test_few_inliers_among_many_matches_are_not_significant() -> None:
 
 def preference_between(x: np.ndarray, y: np.ndarray, one: Pose, other: Pose) -> float:
     surface = ReprojectionSurface(x, y)
-    problem = jet_problem(K, x, surface.around(y))
+    problem = jet_problem(K, x, surface.fit_around(y))
     losses = losses_at(problem, [one, other], Loss('geman_mcclure', 1.0))
     return float(preferences(losses, x, 0)[1])
 
@@ -424,7 +424,7 @@ def test_the_lowest_nearby_minimum_is_taken_with_the_others_as_rivals(
              two_views(rng, others, other.t, near=5, far=6)]
     x, y = (np.concatenate([getattr(part, name) for part in parts]) for name in 'xy')
     y += rng.normal(0, 0.05, y.shape)
-    problem = jet_problem(K, x, ReprojectionSurface(x, y).around(y))
+    problem = jet_problem(K, x, ReprojectionSurface(x, y).fit_around(y))
     loss = Loss('geman_mcclure', 0.2)
     right, wrong = (one, other) if ours > others else (other, one)
     for pose in (right, wrong):
@@ -440,7 +440,7 @@ def test_a_single_minimum_has_no_neighbours() -> None:
     rng = np.random.default_rng(6)
     views = two_views(rng, 300)
     y = views.y + rng.normal(0, 0.05, views.y.shape)
-    problem = jet_problem(K, views.x, ReprojectionSurface(views.x, y).around(y))
+    problem = jet_problem(K, views.x, ReprojectionSurface(views.x, y).fit_around(y))
     loss = Loss('geman_mcclure', 0.2)
     end = minimise(problem, views.R, views.t, loss)
     assert lowest_nearby_minimum(problem, views.x, end, loss) == (end, ())

@@ -13,8 +13,8 @@ from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.step_messages import StepMessages
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.results import ResultsFolder
@@ -27,14 +27,14 @@ Numbers = NDArray[np.float64]
 
 K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
 
-# Pixels that a k1 of one leaves in the residuals of a window: see SelfCalibration.told.
+# Pixels that a k1 of one leaves in the residuals of a window: see SelfCalibration.update.
 STRAIGHT, TURN = 0.5, 8.0
 
 
 def heard(windows: list[tuple[float, float, float]]) -> SelfCalibration:
     lens = SelfCalibration.unknown(K, (376, 1241))
     for window in windows:
-        lens = lens.told(*window)
+        lens = lens.update(*window)
     return lens
 
 
@@ -78,17 +78,17 @@ def test_images_are_corrected_for_a_significant_k1_and_again_at_half_its_varianc
     rng, lens, undone = np.random.default_rng(1), SelfCalibration.unknown(K, (376, 1241)), []
     for _ in range(300):
         # Windows do not see what is corrected already.
-        lens = lens.told(0.01 - lens.undone + 0.004 * rng.normal(), 0.004**2, TURN)
-        if lens.due:
-            lens = lens.straightened()
-            undone.append((lens.undone, lens.sigma))
-            assert not lens.due
+        lens = lens.update(0.01 - lens.corrected_k1 + 0.004 * rng.normal(), 0.004**2, TURN)
+        if lens.needs_update:
+            lens = lens.corrected()
+            undone.append((lens.corrected_k1, lens.sigma))
+            assert not lens.needs_update
     sigmas = np.array([sigma for _, sigma in undone])
     assert 2 <= len(undone) <= 6
     assert undone[0][0] > 3 * sigmas[0]
     assert (2 * sigmas[1:]**2 < sigmas[:-1]**2).all()
     assert all(abs(k1 - 0.01) < 3 * sigma for k1, sigma in undone)
-    assert lens.left == pytest.approx(0.01 - lens.undone, abs=3 * lens.sigma)
+    assert lens.residual_k1 == pytest.approx(0.01 - lens.corrected_k1, abs=3 * lens.sigma)
     assert lens.k1 == pytest.approx(0.01, abs=2.5 * lens.sigma)
 
 
@@ -97,8 +97,8 @@ def test_without_distortion_images_are_never_corrected() -> None:
     for _ in range(20):
         lens = SelfCalibration.unknown(K, (376, 1241))
         for _ in range(100):
-            lens = lens.told(0.004 * rng.normal(), 0.004**2, TURN)
-            assert not lens.due
+            lens = lens.update(0.004 * rng.normal(), 0.004**2, TURN)
+            assert not lens.needs_update
 
 
 class Bent:

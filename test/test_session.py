@@ -139,7 +139,7 @@ def offline(images: list[Any], **parameters: Any) -> list[bytes]:
             for one in tracker.image(image(gray, stamp_ns=i * PERIOD)) if one.topic in POSES]
 
 
-def test_every_gives_the_poses_of_the_tracker_to_the_last_bit(live, drive):
+def test_every_gives_the_poses_of_the_tracker_bit_for_bit(live, drive):
     one = live()
     one.send(drive)
     one.wait_for_images(len(drive))
@@ -159,7 +159,7 @@ def test_an_image_stamped_ahead_is_dropped_once_the_next_one_has_come(live, driv
     assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'OK': 10}
 
 
-def test_an_image_after_a_gap_is_worked_on_though_no_other_comes(live, drive, monkeypatch):
+def test_image_after_a_gap_is_processed_without_a_next_one(live, drive, monkeypatch):
     monkeypatch.setattr(sessions, '_NEXT_IMAGE_TIMEOUT', 0.05)
     one = live()
     one.send(drive[:2])
@@ -168,7 +168,7 @@ def test_an_image_after_a_gap_is_worked_on_though_no_other_comes(live, drive, mo
     assert one.tracker.counts.status == {'FIRST_FRAME': 1, 'OK': 1, 'TIME_JUMP': 1}
 
 
-def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live, drive):
+def test_latest_drops_under_load_and_accounts_for_every_image(live, drive):
     one = live(**{'ros.queue_policy': 'latest'})
     one.graph.delay = 0.05
     one.send(drive)
@@ -181,7 +181,7 @@ def test_latest_drops_what_comes_too_fast_and_every_image_is_accounted_for(live,
     assert 'images dropped: they arrive faster than they are processed' in one.graph.lines[0]
 
 
-def test_a_camera_that_is_too_fast_on_purpose_is_slowed_down_and_nobody_complains(live, drive):
+def test_max_rate_skips_images_without_a_complaint(live, drive):
     limit, slow, fast = RateLimit(4.0), live(), live(**{'ros.max_rate': 4.0})
     for i, gray in enumerate(drive):
         if limit.takes(i * PERIOD):
@@ -208,7 +208,7 @@ def test_a_camera_that_is_too_fast_on_purpose_is_slowed_down_and_nobody_complain
 
 
 @pytest.mark.parametrize('policy', ['latest', 'every'])
-def test_a_sender_without_end_fills_no_memory_and_is_complained_of(live, drive, policy):
+def test_endless_publisher_is_limited_in_memory_and_reported(live, drive, policy):
     one = live(**{'ros.queue_policy': policy, 'ros.queue_size': 1000})
     one.graph.open.clear()
     # Each message is another reference to the same one.
@@ -231,7 +231,7 @@ def test_a_sender_without_end_fills_no_memory_and_is_complained_of(live, drive, 
     assert 'to mend: images pile up' not in one.graph.said()
 
 
-def test_images_that_were_lost_on_the_way_are_complained_of(live, drive):
+def test_images_lost_in_transport_are_reported(live, drive):
     one = live()
     one.session.count_lost(30)
     one.send(drive)
@@ -244,7 +244,7 @@ def test_images_that_were_lost_on_the_way_are_complained_of(live, drive):
     assert 'to mend: images lost on the way' not in one.graph.said()
 
 
-def test_a_camera_info_holds_for_the_images_after_it(live, drive):
+def test_camera_info_applies_to_the_images_after_it(live, drive):
     one = live(**{'ros.queue_size': 12})
     one.graph.open.clear()
     one.send(drive[:4])
@@ -259,7 +259,7 @@ def test_a_camera_info_holds_for_the_images_after_it(live, drive):
 
 # Reset, pause, stop
 
-def test_nothing_of_before_a_reset_comes_after_it(live, drive):
+def test_nothing_from_before_a_reset_is_published_after_it(live, drive):
     one = live(**{'ros.queue_size': 12})
     one.send(drive[:4])
     one.graph.wait(lambda: one.graph.heard('relative_pose'))
@@ -277,7 +277,7 @@ def test_nothing_of_before_a_reset_comes_after_it(live, drive):
     assert one.tracker.counts == fresh.tracker.counts
 
 
-def test_a_reset_does_not_wait_for_more_than_the_image_in_work(live, drive):
+def test_reset_waits_only_for_the_image_being_processed(live, drive):
     one = live(**{'ros.queue_size': 1000})
     one.graph.delay = 0.05
     for _ in range(40):
@@ -289,7 +289,7 @@ def test_a_reset_does_not_wait_for_more_than_the_image_in_work(live, drive):
     assert one.tracker.counts.received < 40
 
 
-def test_a_pause_drops_and_counts_and_a_resume_goes_on(live, drive):
+def test_pause_drops_and_counts_until_resume(live, drive):
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -305,7 +305,7 @@ def test_a_pause_drops_and_counts_and_a_resume_goes_on(live, drive):
     assert stamp_ns(one.graph.heard('relative_pose')[-1].header) == 7 * PERIOD
 
 
-def test_what_was_asked_for_is_answered_and_logged(live, drive):
+def test_service_calls_are_answered_and_logged(live, drive):
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -322,7 +322,7 @@ def test_what_was_asked_for_is_answered_and_logged(live, drive):
         'odometry.odom_frame = world']
 
 
-def test_a_stop_publishes_an_image_as_a_whole_or_not_at_all(live, drive):
+def test_stop_publishes_all_or_no_messages_of_an_image(live, drive):
     one = live()
     one.send(drive[:2])
     one.graph.wait(lambda: one.graph.heard('relative_pose'))
@@ -341,7 +341,7 @@ def test_a_stop_publishes_an_image_as_a_whole_or_not_at_all(live, drive):
     assert len(one.graph.batches) == before + 1
 
 
-def test_a_stop_does_not_wait_for_ever(live, drive):
+def test_stop_times_out(live, drive):
     one = live()
     one.graph.open.clear()
     one.send(drive[:1])
@@ -350,7 +350,7 @@ def test_a_stop_does_not_wait_for_ever(live, drive):
     assert monotonic() - start < 5
 
 
-def test_images_without_end_do_not_hold_up_a_stop(live, drive):
+def test_endless_images_do_not_delay_a_stop(live, drive):
     one, ended = live(**{'ros.queue_size': 1}), Event()
 
     def send() -> None:
@@ -369,7 +369,7 @@ def test_images_without_end_do_not_hold_up_a_stop(live, drive):
 
 
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
-def test_an_error_in_the_thread_is_no_silent_stall(live, drive):
+def test_error_in_the_worker_thread_is_reported(live, drive):
     one = live()
     assert not one.session.failed
     one.graph.broken = True
@@ -382,7 +382,7 @@ def test_an_error_in_the_thread_is_no_silent_stall(live, drive):
 
 # What is said
 
-def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(live, drive):
+def test_bad_images_are_logged_throttled_and_tracking_continues(live, drive):
     one = live()
     one.send(drive[:2])
     for i in range(10):
@@ -397,7 +397,7 @@ def test_a_bad_camera_gives_one_line_a_while_and_the_next_good_pair_is_tracked(l
     assert one.graph.lines == [line]
 
 
-def test_what_there_is_to_mend_is_said_once_in_the_log_with_the_remedy(live, drive):
+def test_complaints_are_logged_once_with_the_remedy(live, drive):
     one = live()
     for gray in [*drive, *drive]:
         one.session.camera_info(camera_info(K, SIZE, header=header(0, 'odom')))
@@ -409,7 +409,7 @@ def test_what_there_is_to_mend_is_said_once_in_the_log_with_the_remedy(live, dri
     assert found[1].startswith('warning: stamps stand still: 5 images in a row have the stamp 0.0')
 
 
-def test_a_new_beginning_is_explained_in_the_log(live, drive):
+def test_restart_is_explained_in_the_log(live, drive):
     one = live()
     one.send(drive[:3], first=100)
     one.send(drive[:3])
@@ -418,7 +418,7 @@ def test_a_new_beginning_is_explained_in_the_log(live, drive):
     assert line.startswith('warning: restarted: TIME_JUMP: the stamps went back by 10.200 s')
 
 
-def test_a_step_back_is_logged_though_a_gap_was_just_before(live, drive):
+def test_step_back_is_logged_right_after_a_gap(live, drive):
     one = live()
     one.send(drive[:3])
     one.send(drive[3:5], first=100)
@@ -429,7 +429,7 @@ def test_a_step_back_is_logged_though_a_gap_was_just_before(live, drive):
     assert 'odom jumps to the origin' in back
 
 
-def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatch):
+def test_missing_inputs_are_logged_throttled(live, monkeypatch):
     one = live()
     one.session.camera_info(None)
     one.session.tick()
@@ -443,7 +443,7 @@ def test_what_is_missing_is_said_with_its_topic_once_in_a_while(live, monkeypatc
         '/left/camera_info']
 
 
-def test_a_camera_that_falls_silent_is_said_in_the_diagnostics(live, drive, monkeypatch):
+def test_silent_camera_is_in_the_diagnostics(live, drive, monkeypatch):
     monkeypatch.setattr(sessions, 'SILENCE_TIMEOUT', 0.2)
     one = live()
     one.send(drive[:3])
@@ -457,7 +457,7 @@ def test_a_camera_that_falls_silent_is_said_in_the_diagnostics(live, drive, monk
     assert 'rate (Hz)' not in one.graph.said()
 
 
-def test_diagnostics_are_not_said_twice_in_a_period(live, drive, monkeypatch):
+def test_diagnostics_are_published_once_per_period(live, drive, monkeypatch):
     monkeypatch.setattr(sessions, '_DIAGNOSTICS_PERIOD', 60.0)
     one = live()
     one.send(drive[:3])
@@ -468,7 +468,7 @@ def test_diagnostics_are_not_said_twice_in_a_period(live, drive, monkeypatch):
     assert len(one.graph.heard('/diagnostics')) == count
 
 
-def test_an_uncalibrated_camera_is_said_before_any_image_comes(live, monkeypatch):
+def test_uncalibrated_camera_is_reported_before_any_image(live, monkeypatch):
     monkeypatch.setattr(sessions, 'SILENCE_TIMEOUT', 0.0)
     one = live()
     one.session.camera_info(camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12)))
@@ -478,7 +478,7 @@ def test_an_uncalibrated_camera_is_said_before_any_image_comes(live, monkeypatch
     assert any('calibrate it' in line for line in one.graph.lines)
 
 
-def test_diagnostics_tell_the_latency_and_what_was_lost_on_the_way(live, drive):
+def test_diagnostics_contain_latency_and_transport_losses(live, drive):
     one = live()
     one.graph.delay = 0.03
     one.session.count_lost(2)
@@ -489,7 +489,7 @@ def test_diagnostics_tell_the_latency_and_what_was_lost_on_the_way(live, drive):
     assert 30 < float(said['latency, median (ms)']) <= float(said['latency, 95 % (ms)']) < 5000
 
 
-def test_a_debug_image_is_drawn_only_while_somebody_looks(live, drive):
+def test_debug_image_is_drawn_only_with_a_subscriber(live, drive):
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -502,7 +502,7 @@ def test_a_debug_image_is_drawn_only_while_somebody_looks(live, drive):
     assert not one.graph.heard('landmarks')
 
 
-def test_with_a_base_frame_the_odometry_is_of_the_vehicle_once_tf_knows_the_mounting(live, drive):
+def test_odometry_is_of_the_base_frame_once_tf_has_the_mounting(live, drive):
     one = live(**{'odometry.base_frame': 'base_link', 'ros.publish_tf': True})
     one.send(drive[:3])
     one.wait_for_images(3)
@@ -525,7 +525,7 @@ def test_with_a_base_frame_the_odometry_is_of_the_vehicle_once_tf_knows_the_moun
     assert one.graph.heard('relative_pose')[-1].header.frame_id == 'camera_body'
 
 
-def test_new_parameters_hold_from_the_next_image(live, drive):
+def test_parameters_change_at_the_next_image(live, drive):
     one = live()
     one.send(drive[:3])
     one.wait_for_images(3)

@@ -15,12 +15,12 @@ from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
-from djet_ros.core.radial import straight_image
+from djet_ros.core.radial import undistort_image
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
-from djet_ros.odometry.uncertainty import compose, in_a_chain, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import compose, inflated_for_chain, UNKNOWN_MOTION
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder, transferred_length
 from djet_ros.posegraph.places import PlaceIndex
@@ -93,7 +93,7 @@ def keyframes():
     return grown
 
 
-def test_keyframes_come_by_length_and_by_turn(keyframes):
+def test_keyframes_by_distance_and_rotation(keyframes):
     straight = np.array([pose(z=0.5 * i) for i in range(9)])
     turning = np.array([pose(yaw=np.radians(4 * i)) for i in range(9)])
     for poses, expected in ((straight, [0, 4, 8]), (turning, [0, 3, 6])):
@@ -102,7 +102,7 @@ def test_keyframes_come_by_length_and_by_turn(keyframes):
         assert [(edge.source, edge.target) for edge in kept.edges] == [(0, 1), (1, 2)]
 
 
-def test_keyframes_are_those_of_the_odometry_where_it_has_them(keyframes):
+def test_keyframes_of_the_odometry_are_used_if_it_has_them(keyframes):
     chosen = [replace(step, keyframe=i in {0, 1, 6})
               for i, step in enumerate(steps(np.array([pose(z=0.5 * i) for i in range(9)])))]
     for slam, expected in ({}, [0, 1, 6]), ({'keyframes': 'distance'}, [0, 4, 8]):
@@ -112,7 +112,7 @@ def test_keyframes_are_those_of_the_odometry_where_it_has_them(keyframes):
             one.keyframe for one in offsets]
 
 
-def test_where_the_image_of_a_keyframe_is_missing_the_next_frame_takes_its_place():
+def test_next_frame_replaces_a_keyframe_without_image():
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.keyframe_map import KeyframeMap
     kept, lost = KeyframeMap(Config()), 10**9 + 2 * 10**8
@@ -152,7 +152,7 @@ def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps(keyframes):
     assert np.abs(np.cov(white) - np.eye(6)).max() < 0.1
 
 
-def test_an_error_common_to_all_lengths_is_no_freedom_of_each():
+def test_common_length_error_is_removed_from_single_lengths():
     """A length known to 5 %, of which 1 % is its own, is as firm as one known to 1 %."""
     motion = pose(x=0.3, z=2.0, yaw=0.1)
 
@@ -167,7 +167,7 @@ def test_an_error_common_to_all_lengths_is_no_freedom_of_each():
                           known_to(0.01).covariance)
 
 
-def test_a_length_that_nobody_knows_may_be_another_but_not_any():
+def test_unknown_length_has_a_bounded_variance():
     """Its standard deviation is its length; the other directions keep theirs."""
     motion, direction = pose(z=2.0), np.diag([0, 0, 1.0, 0, 0, 0])
     edge = Edge(0, 1, motion, np.diag(SIGMAS**2) + 1e6 * direction, scale_known=False)
@@ -175,7 +175,7 @@ def test_a_length_that_nobody_knows_may_be_another_but_not_any():
                        np.diag([*SIGMAS[:2]**2, 2.0**2, *SIGMAS[3:]**2]))
 
 
-def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so(keyframes):
+def test_unknown_motion_starts_a_keyframe_with_an_unknown_edge(keyframes):
     told = steps(np.array([pose(z=0.1 * i) for i in range(4)]))
     told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, told[2].pose)
     kept, offsets = keyframes(told)
@@ -184,7 +184,7 @@ def test_where_nothing_is_known_begins_a_keyframe_and_the_edge_says_so(keyframes
     assert [one.keyframe for one in offsets] == [0, 0, 1, 1]
 
 
-def test_over_a_gap_the_map_turns_as_far_as_the_odometry_does(keyframes):
+def test_map_keeps_the_rotation_of_the_odometry_over_a_gap(keyframes):
     """A gyro measures the rotation; the odometry's frame and the map stay as they are."""
     before, turned = pose(z=9.0), pose(z=9.0, yaw=np.radians(60))
     told = steps(np.array([pose(), before, turned, turned @ pose(z=4.0)]))
@@ -196,7 +196,7 @@ def test_over_a_gap_the_map_turns_as_far_as_the_odometry_does(keyframes):
         kept.optimise()
 
 
-def test_where_no_way_is_known_a_turn_is_known_as_well_as_the_odometry_knows_it(keyframes):
+def test_rotation_covariance_without_a_translation_is_that_of_the_odometry(keyframes):
     before, turned = pose(z=9.0, yaw=0.4), pose(z=9.0, yaw=1.4)
     told, known, own = steps(np.array([pose(), before, turned])), np.eye(3) * 0.5, np.diag(
         [1e-8, 4e-8, 9e-8])
@@ -211,14 +211,14 @@ def test_where_no_way_is_known_a_turn_is_known_as_well_as_the_odometry_knows_it(
 
     # Along the axes of the camera before, and as unsure as independent edges are.
     grown = covariance(known + before[:3, :3] @ own @ before[:3, :3].T)
-    assert np.allclose(grown[3:, 3:], in_a_chain(own), rtol=1e-6)
+    assert np.allclose(grown[3:, 3:], inflated_for_chain(own), rtol=1e-6)
     assert np.array_equal(grown[:3], UNKNOWN_MOTION[:3])
     for turn, *status in ((None,), (known,), (known - own,), (known + 4 * np.eye(3),),
                           (known + own, Status.FIRST_FRAME)):
         assert np.array_equal(covariance(turn, *status), UNKNOWN_MOTION)
 
 
-def test_bad_frames_and_stationary_ones_are_passed_by(keyframes):
+def test_failed_and_stationary_frames_are_not_keyframes(keyframes):
     """The reference of a step may be the frame before the last, with that frame's keyframe."""
     told = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))
     told[3] = replace(told[3], previous_stamp_ns=told[1].stamp_ns)
@@ -254,14 +254,14 @@ def index(*keyframes):
     return places
 
 
-def test_a_place_seen_again_gets_most_votes(features):
+def test_revisited_place_gets_most_votes(features):
     votes = index(*features).votes(features[3], 3)
     assert votes.shape == (3,)
     assert votes[0] > 100
     assert votes[0] > 10 * max(votes[1:])
 
 
-def test_only_keyframes_from_before_get_votes(features):
+def test_only_earlier_keyframes_get_votes(features):
     places = index(*features)
     assert places.votes(features[3], 0).shape == (0,)
     assert np.array_equal(places.votes(features[3], 1), places.votes(features[3], 3)[:1])
@@ -273,7 +273,7 @@ def test_keyframes_without_features_get_no_votes(features):
     assert index(nothing).votes(features[0], 1).tolist() == [0]
 
 
-def test_votes_come_from_all_keyframes_however_many_there_are(features):
+def test_votes_cover_all_keyframes(features):
     """Also from those that were sorted into tables long ago, until they are forgotten."""
     places, few = index(), index(*features[:3]).votes(features[3], 3)
     for number in range(150):
@@ -287,7 +287,7 @@ def test_votes_come_from_all_keyframes_however_many_there_are(features):
 
 # Where keyframes are kept
 
-def test_a_file_gives_back_the_keyframes_that_were_put_there():
+def test_keyframe_file_round_trip():
     cards, estimator = Cards(), TwoViewEstimator()
     frames = [cards.frame(0.1 * i, pose(x=0.2 * i)) for i in range(4)]
     seen = [KeyframeImage(frame, estimator.features(frame.gray)) for frame in frames]
@@ -319,7 +319,7 @@ def test_keyframes_in_a_file_take_no_memory():
     tracemalloc.stop()
 
 
-def test_a_folder_without_room_is_said(tmp_path):
+def test_full_disk_is_reported(tmp_path):
     with pytest.raises(DjetError, match='nowhere'):
         KeyframeFile(tmp_path / 'nowhere')
     with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='free disk space'):
@@ -333,7 +333,7 @@ def test_a_folder_without_room_is_said(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
+def test_loops_do_not_depend_on_the_keyframe_storage():
     cards = Cards()
     poses = [pose(x=0.5 * i) for i in (*range(4), *range(2, -1, -1))]
     graph = chain(np.array(poses))
@@ -353,7 +353,7 @@ def test_it_makes_no_difference_to_loops_where_keyframes_are_kept():
         assert np.array_equal(edge.covariance, other.covariance)
 
 
-def test_loops_lead_over_a_step_back_in_time():
+def test_loops_are_found_over_a_step_back_in_time():
     """A clock that was set back makes none of what was before later than what is now."""
     cards, finder, found = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
     poses = [pose(x=0.5 * i) for i in (*range(4), *range(3, -1, -1))]
@@ -367,7 +367,7 @@ def test_loops_lead_over_a_step_back_in_time():
     assert (4, 3) not in found
 
 
-def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
+def test_loop_uses_the_newest_distortion_of_the_odometry():
     """The distortion found by landmarks at the end was not known at the beginning."""
     cards, k1 = Cards(), 0.06
     poses = [pose(x=0.5 * i, yaw=0.03 * i) for i in (*range(4), *range(2, -1, -1))]
@@ -379,7 +379,7 @@ def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
         finder, errors = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
         for i, here in enumerate(poses):
             frame = cards.frame(1 + 0.1 * i, here, noise=i)
-            seen = straight_image(frame.gray, K, 0.0, before=k1)[0] if bends else frame.gray
+            seen = undistort_image(frame.gray, K, 0.0, before=k1)[0] if bends else frame.gray
             finder.add(replace(frame, gray=seen), edges[i - 1] if i else None,
                        k1 if known and i > 3 else 0.0)
             for loop in finder.loops(i) if i > 3 else ():
@@ -395,7 +395,7 @@ def test_a_loop_is_seen_through_the_lens_as_the_odometry_knows_it():
     assert (known < unknown / 10).all()
 
 
-def test_no_loop_is_sought_between_images_of_two_sizes():
+def test_images_of_different_sizes_form_no_loop():
     cards, finder = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25, loop_votes=1))
     frames = [cards.frame(1 + i, pose(), noise=i) for i in range(2)]
     for frame in (*frames, replace(frames[0], stamp_ns=5 * 10**9, gray=frames[0].gray[:-6, :-10])):
@@ -412,7 +412,7 @@ def bonneted(frame, mask):
     return replace(frame, gray=gray, left_out=mask)
 
 
-def test_the_own_bonnet_gives_no_feature_of_a_place_and_no_match_of_a_loop():
+def test_masked_bonnet_has_no_features_or_matches():
     """At one place, at another, and at the first again, a little aside."""
     here, there = Cards(0), Cards(1)
     frames = [here.frame(1.0, pose()), there.frame(1.1, pose(x=5.0)),
@@ -460,7 +460,7 @@ def points():
 
 
 @pytest.mark.parametrize('motion', [pose(z=-0.4), pose(x=0.3, z=1.2, yaw=0.05), pose(x=-2.0)])
-def test_the_length_of_a_loop_is_told_by_the_depths_of_a_step(points, motion):
+def test_loop_length_comes_from_the_depths_of_a_step(points, motion):
     step, known = pose(z=-1.0, yaw=0.02), Length(1.0, 0.05, True)
     true = np.linalg.norm(motion[:3, 3])
     exact = transferred_length(seen(points, step), seen(points, motion), known, K)
@@ -472,7 +472,7 @@ def test_the_length_of_a_loop_is_told_by_the_depths_of_a_step(points, motion):
     assert exact.sigma < noisy.sigma < true
 
 
-def test_lengths_of_loops_err_as_much_as_they_say(points):
+def test_loop_lengths_are_consistent_with_their_sigma(points):
     step, motion = pose(z=-1.0, yaw=0.02), pose(x=0.3, z=1.2, yaw=0.05)
     true, errors = np.linalg.norm(motion[:3, 3]), []
     for seed in range(100):
@@ -484,7 +484,7 @@ def test_lengths_of_loops_err_as_much_as_they_say(points):
     assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
 
-def test_a_length_is_unknown_where_too_few_points_are_shared(points):
+def test_length_is_unknown_with_too_few_shared_points(points):
     step, other = seen(points[:40], pose(z=-1.0)), seen(points[30:], pose(x=1.0))
     assert not transferred_length(step, other, Length(1.0, 0.05, True), K).known
     # far points have no parallax, and so no depth
@@ -493,7 +493,7 @@ def test_a_length_is_unknown_where_too_few_points_are_shared(points):
                                   Length(1.0, 0.05, True), K).known
 
 
-def test_standing_where_one_has_been_is_a_loop_of_a_known_place():
+def test_loop_without_parallax_has_a_known_short_length():
     """The first view once more: no parallax, so no direction, but no farther than a step."""
     cards = Cards()
     poses = np.array([pose(x=0.5 * i) for i in range(3)] + [pose()])
@@ -517,7 +517,7 @@ def optimise():
     return optimise
 
 
-def test_a_graph_that_agrees_with_itself_stays_as_it_is(optimise):
+def test_consistent_graph_is_not_changed(optimise):
     true, _ = twice_round()
     graph = chain(true)
     graph = replace(graph, edges=(*graph.edges, loop(true, 60, 0), loop(true, 119, 59)))
@@ -526,7 +526,7 @@ def test_a_graph_that_agrees_with_itself_stays_as_it_is(optimise):
     assert (solution.trust > 0.99).all()
 
 
-def test_loops_take_the_drift_away(optimise):
+def test_loops_remove_drift(optimise):
     true, drifted = twice_round()
     graph = chain(drifted)
     loops = tuple(loop(true, 60 + i, i) for i in range(0, 60, 5))
@@ -539,7 +539,7 @@ def test_loops_take_the_drift_away(optimise):
     assert error(after) < error(drifted) / 5
 
 
-def test_wrong_loops_are_not_trusted_and_change_nothing(optimise):
+def test_outlier_loops_are_rejected(optimise):
     true, drifted = twice_round()
     graph = chain(drifted)
     good = tuple(loop(true, 60 + i, i) for i in range(0, 60, 5))
@@ -553,7 +553,7 @@ def test_wrong_loops_are_not_trusted_and_change_nothing(optimise):
     assert np.allclose(solution.graph.poses, clean.graph.poses, atol=0.05)
 
 
-def test_a_loop_of_unknown_length_still_tells_directions(optimise):
+def test_loop_of_unknown_length_constrains_directions(optimise):
     true, drifted = twice_round()
     graph = chain(drifted)
     loops = []
@@ -570,7 +570,7 @@ def test_a_loop_of_unknown_length_still_tells_directions(optimise):
         drifted[:, :3, 3], true[:, :3, 3]) / 5
 
 
-def test_a_singular_covariance_is_refused_with_the_name_of_its_edge(optimise):
+def test_singular_covariance_of_an_edge_is_refused_by_name(optimise):
     true, _ = twice_round()
     graph = chain(true)
     bad = replace(loop(true, 60, 0), covariance=np.ones((6, 6)))
@@ -628,7 +628,7 @@ def closed(drive, tmp_path_factory):
     return out
 
 
-def test_the_command_closes_loops_of_a_recording(closed):
+def test_slam_command_closes_loops_of_a_recording(closed):
     said = json.loads((closed / 'slam.json').read_text())
     assert (said['scale'], said['scale_kind'], said['scale_uncertainty']) == (
         'ground_truth', 'metric', 0.05)
@@ -645,7 +645,7 @@ def test_the_command_closes_loops_of_a_recording(closed):
     assert min(size[:2]) > 400
 
 
-def test_its_loops_are_as_sure_as_they_say(closed):
+def test_loop_errors_are_consistent_with_their_covariance(closed):
     rows = [row.split(',') for row in (closed / 'pose_graph.csv').read_text().splitlines()]
     stamps, truth = read_tum(closed / 'truth_tum.txt')
     at = dict(zip(stamps.tolist(), truth))
@@ -664,7 +664,7 @@ def test_its_loops_are_as_sure_as_they_say(closed):
 
 
 @pytest.mark.slow
-def test_the_command_takes_results_too_and_wherever_their_recording_went(
+def test_slam_command_accepts_results_and_a_moved_recording(
         closed, drive, tmp_path):
     results = closed / 'replay'
     djet('slam', results, '--output', tmp_path / 'again', *FLAGS)
@@ -685,7 +685,7 @@ def test_the_command_takes_results_too_and_wherever_their_recording_went(
     djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
 
 
-def test_the_odometry_tells_its_keyframes_alike_in_messages_and_in_results(closed, tmp_path):
+def test_keyframes_agree_between_messages_and_results(closed, tmp_path):
     from djet_ros.posegraph.step_messages import StepMessages
     from djet_ros.recordings.bags import Bag
     from djet_ros.replay.graph_of_results import read_steps
@@ -705,7 +705,7 @@ def test_the_odometry_tells_its_keyframes_alike_in_messages_and_in_results(close
     assert said['keyframes'] == len(chosen)
 
 
-def test_the_command_keeps_earlier_results_and_parameters(closed, tmp_path):
+def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     refused = djet('slam', closed / 'replay', '--output', closed, *FLAGS, expect=2)
     assert '--overwrite' in refused.stderr
     refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--links', 0, expect=2)
@@ -731,7 +731,7 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
                 if path.is_file()} == before
 
 
-def test_a_run_over_earlier_results_leaves_none_of_them(closed, drive, tmp_path):
+def test_overwriting_run_removes_all_earlier_results(closed, drive, tmp_path):
     out = tmp_path / 'slam'
     shutil.copytree(closed, out)
     (out / 'notes.txt').write_text('mine')

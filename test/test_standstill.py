@@ -39,12 +39,12 @@ def after_a_stand() -> Standstill:
     return standstill
 
 
-def test_what_stood_tells_that_the_camera_stands_however_little_of_it_is_left() -> None:
+def test_static_features_prove_a_standstill_however_few_are_visible() -> None:
     for stand, stationary in ((200, True), (15, True), (3, False)):
         assert after_a_stand().detect(behind_a_lorry(stand), MOST, at_rest=True) is stationary
 
 
-def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
+def test_static_features_need_a_gyro_at_rest_and_a_standstill_before() -> None:
     assert not after_a_stand().detect(behind_a_lorry(40), MOST, at_rest=False)
     assert not Standstill().detect(behind_a_lorry(40), MOST, at_rest=True)
     elsewhere = after_a_stand()
@@ -52,7 +52,7 @@ def test_it_takes_a_gyro_that_felt_nothing_and_a_world_that_is_known() -> None:
     assert not elsewhere.detect(behind_a_lorry(40), MOST, at_rest=True)
 
 
-def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_is_known() -> None:
+def test_a_standstill_after_motion_needs_more_still_matches_than_at_first() -> None:
     for share, first, later in ((0.3, True, True), (0.1, True, False), (0.03, False, False)):
         pair = seen(WORLD, WORLD + np.where(np.arange(400) < 400 * share, 0, 60)[:, None] * RIGHT)
         standstill = Standstill()
@@ -61,7 +61,7 @@ def test_a_camera_that_has_moved_takes_more_to_stand_than_one_of_which_nothing_i
         assert standstill.detect(pair, MOST, at_rest=True) is later
 
 
-def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> None:
+def test_distant_features_are_no_standstill_of_a_camera_that_starts() -> None:
     """A few static features are in the sky, all others follow the motion of the camera."""
     y = WORLD + np.random.default_rng(6).uniform(2, 40, (400, 1)) * RIGHT
     y[:15] = WORLD[:15]
@@ -74,7 +74,7 @@ def test_a_camera_that_sets_off_does_not_stand_for_what_is_infinitely_far() -> N
     assert not after_a_stand().detect(few, MOST, at_rest=True)
 
 
-def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
+def test_a_creeping_camera_is_stationary_only_briefly() -> None:
     """Near features move slightly at first, far ones later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
     stationary = [after_a_stand().detect(
@@ -83,7 +83,7 @@ def test_a_camera_that_creeps_does_not_stand_for_long() -> None:
     assert stationary == [True, False, False, False]
 
 
-def test_a_lorry_that_stood_as_well_tells_nothing_once_it_drove_on() -> None:
+def test_a_lorry_that_stood_and_left_is_not_static() -> None:
     standstill, lorry = after_a_stand(), np.arange(400) < 150
     away = seen(WORLD, WORLD + np.where(lorry[:, None], (30.0, 0), (0.0, 0)), lorry)
     assert standstill.detect(away, MOST, at_rest=True)

@@ -9,12 +9,13 @@ from djet_ros.core.covariance import lift
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
-from djet_ros.core.landmark_choice import around_patches, PATCH
+from djet_ros.core.landmark_choice import PATCH, surrounding_means
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
-from djet_ros.core.window import Addition, Window, WINDOW_TUNING
+from djet_ros.core.window import Window, WINDOW_TUNING, WindowStep
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.result import camera_motion
 from djet_ros.odometry.scale import (
     ConstantScale,
     Length,
@@ -26,7 +27,7 @@ from djet_ros.odometry.scale import (
 )
 from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
-from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 
@@ -77,7 +78,7 @@ def test_the_first_step_is_the_unit_of_all_that_follow(cards):
     assert all(result.scale_kind is Scale.RELATIVE for result in results)
 
 
-def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
+def test_a_shaking_rotation_away_from_landmarks_keeps_the_scale(cards):
     drive = Drive(cards)
     before = drive.go(steps(WAYS[:4]))
     # Half of the landmarks are out of view for so many frames that, were each one a keyframe, all
@@ -91,7 +92,7 @@ def test_a_hand_that_turns_aside_and_trembles_keeps_the_scale(cards):
     assert lengths(before + after) * WAYS[0] == pytest.approx(np.array(WAYS[:8]), rel=0.03)
 
 
-def test_structure_takes_over_from_another_scale_on_the_way(cards):
+def test_landmarks_take_over_from_another_scale_while_running(cards):
     drive = Drive(cards, scale='constant', scale_value=1.0)
     drive.go(steps()[:2])
     for scale in ('structure', 'none', 'structure'):
@@ -105,7 +106,7 @@ def test_structure_takes_over_from_another_scale_on_the_way(cards):
             assert ratios == pytest.approx(np.full(4, ratios[0]), rel=0.03)
 
 
-def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards):
+def test_the_sigma_of_a_step_is_that_of_its_parallax_and_not_of_the_unit(cards):
     results = Drive(cards).go(steps())[1:]
     lengths_of, sigmas = [], []
     for result in results:
@@ -119,7 +120,7 @@ def test_a_step_is_as_sure_as_its_parallax_and_the_unit_is_no_error_of_it(cards)
     assert np.all(np.abs(off) < 3.5 * np.array(sigmas))
 
 
-def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_has_them(cards):
+def test_an_ambiguous_pair_that_agrees_with_the_landmarks_keeps_the_scale(cards):
     estimator, ways, here = TwoViewEstimator(ESTIMATOR), [*[0.32] * 6, 0.46, 0.46, 0.32], np.eye(4)
     views, scale = [], TrackScale()
     for number, way in enumerate([0, *ways]):
@@ -146,7 +147,7 @@ def test_a_pair_in_doubt_does_not_cost_the_scale_where_landmarks_are_where_it_ha
     assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # interrupted: at the last speed
 
 
-def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
+def test_standing_still_and_rotating_in_place_keep_the_scale(cards):
     drive = Drive(cards)
     before = lengths(drive.go(steps()[:5]))
     rest = drive.go([np.eye(4)] * 3)
@@ -158,7 +159,7 @@ def test_standing_still_and_turning_on_the_spot_keep_the_scale(cards):
     assert after == pytest.approx(1, rel=0.05)
 
 
-def test_after_a_turn_on_the_spot_steps_are_expected_to_be_as_long_as_before_it(cards):
+def test_a_rotation_in_place_does_not_change_the_expected_length(cards):
     drive = Drive(cards)
     drive.go(steps()[:5])
     expected = drive.odometry._scale._speed
@@ -167,7 +168,7 @@ def test_after_a_turn_on_the_spot_steps_are_expected_to_be_as_long_as_before_it(
     assert drive.odometry._scale._speed == expected
 
 
-def test_a_turn_beyond_all_that_was_seen_leaves_the_scale_to_one_guess():
+def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
     scene = make_scene('indoor', 0, (320, 240))
     poses, turn = list(scene.trajectory(6)), pose(yaw=0.06)
     for _ in range(30):
@@ -186,7 +187,7 @@ def test_a_turn_beyond_all_that_was_seen_leaves_the_scale_to_one_guess():
 
 
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
-def test_a_way_too_slow_for_parallax_from_frame_to_frame_adds_up(cards, way):
+def test_motion_too_slow_for_parallax_from_frame_to_frame_accumulates(cards, way):
     drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
     start = drive.go(steps(WAYS[:4]))[-1].pose
     results = drive.go(slow)
@@ -198,7 +199,7 @@ def test_a_way_too_slow_for_parallax_from_frame_to_frame_adds_up(cards, way):
 
 
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
-def test_a_way_too_slow_for_parallax_adds_up_before_there_are_landmarks(cards, way):
+def test_motion_too_slow_for_parallax_accumulates_before_there_are_landmarks(cards, way):
     speed = SpeedScale()
     for i in range(80):
         speed.add_speed(i * 10**8, way * 10)
@@ -239,7 +240,7 @@ def test_without_any_parallax_there_is_no_unit_yet(cards):
     assert drive.go(steps()[:2])[0].scale == pytest.approx(1)
 
 
-def test_a_speed_makes_metres_and_landmarks_carry_them_on_where_it_falls_silent(cards):
+def test_a_speed_makes_the_scale_metric_and_landmarks_carry_it_without_speeds(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     measured = []
@@ -263,7 +264,7 @@ def sigma(result):
     return float(np.sqrt(along @ result.motion_covariance[:3, :3] @ along))
 
 
-def test_one_wild_speed_does_not_change_the_scale(cards):
+def test_one_outlier_of_the_speeds_does_not_change_the_scale(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     speeds.add_speed(0, 2.0)
@@ -292,7 +293,7 @@ def test_the_window_keeps_few_views(cards):
     assert (window.landmarks()[:, 2] > 0).mean() > 0.9
 
 
-def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards):
+def test_landmarks_leave_the_window_once_each_at_their_true_position(cards):
     drive, depths = Drive(cards), []
     for number in range(36):
         result, = drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03)])
@@ -305,7 +306,7 @@ def test_landmarks_that_leave_the_window_lie_where_they_are_each_but_once(cards)
     assert np.median(off) < 0.03
 
 
-def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_them(cards):
+def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
     """Sideways any depth fits two frames, as the epipolar lines are horizontal."""
     ways = [pose(x=0.32)] * 8
     pair = Drive(cards).go(ways)[-1].relative
@@ -322,7 +323,7 @@ def test_two_frames_that_give_other_depths_than_those_before_do_not_agree_with_t
     assert scale.agrees(aside, pair.x[few], wrong[few]) is None
 
 
-def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_too(cards):
+def test_landmarks_seen_between_keyframes_contradict_other_depths_too(cards):
     """In slow motion only the first two frames are kept, though many confirmed their depths."""
     ways = [pose(x=0.04)] * 7
     pair = Drive(cards).go(ways)[-1].relative
@@ -331,11 +332,11 @@ def test_landmarks_that_frames_between_keyframes_saw_speak_against_other_depths_
     window = drive.odometry._scale._window
     assert len(window._views) == 3
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    agree, asked = window.agreement(aside, pair.x, pair.y_opt)
+    agree, asked = window.count_agreeing(aside, pair.x, pair.y_opt)
     assert asked > 50 and agree > 0.9 * asked
 
 
-def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
+def test_parallax_that_depths_do_not_confirm_is_noise(cards):
     """The residual of a blurred rotation has any size and sign, wherever landmarks are."""
     ways = [pose(x=0.16, z=0.12)] * 8
     pair = Drive(cards).go(ways)[-1].relative
@@ -343,7 +344,7 @@ def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
     drive.go(ways[:-1])
     scale = drive.odometry._scale  # as it was before the last frame
     assert not scale.lacks_parallax(pair)
-    length, error = scale._window.told_length(pair)
+    length, error = scale._window.pair_length(pair)
     assert length == pytest.approx(1, rel=0.05) and error < 0.02
     rng, none = np.random.default_rng(5), 0
     for _ in range(20):
@@ -356,14 +357,14 @@ def test_a_parallax_that_no_depths_bear_out_is_noise(cards):
     assert not scale.lacks_parallax(pair)
 
 
-def test_another_estimator_goes_on_at_the_last_speed(cards):
+def test_another_estimator_continues_at_the_last_speed(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12)] * 3)
     drive.odometry.configure(EstimatorConfig(max_features=600), OdometryConfig(), RelativeScale())
     assert lengths(drive.go([pose(x=0.16, z=0.12)] * 2)) == pytest.approx(1, rel=0.05)
 
 
-def test_where_a_landmark_is_seen_does_not_hang_on_where_it_was_expected(cards):
+def test_the_measurement_of_a_landmark_does_not_depend_on_its_prediction(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.03)] * 4)
     window = drive.odometry._scale._window
@@ -397,19 +398,19 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)
 
 
-def test_near_is_told_by_what_is_beyond_a_patch():
+def test_depth_around_a_patch_is_that_of_its_next_but_one_neighbours():
     rng = np.random.default_rng(3)
     points, values = rng.uniform(0, (600, 180), (300, 2)), rng.normal(size=300)
     cells = np.floor((points - np.minimum(points.min(0), 0)) / PATCH)
     apart = np.abs(cells[:, None] - cells).max(2)
     expected = [values[mask].mean() if mask.any() else values.mean() for mask in apart == 2]
-    assert around_patches(points, values) == pytest.approx(expected)
-    assert not len(around_patches(points[:0], values[:0]))
+    assert surrounding_means(points, values) == pytest.approx(expected)
+    assert not len(surrounding_means(points[:0], values[:0]))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('seed', [1, 3])
-def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(seed: int) -> None:
+def test_pauses_with_hardly_any_motion_do_not_lose_the_scale(seed: int) -> None:
     """A hand-held camera pauses, and new landmarks have hardly any parallax."""
     scene = make_scene('handheld', seed, (480, 360))
     poses, odometry = scene.trajectory(80), VisualOdometry(EstimatorConfig(max_features=1000))
@@ -421,7 +422,7 @@ def test_where_the_camera_hardly_moves_in_between_the_scale_does_not_go_astray(s
 
 
 @pytest.mark.parametrize('seed', [0, 1, 4, 6])
-def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
+def test_fast_rotations_keep_the_scale(seed: int) -> None:
     """At 15 degrees a frame landmarks leave the view after a few, at times all at once."""
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
     poses = scene.trajectory(36)
@@ -434,7 +435,7 @@ def test_a_camera_that_is_whirled_about_keeps_the_scale(seed: int) -> None:
 
 @pytest.mark.parametrize('frames_per_second', [10, 30])
 @pytest.mark.parametrize('size', [0.1, 0.025])
-def test_a_slow_camera_is_metric_however_fast_its_frames_come(cards, size, frames_per_second):
+def test_a_slow_camera_is_metric_at_any_frame_rate(cards, size, frames_per_second):
     """At 30 frames a second each step is 7 mm, or 1.75 mm, and the speed is known to a mm."""
     speeds = SpeedScale()
     odometry, here, ns, results = VisualOdometry(ESTIMATOR, OdometryConfig(), speeds), 0.0, 0, []
@@ -451,7 +452,7 @@ def test_a_slow_camera_is_metric_however_fast_its_frames_come(cards, size, frame
     assert lengths(told) == pytest.approx(np.full(24, 2.1 * size / frames_per_second), rel=0.05)
 
 
-def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
+def test_speeds_of_zero_do_not_observe_the_scale(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     speeds.add_speed(0, 0.0)
@@ -469,7 +470,7 @@ def test_wheels_that_stand_do_not_tell_how_long_lengths_are(cards):
     assert np.linalg.norm(silent.motion[:3, 3]) == pytest.approx(0.2, rel=0.05)
 
 
-def test_a_constant_length_that_is_wrong_is_wrong_alike_in_all_steps(cards):
+def test_the_error_of_a_constant_length_is_common_to_all_steps(cards):
     frame, scale, count = cards.frame(0.0), TrackScale(), 100
     view = TwoViewEstimator(ESTIMATOR).view(frame.gray, frame.K)
     scale.configure(ESTIMATOR, ConstantScale(1.0, 0.05), 0.05)
@@ -485,7 +486,7 @@ def test_a_constant_length_that_is_wrong_is_wrong_alike_in_all_steps(cards):
     assert np.sqrt(path.pose[2, 2]) == pytest.approx(0.05 * count, rel=1e-3)
 
 
-def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
+def test_after_a_gap_a_standing_camera_is_no_longer_metric(cards):
     speeds = SpeedScale()
     drive = Drive(cards, speeds, max_gap=2.0)
     for _ in range(3):
@@ -501,10 +502,10 @@ def test_after_a_gap_a_camera_that_stands_is_no_longer_sure_of_metres(cards):
 
 
 @pytest.mark.parametrize('source', [RelativeScale(), ConstantScale(1.2)])
-def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(source):
+def test_a_rotation_without_landmarks_has_the_uncertainty_of_a_usual_step(source):
     """Without landmarks the newest frame in the window is determined by rounding only."""
     ahead = np.array([0, 0, -1.0])
-    added = [Addition(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
+    added = [WindowStep(np.eye(3), length * ahead, length, sigma, sigma**2 * np.eye(6), np.eye(4))
              for length, sigma in ((1.0, 1e-3), (0.02, 800.0))]
     source.exact, source.uses_landmarks = False, True
     scale = TrackScale()
@@ -523,10 +524,10 @@ def test_a_turn_of_which_landmarks_tell_nothing_may_have_gone_as_far_as_usual(so
     assert np.exp(scale._filter.log) == pytest.approx(usual)
 
 
-def test_where_landmarks_tell_the_way_of_a_pair_without_parallax_both_covariances_are_theirs():
+def test_motion_and_covariances_without_parallax_are_those_of_the_window():
     ahead, aside = np.array([0, 0, -1.0]), np.array([0.5, 0, 0])
     sure = np.diag([1, 2, 3, 4, 5, 6]) * 1e-6
-    added = [Addition(np.eye(3), t, float(np.linalg.norm(t)), 1e-3, sure, np.eye(4))
+    added = [WindowStep(np.eye(3), t, float(np.linalg.norm(t)), 1e-3, sure, np.eye(4))
              for t in (ahead, aside)]
     scale = TrackScale()
     scale.configure(ESTIMATOR, RelativeScale(), 0.0)
@@ -561,7 +562,7 @@ def factors(metres, alike):
 
     alike: correlation length in metres.
     """
-    step = Addition(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
+    step = WindowStep(np.eye(3), np.array([0, 0, -1.0]), 1.0, 0.002, np.eye(6) * 1e-6, np.eye(4))
     scale = TrackScale()
     scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
     # A window with steps of constant length, with a sigma of 0.2 %.
@@ -576,7 +577,7 @@ def factors(metres, alike):
     return np.array(found).T
 
 
-def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_says():
+def test_the_variance_of_the_factor_is_consistent_with_correlated_lengths():
     rng, squares = np.random.default_rng(0), {0: [], 8: []}
     for _ in range(60):
         metres = np.exp(np.repeat(rng.normal(0, 0.02, 20), 8))
@@ -588,7 +589,7 @@ def test_where_lengths_over_one_stretch_err_alike_the_factor_is_as_sure_as_it_sa
     assert np.mean(squares[0]) > 3
 
 
-def test_of_the_error_of_a_factor_as_much_is_kept_as_measurements_leave_of_it():
+def test_the_kept_share_of_the_error_is_what_updates_leave_of_it():
     rng = np.random.default_rng(1)
     runs = np.array([factors(np.exp(rng.normal(0, 0.02, 4)), alike=0) for _ in range(400)])
     errors, kept = runs[:, 0], runs[0, 2]
@@ -598,7 +599,7 @@ def test_of_the_error_of_a_factor_as_much_is_kept_as_measurements_leave_of_it():
         assert one @ next_one / (one @ one) == pytest.approx(kept[before + 1], abs=0.12)
 
 
-def test_a_lawn_as_long_as_the_ground_in_sight_does_not_make_another_scale():
+def test_outliers_as_long_as_the_visible_ground_do_not_change_the_scale():
     metres = np.ones(160)
     metres[80:95] = 0.8
     logs, *_ = factors(metres, alike=8)

@@ -10,12 +10,12 @@ from djet_ros.core.hamming import dense_descriptors, smooth
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import indefinite, Paraboloids
 from djet_ros.core.surfaces import (
-    contrast_of,
-    contrasts_of,
+    contrast_ratio,
+    contrast_ratios,
     DescriptorSurface,
     PhotometricSurface,
     ReprojectionSurface,
-    with_minimum,
+    resolve_indefinite,
 )
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_the_descriptor_surface_is_fitted_to_the_hamming_distances_around_the_ne
     previous, current = (view(one.gray, config) for one in pair)
     x, y = np.array([[60.4, 50.0], [90.0, 70.6]]), np.array([[64.2, 48.7], [88.0, 66.4]])
     surface = DescriptorSurface(previous, current, x, config)
-    fitted = surface.around(y)
+    fitted = surface.fit_around(y)
     assert fitted.usable.all()
     assert np.array_equal(fitted.centres, [[64, 49], [88, 66]])
     radius = side // 2
@@ -80,7 +80,7 @@ def test_the_reference_point_stays_sub_pixel_though_its_descriptor_is_of_a_whole
         surface = DescriptorSurface(view(image, config), view(image, config), x, config)
         assert np.array_equal(surface.x, x)
         # As in the paper, the sub-pixel part is discarded.
-        assert np.allclose(surface.around(x).centres, np.rint(x) + ahead)
+        assert np.allclose(surface.fit_around(x).centres, np.rint(x) + ahead)
 
 
 def test_references_between_pixels_reduce_the_bias_of_the_minimum():
@@ -96,7 +96,7 @@ def test_references_between_pixels_reduce_the_bias_of_the_minimum():
     surface = DescriptorSurface(before, after, x, EstimatorConfig())
     errors, y, as_it_was = [], x + np.rint(shift), np.repeat(np.eye(3, 2)[None], len(x), axis=0)
     for warp in (None, as_it_was, as_it_was):
-        fitted, _ = with_minimum(surface.around(y, warp), 'project')
+        fitted, _ = resolve_indefinite(surface.fit_around(y, warp), 'project')
         y = np.clip(fitted.minima(), y - 1, y + 1)
         errors.append(np.median(np.linalg.norm(y - x - shift, axis=1)))
     assert errors[2] < 0.7 * errors[0]
@@ -111,7 +111,7 @@ def test_a_descriptor_surface_has_its_minimum_at_the_image_shift():
     surface = DescriptorSurface(view(image), view(moved), x, EstimatorConfig())
     y = x + shift + (1, -1)  # started beside the right place, the window follows the minimum
     for _ in range(3):
-        fitted, _ = with_minimum(surface.around(y), 'project')
+        fitted, _ = resolve_indefinite(surface.fit_around(y), 'project')
         y = np.clip(fitted.minima(), y - 1, y + 1)
     assert np.median(np.linalg.norm(y - x - shift, axis=1)) < 0.25
 
@@ -123,13 +123,13 @@ def test_a_reused_descriptor_surface_equals_a_new_one(pair, warped):
     warp = np.repeat([np.diag([1.1, 0.95, 0])[:, :2]], 30, axis=0) if warped else None
     surface = DescriptorSurface(*pair, x, EstimatorConfig())
     y = x.copy()
-    surface.around(y)
+    surface.fit_around(y)
     for _ in range(4):
         y = y + rng.normal(0, 1.0, y.shape) * (rng.uniform(size=(30, 1)) < 0.5)
-        asked = surface.around(y, warp)
+        asked = surface.fit_around(y, warp)
         new = DescriptorSurface(*pair, x, EstimatorConfig())
-        new.around(x)  # the contrast is measured where matches are first seen
-        fresh = new.around(y, warp)
+        new.fit_around(x)  # the contrast is measured where matches are first seen
+        fresh = new.fit_around(y, warp)
         for name in ('centres', 'A', 'b', 'c', 'usable'):
             assert np.allclose(getattr(asked, name), getattr(fresh, name), 1e-9), name
 
@@ -141,8 +141,8 @@ def test_a_surface_without_a_warp_ignores_earlier_warps(
         pair, kind, warp):
     x = np.random.default_rng(37).uniform((40, 40), np.subtract(SIZE, 40), (30, 2))
     asked, new = (kind(*pair, x, EstimatorConfig()) for _ in range(2))
-    asked.around(x, np.repeat(warp[None], len(x), axis=0))
-    again, first = asked.around(x), new.around(x)
+    asked.fit_around(x, np.repeat(warp[None], len(x), axis=0))
+    again, first = asked.fit_around(x), new.fit_around(x)
     for name in ('centres', 'A', 'b', 'c', 'usable'):
         assert np.array_equal(getattr(again, name), getattr(first, name)), name
 
@@ -170,7 +170,7 @@ def test_warped_references_reduce_the_error_of_minima(name):
     errors = {}
     for warp in (None, warps):
         surface = DescriptorSurface(previous, current, x, EstimatorConfig())
-        fitted, _ = with_minimum(surface.around(y, warp), 'project')
+        fitted, _ = resolve_indefinite(surface.fit_around(y, warp), 'project')
         errors[warp is None] = np.median(np.linalg.norm(fitted.minima() - y, axis=1))
     assert errors[False] < 0.7 * errors[True]
 
@@ -179,7 +179,7 @@ def test_warped_references_reduce_the_error_of_minima(name):
 @pytest.mark.parametrize('name', WARPS)
 def test_warped_references_reduce_the_residual(kind, name):
     previous, current, x, (y, warps) = warped(WARPS[name])
-    plain, seen = (np.median(kind(previous, current, x, EstimatorConfig()).around(y, warp).c)
+    plain, seen = (np.median(kind(previous, current, x, EstimatorConfig()).fit_around(y, warp).c)
                    for warp in (None, warps))
     assert seen < plain
 
@@ -201,7 +201,7 @@ def test_after_a_large_rotation_minima_are_biased_unless_warps_are_projective(tu
         grown = 1 / (np.column_stack([x, np.ones(len(x))]) @ H[2])
         for name, rows in zip(off, (1, 0)):
             warp = patch_warp(camera, R, y, grown) * [[1], [1], [rows]]
-            fits = DescriptorSurface(view(image), view(turned), x, EstimatorConfig()).around(
+            fits = DescriptorSurface(view(image), view(turned), x, EstimatorConfig()).fit_around(
                 y, warp)
             off[name].append(np.median((fits.minima() - y)[fits.usable], axis=0))
     together = {name: np.linalg.norm(np.mean(means, axis=0)) for name, means in off.items()}
@@ -212,7 +212,7 @@ def test_the_identity_warp_changes_nothing_on_whole_pixels(pair):
     x = np.array([[60.0, 50.0], [90.0, 71.0]])
     config = EstimatorConfig(window=3, grading=0.0)
     pair = [view(one.gray, config) for one in pair]
-    plain, same = (DescriptorSurface(*pair, x, config).around(x + 2.0, warp)
+    plain, same = (DescriptorSurface(*pair, x, config).fit_around(x + 2.0, warp)
                    for warp in (None, np.repeat(np.eye(3, 2)[None], 2, axis=0)))
     assert np.array_equal(plain.A, same.A) and np.array_equal(plain.c, same.c)
 
@@ -227,7 +227,7 @@ def test_points_without_descriptors_at_the_border_have_no_surface(pair, side):
     x[6], x[7] = (REACH, height - 1 - REACH), (REACH - 1, 60)
     config = EstimatorConfig(window=side, patch_scale=1.0)
     surface = DescriptorSurface(*(view(one.gray, config) for one in pair), x, config)
-    fitted = surface.around(y)
+    fitted = surface.fit_around(y)
     assert fitted.usable.tolist() == [True, True, False, True, False, False, True, False]
     assert np.array_equal(fitted.centres, y)
 
@@ -254,7 +254,7 @@ def test_the_photometric_surface_is_the_papers_lucas_kanade_sums(pair, side, sig
     x = np.array([[60.0, 50.0], [90.3, 70.62], [33.141, 88.007]])
     y = np.array([[64.0, 49.0], [88.47, 66.81], [41.99, 77.53]])
     config = EstimatorConfig(method='pjet', window=side, window_sigma=sigma)
-    fitted = PhotometricSurface(previous, current, x, config).around(y)
+    fitted = PhotometricSurface(previous, current, x, config).fit_around(y)
     assert fitted.usable.all() and np.array_equal(fitted.centres, y)
     I_A, I_B = previous.smoothed.astype(float), current.smoothed.astype(float)
     radius = side // 2
@@ -281,7 +281,7 @@ def test_the_minimum_of_the_photometric_surface_is_the_shift_of_a_smooth_image(s
                                  EstimatorConfig(method='pjet', window=15, window_sigma=0.0))
     y = x
     for _ in range(4):
-        y = surface.around(y).minima()
+        y = surface.fit_around(y).minima()
     errors = np.linalg.norm(y - x - shift, axis=1)
     assert np.median(errors) < 0.02
     assert errors.max() < 0.15
@@ -295,15 +295,15 @@ def test_the_photometric_surface_needs_its_windows_inside_both_images(pair):
     places = np.array(inside + outside, float)
     middle = np.full_like(places, 60.0)
     expected = [True] * 3 + [False] * 4
-    assert PhotometricSurface(*pair, middle, config).around(places).usable.tolist() == expected
-    assert PhotometricSurface(*pair, places, config).around(middle).usable.tolist() == expected
+    assert PhotometricSurface(*pair, middle, config).fit_around(places).usable.tolist() == expected
+    assert PhotometricSurface(*pair, places, config).fit_around(middle).usable.tolist() == expected
 
 
 def test_the_reprojection_surface_is_the_squared_distance_to_the_observed_point():
     rng = np.random.default_rng(36)
     x, y, keypoints, places = rng.uniform(0, 500, (4, 25, 2))
     surface = ReprojectionSurface(x, y)
-    for fitted in (surface.around(y), surface.around(keypoints)):
+    for fitted in (surface.fit_around(y), surface.fit_around(keypoints)):
         assert np.allclose(fitted.values(places), ((places - y)**2).sum(1))
         assert np.allclose(fitted.minima(), y)
         assert fitted.usable.all()
@@ -316,7 +316,7 @@ def test_surfaces_without_a_minimum_are_counted_and_treated_by_policy(policy):
                   np.diag([1.0, -1.0])])
     usable = np.array([True, True, True, True, False])  # the last one is out already
     before = Paraboloids(np.zeros((5, 2)), A, np.ones((5, 2)), np.arange(5.0), usable)
-    after, count = with_minimum(before, policy)
+    after, count = resolve_indefinite(before, policy)
     assert count == 2
     assert np.array_equal(after.b, before.b) and np.array_equal(after.c, before.c)
     if policy == 'project':
@@ -339,12 +339,12 @@ def test_in_an_image_smaller_than_a_window_no_point_has_a_surface(pair, kind):
     points = np.array([[4.0, 4.0], [70.0, 60.0]])
     for previous, current in ((tiny, tiny), (pair[0], tiny), (tiny, pair[0])):
         surface = kind(previous, current, points, EstimatorConfig(window=15))
-        assert not surface.around(points).usable.any()
+        assert not surface.fit_around(points).usable.any()
 
 
 def test_contrast_ratios_of_several_images_are_those_of_each():
     here, there = np.random.default_rng(2).lognormal(sigma=2, size=(2, 18))
     counts = np.array([1, 4, 2, 11])
     parts = zip(*(np.split(strengths, np.cumsum(counts)[:-1]) for strengths in (here, there)))
-    each = [contrast_of(*part) for part in parts]
-    np.testing.assert_array_equal(contrasts_of(here, there, counts), np.repeat(each, counts))
+    each = [contrast_ratio(*part) for part in parts]
+    np.testing.assert_array_equal(contrast_ratios(here, there, counts), np.repeat(each, counts))

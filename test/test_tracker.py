@@ -8,7 +8,7 @@ from cards import Cards, K, pose, SIZE
 import cv2
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
-from djet_ros.core.masks import at
+from djet_ros.core.masks import masked_at
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.debug_image import debug_image
@@ -124,7 +124,7 @@ def meddle(one, number):
         one.reset()
 
 
-def test_images_that_are_expected_come_out_as_if_they_were_not(drive, threads):
+def test_images_prepared_ahead_give_the_same_results(drive, threads):
     def results(ahead):
         """Return all messages of images, of which so many are prepared ahead."""
         one = tracker()
@@ -133,7 +133,7 @@ def test_images_that_are_expected_come_out_as_if_they_were_not(drive, threads):
         out = []
         for i, message in enumerate(messages):
             for following in messages[i + 1:i + 1 + ahead]:
-                one.expect(following)
+                one.prepare_ahead(following)
             meddle(one, i)
             out.append([serialised(what) for topic, what in one.image(message)
                         if topic != '/diagnostics'])
@@ -144,7 +144,7 @@ def test_images_that_are_expected_come_out_as_if_they_were_not(drive, threads):
     assert results(1) == results(2) == results(3) == alone
 
 
-def test_a_mask_holds_for_an_image_that_was_expected_before_it_came(drive, threads):
+def test_a_mask_applies_to_an_image_that_was_prepared_before_it_came(drive, threads):
     hidden = np.full(SIZE[::-1], 255, np.uint8)
     hidden[:, :SIZE[0] // 2] = 0
 
@@ -153,7 +153,7 @@ def test_a_mask_holds_for_an_image_that_was_expected_before_it_came(drive, threa
         messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive[:3])]
         for i, message in enumerate(messages):
             if ahead and i + 1 < len(messages):
-                one.expect(messages[i + 1])
+                one.prepare_ahead(messages[i + 1])
             one.mask(image(hidden, stamp_ns=ns(0.1 * i)))
             one.image(message)
         return one.last.relative
@@ -164,7 +164,7 @@ def test_a_mask_holds_for_an_image_that_was_expected_before_it_came(drive, threa
     np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
 
 
-def test_what_the_lens_does_not_show_tells_nothing_expected_or_not(drive, threads):
+def test_unseen_pixels_are_ignored_prepared_ahead_or_not(drive, threads):
     D = np.array([0.3, 0.1, 0, 0, 0])
     unseen = Camera(K, D, SIZE).unseen(SIZE[::-1])
 
@@ -174,24 +174,24 @@ def test_what_the_lens_does_not_show_tells_nothing_expected_or_not(drive, thread
         messages = [image(gray, stamp_ns=ns(0.1 * i)) for i, gray in enumerate(drive[:3])]
         for i, message in enumerate(messages):
             if ahead and i + 1 < len(messages):
-                one.expect(messages[i + 1])
+                one.prepare_ahead(messages[i + 1])
             one.image(message)
         return one.last.relative
 
     alone, expected = seen(False), seen(True)
-    assert not at(unseen, alone.x).any() and not at(unseen, alone.y_opt).any()
-    assert at(unseen, np.indices(SIZE).reshape(2, -1).T).mean() > 0.05
+    assert not masked_at(unseen, alone.x).any() and not masked_at(unseen, alone.y_opt).any()
+    assert masked_at(unseen, np.indices(SIZE).reshape(2, -1).T).mean() > 0.05
     np.testing.assert_array_equal(expected.x, alone.x)
     np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
 
 
 @pytest.mark.parametrize('threads', [1], indirect=True)
-def test_images_that_are_expected_and_never_come_are_forgotten(drive, threads):
+def test_images_prepared_ahead_that_never_come_are_forgotten(drive, threads):
     one = tracker()
     expected = [image(gray, stamp_ns=ns(10 + i)) for i, gray in enumerate(drive)]
     gone = [weakref.ref(message) for message in expected]
     for message in expected:
-        one.expect(message)
+        one.prepare_ahead(message)
     del message, expected
     gc.collect()
     assert sum(ref() is not None for ref in gone) <= 2
@@ -212,7 +212,7 @@ def test_compressed_images_are_tracked_like_raw_ones(drive):
 
 # CameraInfo: latched, periodic, late, changing
 
-def test_images_before_any_camera_info_are_counted_and_said(drive):
+def test_images_before_any_camera_info_are_counted_and_reported(drive):
     one = tracker(info=False)
     out = play(one, drive[:3])
     assert out[0]['/diagnostics'].status[0].message == 'waiting for camera_info'
@@ -334,7 +334,7 @@ def test_an_equal_stamp_drops_the_image(drive):
     assert one.counts.status == {'FIRST_FRAME': 1, 'OK': 2}
 
 
-def test_a_bag_that_loops_begins_anew(drive):
+def test_looping_bag_resets_the_odometry(drive):
     one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.0})
     first = play(one, drive[:8], start=50.0)
     again = play(one, drive[:8], start=50.0)
@@ -364,7 +364,7 @@ def in_a_row(one, stamped):
 
 
 @pytest.mark.parametrize('ahead', [1.5, 5.0, 1e6])
-def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_goes_on(drive, ahead):
+def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_continues(drive, ahead):
     one, undisturbed = tracker(), tracker()
     in_a_row(one, [(gray, 50 + 0.1 * i + (ahead if i == 6 else 0))
                    for i, gray in enumerate(drive)])
@@ -377,7 +377,7 @@ def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_goes_on(drive, ahe
 
 @pytest.mark.parametrize(('ahead', 'rate', 'late'), [(0.25, 10, 2), (0.55, 10, 5), (0.85, 10, 6),
                                                      (0.55, 30, 16)])
-def test_an_image_stamped_ahead_within_a_gap_leaves_the_trajectory_where_it_is(
+def test_an_image_stamped_ahead_within_a_gap_does_not_change_the_trajectory(
         drive, ahead, rate, late):
     one = tracker()
     there_and_back = [*drive, *drive[-2:0:-1]]
@@ -388,7 +388,7 @@ def test_an_image_stamped_ahead_within_a_gap_leaves_the_trajectory_where_it_is(
     assert one.counts.status['FIRST_FRAME'] == 1
 
 
-def test_stamps_that_go_back_to_before_the_last_two_images_begin_anew_as_ever(drive):
+def test_stamps_that_go_back_before_the_last_two_images_reset_the_odometry(drive):
     one = tracker()
     in_a_row(one, [(drive[i], seconds) for i, seconds in enumerate([50.0, 50.1, 50.9, 50.05])])
     assert one.counts.dropped == {}
@@ -403,7 +403,7 @@ def test_after_a_gap_or_where_stamps_go_back_for_good_no_image_counts_as_ahead(d
     assert one.counts.processed == 4
 
 
-def test_stamps_that_went_back_a_little_and_stay_there_begin_anew(drive):
+def test_stamps_that_go_back_a_little_for_good_reset_the_odometry(drive):
     one = tracker(**{'odometry.max_backwards': 3.0})
     play(one, drive[:3], start=50.0)
     play(one, drive[:12], start=48.0)
@@ -411,7 +411,7 @@ def test_stamps_that_went_back_a_little_and_stay_there_begin_anew(drive):
     assert one.counts.status == {'FIRST_FRAME': 1, 'TIME_JUMP': 1, 'OK': 4}
 
 
-def test_a_new_beginning_is_explained(drive):
+def test_a_restart_is_explained(drive):
     one = tracker()
     play(one, drive[:2], start=50.0)
     play(one, drive[:1], start=20.0)
@@ -442,14 +442,14 @@ def mended(one):
                                       in said.values.items() if name.startswith('to mend: ')}
 
 
-def test_a_healthy_drive_has_nothing_to_mend(drive):
+def test_a_healthy_drive_has_no_problems(drive):
     one = tracker()
     play(one, drive)
     assert mended(one) == ('OK', 'tracking', {})
 
 
 @pytest.mark.parametrize('stamp', [0, ns(12.5)])
-def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp):
+def test_constant_stamps_are_reported_as_an_error(drive, stamp):
     one = tracker()
     out = [by_topic(one.image(image(gray, stamp_ns=stamp))) for gray in drive]
     level, summary, found = mended(one)
@@ -463,13 +463,13 @@ def test_a_camera_whose_stamps_stand_still_is_an_error_that_says_so(drive, stamp
 
 
 @pytest.mark.parametrize('prepared', [False, True])
-def test_a_camera_of_12_bits_is_said_and_gives_the_same_once_its_range_is_known(drive, prepared):
+def test_few_gray_levels_of_12_bits_are_reported_and_mended_by_the_range(drive, prepared):
     def sent(one, first):
         messages = [image(gray.astype('<u2') * 16, 'mono16', ns(0.1 * (first + i)))
                     for i, gray in enumerate(drive)]
         for message, after in zip(messages, [*messages[1:], None]):
             if prepared and after is not None:
-                one.expect(after)
+                one.prepare_ahead(after)
             one.image(message)
         return one.last.pose
 
@@ -487,16 +487,16 @@ def test_a_camera_of_12_bits_is_said_and_gives_the_same_once_its_range_is_known(
     assert mended(one)[2] == {}
 
 
-def test_a_change_of_the_gray_range_holds_for_an_image_that_was_begun_before(drive):
+def test_a_change_of_the_gray_range_applies_to_an_image_prepared_before(drive):
     message = image(drive[0].astype('<u2') * 16, 'mono16', 1)
     one = tracker()
-    one.expect(message)
+    one.prepare_ahead(message)
     one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
     one.image(message)
     assert np.array_equal(one._frame.gray, drive[0])
 
 
-def test_one_image_that_comes_twice_is_nothing_to_mend(drive):
+def test_one_repeated_image_is_no_problem(drive):
     one = tracker()
     for i, gray in enumerate(drive):
         play(one, [gray, gray], start=0.1 * i, period=0.0)
@@ -516,7 +516,7 @@ def speed(seconds, metres_per_second=3.0):
     (None, 'no speed was received; publish it on speed or speed_odometry, stamped by the clock'),
     (100.0, r'the newest speed is stamped 100\.\d s after the newest image'),
     (-100.0, r'the newest speed is stamped 100\.\d s before the newest image')])
-def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(drive, off, seen):
+def test_a_speed_that_is_missing_or_of_another_clock_is_reported_with_the_remedy(drive, off, seen):
     one = tracker(**{'odometry.scale': 'speed'})
     for i, gray in enumerate(drive):
         if off is not None:
@@ -531,7 +531,7 @@ def test_a_speed_that_is_missing_or_of_another_clock_is_said_with_the_remedy(dri
     assert mended(one) == ('OK', 'tracking', {})
 
 
-def test_ground_that_is_never_seen_is_said_too(drive):
+def test_ground_that_is_never_seen_is_reported(drive):
     one = tracker(**{'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0})
     play(one, [np.rot90(gray, 2) for gray in drive])
     assert 'no level ground' in mended(one)[2]['no metric length']
@@ -588,7 +588,7 @@ def test_a_camera_info_of_another_frame_is_a_warning(drive, info, images, said):
     ('odom', {}, 'frame_id is odom_frame', 'set odometry.camera_frame or odometry.odom_frame'),
     ('map', {'odometry.odom_frame': 'map'}, 'frame_id is odom_frame', 'set odometry.camera_frame'),
 ])
-def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
+def test_a_frame_that_is_invalid_on_tf_is_reported_and_not_published(
         drive, frame, parameters, name, remedy):
     one = tracker(info=False, **{'ros.publish_tf': True, **parameters})
     one.camera_info(camera_info(K, SIZE, header=header(0, frame)))
@@ -609,7 +609,7 @@ def test_a_frame_that_can_not_stand_on_tf_is_said_and_never_goes_there(
     ({'odometry.odom_frame': '/left/odom', 'odometry.camera_frame': '/left/cam'},
      'left/odom', 'left/cam'),
     ({'odometry.base_frame': '/base_link'}, 'odom', 'base_link')])
-def test_names_of_frames_are_as_tf2_takes_them_whatever_is_before_them(
+def test_leading_slashes_of_frame_names_are_removed(
         drive, parameters, parent, child):
     one = tracker(info=False, **{'ros.publish_tf': True, **parameters})
     one.camera_info(camera_info(K, SIZE, header=header(0, 'camera_optical_frame')))
@@ -692,7 +692,7 @@ def test_diagnostics_come_on_a_change_of_state_and_once_per_second_of_stamps(dri
     assert said == [0, 1, 11, 21]
 
 
-def test_a_path_goes_on_with_other_parameters_unless_they_name_other_frames(drive):
+def test_a_path_continues_with_other_parameters_unless_they_name_other_frames(drive):
     one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.0})
     lengths = []
     for i, values in enumerate(({}, {'odometry.max_gap': 2.0, 'ros.path_length': 100},
@@ -791,7 +791,7 @@ def test_speeds_give_the_length(drive):
 def test_faces_add_their_counts_and_values(drive):
     one = tracker()
     one.count_dropped('queue_full', 3)
-    one.face_values['latency (ms)'] = '7.0'
+    one.node_values['latency (ms)'] = '7.0'
     out = play(one, drive[:1])[0]
     said = values(out['/diagnostics'])
     assert said['frames received'] == '4'
@@ -831,7 +831,7 @@ def test_whatever_comes_in_whatever_order_every_image_is_accounted_for(events):
 
 # Parameters at run time
 
-def test_new_parameters_hold_from_the_next_frame_and_the_trajectory_goes_on(drive):
+def test_new_parameters_apply_from_the_next_frame_and_the_trajectory_continues(drive):
     one = tracker()
     play(one, drive[:2])
     before = one.last.pose
@@ -865,7 +865,7 @@ def test_another_residual_distortion_makes_another_camera(drive):
     assert one.camera is same
 
 
-def test_a_residual_distortion_that_makes_no_sense_is_said_until_it_is_taken_back(drive):
+def test_an_invalid_residual_distortion_is_reported_until_corrected(drive):
     one = tracker(info=False)
     one.camera_info(camera_info(K, SIZE, d=np.array([-0.2, 0.05, 0, 0, 0])))
     play(one, drive[:1])
@@ -904,7 +904,7 @@ def test_diagnostics_say_what_was_counted(drive):
     assert 'time of matching (ms)' in told.values
 
 
-def test_before_anything_happened_there_is_something_to_say():
+def test_diagnostics_exist_before_any_message():
     told = Tracker(Config(), message_type).diagnosis()
     assert (told.level, told.summary) == ('WARN', 'waiting for camera_info')
 

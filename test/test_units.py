@@ -51,7 +51,7 @@ def integrated(edges):
     return np.array(poses)
 
 
-def test_units_differ_between_laps_as_loops_tell():
+def test_units_follow_the_scale_ratios_of_loops():
     edges, units = drifting(circles())
     found = log_units(N, edges)
     assert found[0] == 0
@@ -60,12 +60,12 @@ def test_units_differ_between_laps_as_loops_tell():
     assert found == pytest.approx(units, abs=0.04)
 
 
-def test_a_loop_that_contradicts_the_others_has_no_say():
+def test_outlier_scale_ratio_is_rejected():
     edges, units = drifting(circles(), wrong=(40,))
     assert log_units(N, edges) == pytest.approx(units, abs=0.04)
 
 
-def test_without_a_loop_that_tells_nothing_changes():
+def test_without_scale_ratios_nothing_is_rescaled():
     edges, _ = drifting(circles())
     graph = PoseGraph(np.arange(N), circles(), tuple(edges[:N - 1]))
     same, factors = to_common_unit(graph)
@@ -73,7 +73,7 @@ def test_without_a_loop_that_tells_nothing_changes():
     assert all(one is other for one, other in zip(same.edges, graph.edges))
 
 
-def test_in_another_unit_an_edge_is_longer_and_as_sure_and_turns_as_before():
+def test_rescaled_edge_keeps_rotation_and_relative_uncertainty():
     errors, motion = np.random.default_rng(5).normal(size=(6, 20)), circles()[7]
     edge = rescaled_edge(Edge(0, 1, motion, errors @ errors.T / 20), 3.0)
     assert np.array_equal(edge.motion[:3, :3], motion[:3, :3])
@@ -82,7 +82,7 @@ def test_in_another_unit_an_edge_is_longer_and_as_sure_and_turns_as_before():
     assert np.allclose(edge.covariance, errors @ errors.T / 20)
 
 
-def test_loops_mend_the_scale_which_poses_alone_cannot():
+def test_loops_correct_scale_drift():
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.backend import optimise
     truth = circles()
@@ -98,7 +98,7 @@ def test_loops_mend_the_scale_which_poses_alone_cannot():
     assert mended < bent / 2
 
 
-def test_what_is_not_trusted_is_counted_by_its_kind():
+def test_rejected_edges_are_counted_by_kind():
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.backend import OptimisedGraph
     edges = tuple(Edge(0, 1, np.eye(4), np.eye(6), kind)
@@ -116,7 +116,7 @@ def pair(points, R, t, K):
                         inliers=np.ones(len(x), bool)), there
 
 
-def test_the_units_at_both_ends_are_compared_where_no_point_is_seen_by_all():
+def test_scale_ratio_without_points_in_all_three_pairs():
     """Half of a loop's points are those of the step at its one end, half at the other."""
     rng = np.random.default_rng(1)
     K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
@@ -142,7 +142,7 @@ def test_the_units_at_both_ends_are_compared_where_no_point_is_seen_by_all():
     assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
 
-def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():
+def test_scale_ratio_from_depths():
     rng = np.random.default_rng(0)
     K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
     points = rng.uniform((-6, -3, 8), (6, 3, 30), (200, 3))
@@ -161,7 +161,7 @@ def test_the_units_at_both_ends_of_a_loop_are_compared_by_depths():
     assert log_scale_ratio(step, 1.0, loop, 1.0, few, 1.0, K) is None
 
 
-def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypatch):
+def test_edges_of_a_removed_keyframe_are_rescaled_to_its_successor(monkeypatch):
     """In a map without an error no edge is off by what is forgotten, though the unit grows."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph import keyframe_map
@@ -209,7 +209,7 @@ def test_what_a_forgotten_keyframe_told_is_told_in_the_unit_of_its_heir(monkeypa
             assert edge.log_scale_ratio[0] == pytest.approx(np.log(target.factor / source.factor))
 
 
-def test_the_first_keyframe_that_is_left_keeps_its_unit():
+def test_first_remaining_keyframe_keeps_its_unit():
     edges, _ = drifting(circles())
     graph = PoseGraph(np.arange(N), circles(), tuple(edges))
     one, ours = to_common_unit(graph), to_common_unit(graph, 1.5)

@@ -13,6 +13,7 @@ from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.messages import twist
+from djet_ros.odometry.result import camera_motion
 from djet_ros.odometry.scale import (
     ConstantScale,
     GroundTruthScale,
@@ -25,7 +26,7 @@ from djet_ros.odometry.scale import (
     UnitScale,
 )
 from djet_ros.odometry.uncertainty import compose, motion_covariance
-from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
+from djet_ros.odometry.visual_odometry import VisualOdometry
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
 import pytest
@@ -72,7 +73,7 @@ def test_poses_are_the_current_camera_in_the_first_and_in_the_previous_one(cards
     assert results[3].previous_stamp_ns == results[2].stamp_ns
 
 
-def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
+def test_an_undecided_pair_makes_its_newer_image_the_reference():
     """Otherwise the next pair spans two steps, over which the smaller body leaves the image."""
     world, body = Cards(), Cards(seed=6)
 
@@ -91,7 +92,7 @@ def test_from_two_images_that_tell_two_motions_the_newer_one_goes_on():
     assert results[3].pose_covariance[0, 0] > 1e5
 
 
-def test_what_was_seen_before_an_image_in_doubt_is_not_looked_for_in_it():
+def test_after_an_undecided_pair_its_matches_are_not_reused():
     """The motion may continue, but the matches are of an older image."""
     world, body, estimator = Cards(), Cards(seed=6), TwoViewEstimator(ESTIMATOR)
     vo, here, there, views, results = odometry(ConstantScale(1.0)), np.eye(4), np.eye(4), [], []
@@ -109,7 +110,7 @@ def test_what_was_seen_before_an_image_in_doubt_is_not_looked_for_in_it():
     assert np.array_equal(estimator.estimate(*views[3:], motion).x, after.x)
 
 
-def test_a_compromise_between_two_bodies_is_not_carried_on():
+def test_a_compromise_between_two_bodies_does_not_persist():
     scene = make_scene('moving_object', size=(620, 188))
     poses = scene.trajectory(6)
     vo = VisualOdometry()
@@ -123,7 +124,7 @@ def test_a_compromise_between_two_bodies_is_not_carried_on():
     assert results[-1].status is Status.OK
 
 
-def test_without_a_scale_a_translation_has_length_one_and_says_that_it_is_no_metre(cards):
+def test_without_a_scale_a_translation_has_length_one_and_is_not_metric(cards):
     result = drive(odometry(UnitScale()), cards, [np.eye(4), STEP])[-1]
     assert np.linalg.norm(result.motion[:3, 3]) == pytest.approx(1)
     assert not result.scale_known
@@ -141,7 +142,7 @@ def test_one_bad_frame_is_bridged_by_the_next_good_one(cards):
     assert np.degrees(rotation_angle(bridged.motion[:3, :3], STEP[:3, :3])) < 0.3
 
 
-def test_a_pair_whose_direction_is_in_doubt_still_turns_the_pose():
+def test_a_pair_with_an_ambiguous_direction_still_rotates_the_pose():
     rng, doubted = np.random.default_rng(0), []
     for _ in range(24):
         R, _, *pictures = pictures_of_a_plane(rng)
@@ -235,7 +236,7 @@ def test_pure_rotation_turns_the_pose_and_does_not_move_it(cards):
         assert result.motion_covariance[0, 0] == pytest.approx(1e6)
 
 
-def test_the_reference_stays_in_sight_while_nothing_tells_the_way(cards):
+def test_the_reference_is_kept_in_view_while_the_direction_is_undetermined(cards):
     results = drive(odometry(), cards, [np.eye(4), *[pose(yaw=0.018)] * 8])
     # 4.7 pixels a step; the limit in an image of width 320 is 16
     stamps = [result.stamp_ns for result in results]
@@ -243,7 +244,7 @@ def test_the_reference_stays_in_sight_while_nothing_tells_the_way(cards):
     assert references == [0, 0, 0, 0, 4, 4, 4, 4]
 
 
-def test_a_motion_that_was_crept_into_came_about_since_it_was_none(cards):
+def test_a_motion_that_began_with_creep_lasts_since_the_standstill(cards):
     creeping = [pose(x=0.002)] * 20
     results = drive(odometry(ConstantScale(1.0)), cards, [*[np.eye(4)] * 10, *creeping])
     resting = results[9].stamp_ns
@@ -275,7 +276,7 @@ def gyro_of(rate):
     return gyro
 
 
-def test_a_gyro_in_degrees_is_found_out_though_no_match_is_found_by_it(cards):
+def test_a_gyro_in_degrees_is_rejected_though_it_misleads_all_matches(cards):
     gyro = gyro_of(np.degrees([0, 0.1, 0]))
     results = drive(VisualOdometry(ESTIMATOR, gyro=gyro), cards, [STEP] * 36)
     assert not gyro.trusted
@@ -283,7 +284,7 @@ def test_a_gyro_in_degrees_is_found_out_though_no_match_is_found_by_it(cards):
     assert results[-1].status is Status.OK
 
 
-def test_what_a_gyro_tells_against_all_images_is_not_said_to_be_known(cards):
+def test_a_gyro_that_contradicts_all_images_is_not_dead_reckoned(cards):
     results = drive(VisualOdometry(ESTIMATOR, gyro=gyro_of([0, 1.0, 0])), cards, [STEP] * 3)
     for result in results[1:]:
         assert result.status is Status.DEGENERATE
@@ -315,7 +316,7 @@ def by_guess():
 
 
 @pytest.mark.parametrize('source', [SpeedScale, by_guess])
-def test_what_has_told_of_the_new_time_before_its_first_image_counts(cards, source):
+def test_measurements_of_the_new_time_before_its_first_image_are_kept(cards, source):
     """A looping bag has its speeds with its images, or before them."""
     scale = source()
     vo, lengths = odometry(scale), []
@@ -331,7 +332,7 @@ def test_what_has_told_of_the_new_time_before_its_first_image_counts(cards, sour
 
 
 @pytest.mark.parametrize('source', [SpeedScale, by_guess])
-def test_what_was_told_of_the_time_before_does_not_count_in_the_new_one(cards, source):
+def test_measurements_of_the_old_time_are_forgotten(cards, source):
     """A bag is played again from its middle, without its speeds."""
     scale = source()
     for i in range(30):
@@ -397,7 +398,7 @@ def test_no_image_is_too_bad_to_survive(cards, image):
         assert np.isfinite(result.pose_covariance).all()
 
 
-def test_real_frames_are_followed(kitti):
+def test_real_frames_are_tracked(kitti):
     sequence = KittiSequence(kitti / 'sequences' / '06', end=6)
     truth = GroundTruthScale(sequence.stamps_ns, sequence.poses[:, :3, 3])
     vo = VisualOdometry(scale=truth)
@@ -481,7 +482,7 @@ def test_covariances_stay_finite_symmetric_and_positive(cards):
 
 @pytest.mark.parametrize('changes', [
     {'grading': 0.0}, {'patch_scale': 1.0}, {'detector': 'orb'}])
-def test_with_other_parameters_both_images_of_the_next_pair_are_seen_by_them(cards, changes):
+def test_other_parameters_apply_to_both_images_of_the_next_pair(cards, changes):
     other = replace(ESTIMATOR, **changes)
     frames = [cards.frame(0.1 * i, pose(x=0.25 * i), noise=i) for i in range(4)]
     for before, after in ((ESTIMATOR, other), (other, ESTIMATOR)):
@@ -497,7 +498,7 @@ def test_with_other_parameters_both_images_of_the_next_pair_are_seen_by_them(car
 
 # Scale
 
-def test_unit_scale_knows_nothing():
+def test_unit_scale_is_unknown():
     assert UnitScale().between(0, 5) == Length(1.0, 1e3, False)
 
 
@@ -522,7 +523,7 @@ def test_a_speed_is_held_for_half_a_second_and_then_only_guessed():
     assert late.value == pytest.approx(0.2)
 
 
-def test_speeds_once_a_second_tell_all_between_them_and_none_tell_nothing_of_a_hole():
+def test_speeds_at_one_hertz_are_interpolated_but_not_over_a_gap():
     scale = SpeedScale()
     for second in (10, 11, 12, 20):
         scale.add_speed(second * 10**9, float(second))
@@ -533,7 +534,7 @@ def test_speeds_once_a_second_tell_all_between_them_and_none_tell_nothing_of_a_h
         assert not scale.between(start * 10**9, end * 10**9).known
 
 
-def test_what_is_forgotten_leaves_no_length_to_the_next_track():
+def test_a_reset_source_has_no_length_for_the_next_track():
     scale = SpeedScale()
     scale.add_speed(0, 2.0)
     odometry = VisualOdometry(scale=scale)
@@ -542,7 +543,7 @@ def test_what_is_forgotten_leaves_no_length_to_the_next_track():
     assert not scale.between(0, 10**8).known
 
 
-def test_senseless_speeds_are_ignored():
+def test_invalid_speeds_are_ignored():
     scale = SpeedScale()
     for stamp, speed in ((0, 1.0), (1, np.nan), (2, np.inf), (0, 9.0), (-5, 9.0)):
         scale.add_speed(stamp, speed)
@@ -568,7 +569,7 @@ def test_speeds_that_come_a_little_late_count_at_their_stamps():
     assert scale.between(0, 4 * 10**8).value == pytest.approx(0.9)
 
 
-def test_ground_truth_is_interpolated_and_not_believed_across_holes():
+def test_ground_truth_is_interpolated_but_not_across_gaps():
     stamps = np.array([0, 1, 2, 30, 31]) * 10**8
     positions = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [np.nan] * 3, [9, 9, 9.0]])
     scale = GroundTruthScale(stamps, positions)
@@ -589,7 +590,7 @@ def test_the_configuration_names_the_scale():
 
 @pytest.mark.parametrize(('scale', 'length', 'too_short'), [
     ('constant', 'scale_value', 1e-7), ('camera_height', 'camera_height', 0.009)])
-def test_nobody_guesses_a_length_that_a_scale_needs(scale, length, too_short):
+def test_a_scale_without_its_required_length_is_refused(scale, length, too_short):
     for given in ({}, {length: too_short}):
         with pytest.raises(DjetError, match=rf"scale is '{scale}', and odometry.{length} is "
                            rf'\S+; give the metres .*--{length.replace("_", "-")}'):
@@ -605,7 +606,7 @@ def test_a_frame_that_is_refused_leaves_no_trace(cards):
 
 
 @pytest.mark.parametrize('gap', [0.1, 60.0])
-def test_what_was_known_of_a_lens_is_not_of_another_camera(cards, gap):
+def test_the_estimated_distortion_is_forgotten_for_another_camera(cards, gap):
     vo = odometry()
     drive(vo, cards, [np.eye(4), STEP, STEP])
     vo._undistort(0.02)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from djet_ros.core.bundle import in_frame, projected
+from djet_ros.core.bundle import points_in_frame, projected
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, rotation_log
-from djet_ros.core.radial import bent, straightened
+from djet_ros.core.radial import distort, undistort
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.core.window import Window, WINDOW_TUNING
 import numpy as np
@@ -99,14 +99,14 @@ class NumbersWindow(Window):
         self.added = self.add(blank(), pair, self._unit)
         return self.added.length
 
-    def straighten(self, newest: Any) -> None:
+    def correct_images(self, newest: Any) -> None:
         """Go on with a lens that has so much less of k1, and points where that shows them."""
-        before, undone = self._landmarks.found, self.lens.undone
-        super().straighten(newest)
-        moved = straightened(K, bent(K, before, undone), self.lens.undone)
+        before, undone = self._landmarks.found, self.lens.corrected_k1
+        super().correct_images(newest)
+        moved = undistort(K, distort(K, before, undone), self.lens.corrected_k1)
         for old, new in zip(before.tolist(), moved.tolist()):
             self._which[tuple(new)] = self._which[tuple(old)]
-        self._street.k1 -= self.lens.undone
+        self._street.k1 -= self.lens.corrected_k1
 
     def _corrected(self, view: Any, before: float) -> Any:
         return view
@@ -115,7 +115,7 @@ class NumbersWindow(Window):
         found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
-        pixels = self._projected(in_frame(K, self._poses, found, newest))
+        pixels = self._projected(points_in_frame(K, self._poses, found, newest))
         wanted = seen[mine] & inside(pixels)
         wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
         found.minima[wanted, -1], found.seen[wanted, -1] = places[mine[wanted]], True
@@ -136,7 +136,7 @@ def inside(places: Numbers) -> NDArray[np.bool_]:
 
 def blank() -> Any:
     image: Image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    return SimpleNamespace(K=K, gray=image, tested=image, mask=None)
+    return SimpleNamespace(K=K, gray=image, surface_gray=image, mask=None)
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])
@@ -191,7 +191,7 @@ def test_the_rotation_drifts_less_than_half_of_that_by_pairs(seed: int) -> None:
         window.go()
         chained = window.pairs[-1] @ chained
         here = here @ window.added.onward
-        window.tell(window.added.onward)
+        window.record_published(window.added.onward)
         off.append([np.linalg.norm(rotation_log(R)) for R in (chained, here[:3, :3])])
     by_pairs, told = np.sqrt(np.square(off).mean(0))
     assert told < 0.5 * by_pairs
@@ -202,7 +202,7 @@ def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) ->
     window, off, sigmas = NumbersWindow(Street(seed, 160, 0.2, turned=1e-3)), [], []
     for _ in range(160):
         window.go()
-        window.tell(window.added.onward)
+        window.record_published(window.added.onward)
         off.append(np.linalg.norm(window.added.onward[:3, 3]) - window.added.length)
         sigmas.append(window.added.sigma)
     assert np.std(off[-50:]) < np.median(sigmas)
@@ -214,7 +214,7 @@ def test_unpublished_motion_is_made_up_for_without_a_jump() -> None:
     for number in range(40):
         window.go()
         onward = np.eye(4) if number == 10 else window.added.onward
-        window.tell(onward)
+        window.record_published(onward)
         here = here @ onward
         ways.append(onward[2, 3])
     assert ways[9] == pytest.approx(1, abs=0.02) and ways[10] == 0
@@ -237,17 +237,17 @@ def test_in_a_turn_the_window_estimates_k1_and_lengths_hardly_drift(
 @pytest.mark.parametrize('k1', [-0.015, 0.015])
 def test_a_window_continues_when_images_are_corrected(k1: float) -> None:
     window, lengths = NumbersWindow(Street(0, 120, 0.1, curve=0.02, k1=k1)), []
-    while not window.lens.due:
+    while not window.lens.needs_update:
         lengths.append(window.go())
     noise = np.median(window.told)
     taken, thrown = window.taken, window.thrown
-    window.straighten(blank())
+    window.correct_images(blank())
     lengths += [window.go() for _ in range(120 - len(lengths))]
     # Earlier observations agree with the new ones.
     assert np.median(window.told[-10:]) == pytest.approx(noise, rel=0.1)
     assert window.thrown - thrown < 0.015 * (window.taken - taken)
     assert window.lens.k1 == pytest.approx(k1, abs=2 * window.lens.sigma)
-    assert abs(window.lens.left) < abs(k1) / 4
+    assert abs(window.lens.residual_k1) < abs(k1) / 4
     assert np.mean(lengths[-15:]) == pytest.approx(np.mean(lengths[:15]), rel=0.02)
 
 

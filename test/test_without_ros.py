@@ -29,5 +29,5 @@ def test_the_nodes_say_in_one_line_what_is_missing(
 def test_the_live_odometry_needs_no_library_that_ubuntu_does_not_package() -> None:
     # rosdep installs neither, and the node runs without them.
     program = ('import sys; sys.modules["rosbags"] = sys.modules["gtsam"] = None; '
-               'import djet_ros.live.odometry_face')
+               'import djet_ros.live.odometry_node')
     subprocess.run([sys.executable, '-c', program], check=True)

@@ -80,7 +80,7 @@ def textured(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
 
 def some(features: Features, chosen: np.ndarray | slice) -> Features:
     """Return a subset of the features, by index or slice."""
-    return Features.described(
+    return Features.with_descriptors(
         features.points[chosen], features.octaves[chosen], features.angles[chosen],
         features.responses[chosen], features.descriptors[chosen])
 

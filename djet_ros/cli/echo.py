@@ -150,7 +150,7 @@ class _SilenceWarning:
             print(f'waiting for {self._topic}: {self._reason()}', file=sys.stderr, flush=True)
 
     def _reason(self) -> str:
-        if offers := self._graph.offers(self._topic):
+        if offers := self._graph.publishers_of(self._topic):
             return f'{len(offers)} publish it, none sends'
         near = get_close_matches(self._topic, self._graph.published(_ODOMETRY), n=1, cutoff=0.0)
         return 'nobody publishes it' + (f'; did you mean {near[0]}?' if near else '')

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the file, and print the number of poses and edges."""
     graph = read_results(args.results, warn)
     if args.chained:
-        graph = replace(graph, edges=tuple(edge.in_graph() for edge in graph.edges))
+        graph = replace(graph, edges=tuple(edge.inflated() for edge in graph.edges))
     write_graph(graph, args.output, args.format, args.overwrite)
     kinds = Counter(edge.kind for edge in graph.edges)
     unscaled = sum(not edge.scale_known for edge in graph.edges)

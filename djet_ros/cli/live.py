@@ -40,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
 
     from djet_ros.dds.graph import Graph
     from djet_ros.dds.middleware import DdsMiddleware
-    from djet_ros.live.odometry_face import OdometryFace
+    from djet_ros.live.odometry_node import OdometryNode
     with Graph() as graph:
-        return OdometryFace(DdsMiddleware(graph, names, use_sim_time), config).run(stop)
+        return OdometryNode(DdsMiddleware(graph, names, use_sim_time), config).run(stop)
 
 
 def _configuration(args: argparse.Namespace, node: str) -> tuple[Config, bool]:

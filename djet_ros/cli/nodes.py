@@ -60,7 +60,7 @@ def _run(name: str, description: str, *, without_ros: str,
         prog=name, description=description, epilog=_EPILOG.format(name=name),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
-        if (rest := parser.parse_known_args(running.own_words())[1]):
+        if (rest := parser.parse_known_args(running.non_ros_arguments())[1]):
             raise DjetError(f"unrecognized argument '{one_line(rest[0])}'; ROS arguments, such as "
                             "-r image:=/camera/image_raw, must follow '--ros-args'")
         return 0 if stop.is_set() else int(running.run_node(name, make, stop))

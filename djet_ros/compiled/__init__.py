@@ -66,10 +66,10 @@ def in_use() -> str:
     return 'NumPy' if library is None else 'compiled'
 
 
-def place(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
+def align(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
           inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """
-    Align N patches of some gray images with another one (H, W): `core.patches.Expected.stepped`.
+    Align N patches of some gray images with another one (H, W): `core.patches.Templates.align`.
 
     points: (N, 2) in `there`, ordered by image; inverse: (N, 2, 2) inverses of their warps; began:
     (N, 2) initial positions in `here`, with room for the patches and all steps; inside: (N,) those
@@ -86,21 +86,21 @@ def place(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, b
     return places, variances, inverses
 
 
-def grades_through(images: Images, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
-                   ends: tuple[Gray, NDArray[np.int64]], reach: int, most_nearer: float
-                   ) -> NDArray[np.int16]:
+def warped_grades(images: Images, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
+                  ends: tuple[Gray, NDArray[np.int64]], reach: int, max_depth_ratio: float
+                  ) -> NDArray[np.int16]:
     """
-    Return grades (T, N) of tests on patches seen through warps: `core.graded.grades_through`.
+    Return grades (T, N) of tests on patches seen through warps: `core.graded.warped_grades`.
 
     looks: (N, 2, 2) inverse warps, and (N, 2) their relative change of depth per pixel; points:
     (N, 2) in the images, ordered by image; contrast: (N,); ends: (2, E) distinct test points, and
-    (2, T) the indices of each test; reach: the largest grade; most_nearer: limit of the depth
+    (2, T) the indices of each test; reach: the largest grade; max_depth_ratio: limit of the depth
     ratio.
     """
     n, tests = len(points), ends[1].shape[1]
     grades = np.empty((tests, n), np.int16)
     _call('djet_grades_through', *_images(images, np.int16), c_int(n),
-          _ptr(looks[0], np.float32), _ptr(looks[1], np.float32), c_float(most_nearer),
+          _ptr(looks[0], np.float32), _ptr(looks[1], np.float32), c_float(max_depth_ratio),
           _ptr(points, np.float32), _ptr(contrast, np.float32), c_int(ends[0].shape[1]),
           _ptr(ends[0].T, np.float32), c_int(tests), _ptr(ends[1], np.int64), c_int(reach),
           _ptr(grades, np.int16))
@@ -339,7 +339,7 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
     """
     Sum the terms of N matches over nested cells: `core.covariance.sums_of_cells`.
 
-    J: (5, N); weights, r: (N,); order, codes: (N,) from `core.covariance._along_curve`; sides:
+    J: (5, N); weights, r: (N,); order, codes: (N,) from `core.covariance._morton_order`; sides:
     number of cell sizes; small: index of the size whose sums are returned. Returns the sums (27,
     C) of these cells and the index (C,) of their first match in order; and for each size pulls (S,
     5, 5) and products (S, 2).
@@ -353,9 +353,9 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
     return sums[:count].T, first[:count], pulls, products
 
 
-def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
+def leave_one_out(whole: Array, sums: Array) -> tuple[Array, Array]:
     """
-    Leave out each of C cells in turn: `core.covariance.without_each`.
+    Leave out each of C cells in turn: `core.covariance.leave_one_out`.
 
     whole: (5, 5); sums: (27, C). Returns the changes (5, C) of the pose, and the sum (5, 5) of
     inverse Hessians.

@@ -98,7 +98,7 @@ INLINE void invert(double A[POSE][POSE])
     }
 }
 
-/* Change of a pose when each of C cells is left out in turn: covariance.without_each. whole:
+/* Change of a pose when each of C cells is left out in turn: covariance.leave_one_out. whole:
    (5, 5) H of all matches; cells: (C, 27) sums. Writes changes (C, 5), and the sum (5, 5) of
    the inverse Hessians. */
 WIDE void djet_without_each(int C, const double whole[POSE][POSE], const double (*cells)[TERMS],

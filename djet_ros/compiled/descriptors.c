@@ -9,7 +9,7 @@ typedef struct {
     int32_t first[TESTS], second[TESTS];
 } Ends;
 
-INLINE Ends ends_of(const int64_t (*tests)[4], int width)
+INLINE Ends endpoints_of(const int64_t (*tests)[4], int width)
 {
     Ends ends;
     for (int t = 0; t < TESTS; t++) {
@@ -35,7 +35,7 @@ WIDE void djet_match_distances(const uint8_t *there, const uint8_t *here, int he
                                int n, const double (*x)[2], const double (*y)[2],
                                const int64_t (*tests)[4], int reach, double *distances)
 {
-    const Ends ends = ends_of(tests, width);
+    const Ends ends = endpoints_of(tests, width);
     for (int k = 0; k < n; k++) {
         const uint8_t *a = pixel_at(there, height, width, x[k], reach),
                       *b = pixel_at(here, height, width, y[k], reach);
@@ -88,7 +88,7 @@ WIDE void djet_most_similar(int m, const int64_t (*strips)[4], int n_there, int 
 WIDE void djet_describe(const uint8_t *gray, int width, int n, const int64_t (*pixels)[2],
                         const int64_t (*tests)[4], uint8_t (*descriptors)[TESTS / 8])
 {
-    const Ends ends = ends_of(tests, width);
+    const Ends ends = endpoints_of(tests, width);
     for (int k = 0; k < n; k++) {
         const uint8_t *at = gray + pixels[k][1] * width + pixels[k][0];
         for (int byte = 0; byte < TESTS / 8; byte++) {

@@ -262,7 +262,7 @@ static int damped_step(const double given[5][5], const double gradient[5], doubl
     return 1;
 }
 
-/* jet.moved: rotation from the left, then t along the sphere. */
+/* jet.retract: rotation from the left, then t along the sphere. */
 static void move(const Pose *pose, const double tangents[2][3], const double step[5], Pose *moved)
 {
     double S[3][3], square[3][3], turn[3][3];

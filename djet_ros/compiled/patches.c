@@ -7,7 +7,7 @@ enum { RADIUS = 5, SIDE = 2 * RADIUS + 1, PIXELS = SIDE * SIDE, ROOM = SIDE + 2,
 typedef struct {
     Lanes slopes[2][PIXELS], gray[PIXELS], contrast;
     double inverse[LANES][2][2];
-} Expected;
+} Templates;
 
 typedef struct {
     Lanes around[NEXT * NEXT], products[2][2][2];
@@ -43,7 +43,7 @@ INLINE void sample(Image image, const Lanes points[2], const Lanes inverse[2][2]
         }
 }
 
-INLINE void expect(const Lanes *wide, float least_slope, Expected *to)
+INLINE void make_templates(const Lanes *wide, float least_slope, Templates *to)
 {
     for (int j = 0; j < SIDE; j++)
         for (int i = 0; i < SIDE; i++) {
@@ -85,7 +85,7 @@ INLINE void gather(const uint8_t *image, int width, const double *place, int l, 
 }
 
 /* Sum products of gradients and of patches at four pixels. */
-INLINE void multiply(const Expected *expected, Seen *seen)
+INLINE void multiply(const Templates *expected, Seen *seen)
 {
     for (int y = 0; y < 2; y++)
         for (int x = 0; x < 2; x++) {
@@ -102,7 +102,7 @@ INLINE void multiply(const Expected *expected, Seen *seen)
 
 /* Move patches to new positions; few of them move to other pixels. */
 INLINE void follow(const uint8_t *image, int width, const double (*places)[2],
-                   const Expected *expected, Seen *seen)
+                   const Templates *expected, Seen *seen)
 {
     int crossed = 0;
     for (int l = 0; l < LANES; l++)
@@ -125,7 +125,7 @@ INLINE double interpolated(const Seen *seen, int k, int l, double x, double y)
 }
 
 /* Residuals of patches after fitting their brightness and contrast: sums of squares. */
-INLINE Lanes left_over(const Expected *expected, const Seen *seen, const double (*places)[2])
+INLINE Lanes left_over(const Templates *expected, const Seen *seen, const double (*places)[2])
 {
     Lanes patches[PIXELS];
     float parts[2][LANES];
@@ -161,7 +161,7 @@ INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there
             for (int axis = 0; axis < 2; axis++)
                 at[l][axis] = at_first[l][axis] = began[first + (l < count ? l : count - 1)][axis];
         Lanes wide[ROOM * ROOM];
-        Expected expected;
+        Templates expected;
         Seen seen;
         const float *W = inverse[first][0];
         const Lanes points_of[2] = {gathered(points[first], 2, count),
@@ -170,7 +170,7 @@ INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there
             {gathered(W, 4, count), gathered(W + 1, 4, count)},
             {gathered(W + 2, 4, count), gathered(W + 3, 4, count)}};
         sample(image, points_of, inverse_of, wide);
-        expect(wide, (float)tuning[0], &expected);
+        make_templates(wide, (float)tuning[0], &expected);
         for (int l = 0; l < LANES; l++)
             gather(here, here_width, at[l], l, &seen);
         multiply(&expected, &seen);

@@ -13,7 +13,7 @@ typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
 
 /* djet_grades_through, for patches [from, to) of one image. */
 INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int height, int width, int n,
-                       const float *inverse, const float *nearer, float most_nearer,
+                       const float *inverse, const float *nearer, float max_depth_ratio,
                        const float *points, const float *contrast, int E, const float (*ends)[2],
                        int T, const int64_t *of_tests, int reach, int16_t *grades)
 {
@@ -31,8 +31,8 @@ INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int heig
         Lanes seen[MOST_ENDS];
         for (int e = 0; e < E; e++) {
             const float dx = ends[e][0], dy = ends[e][1];
-            const Lanes depth = clipped(1 - (by_x * dx + by_y * dy), 1 / most_nearer,
-                                        most_nearer);
+            const Lanes depth = clipped(1 - (by_x * dx + by_y * dy), 1 / max_depth_ratio,
+                                        max_depth_ratio);
             seen[e] = between(image, x + (xx * dx + xy * dy) / depth,
                               y + (yx * dx + yy * dy) / depth);
         }
@@ -51,13 +51,13 @@ INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int heig
    distinct test points; of_tests: (2, T) indices of each test. */
 WIDE void djet_grades_through(int I, const int16_t *const *images, const int64_t *counts, int height,
                               int width, int n, const float *inverse, const float *nearer,
-                              float most_nearer, const float *points, const float *contrast, int E,
+                              float max_depth_ratio, const float *points, const float *contrast, int E,
                               const float (*ends)[2], int T, const int64_t *of_tests, int reach,
                               int16_t *grades)
 {
     for (int64_t i = 0, first = 0; i < I; first += counts[i++])
         grade_some(images[i], first, first + counts[i], height, width, n, inverse, nearer,
-                   most_nearer, points, contrast, E, ends, T, of_tests, reach, grades);
+                   max_depth_ratio, points, contrast, E, ends, T, of_tests, reach, grades);
 }
 
 /* Copy the patches of side x side pixels around some centres, points last. */

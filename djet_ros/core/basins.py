@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 from djet_ros.core.covariance import CHI2_999, pose_differences
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.fusion import Turn
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import fit_rotation
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     epipolar_residuals,
     JetProblem,
     Loss,
@@ -28,7 +28,7 @@ from djet_ros.core.sketch import (
     RotationPrior,
     Sketch,
 )
-from djet_ros.core.starts import around, hemisphere_starts, thinned
+from djet_ros.core.starts import hemisphere_starts, starts_around, subsampled
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -109,14 +109,15 @@ class Basin:
 
 
 def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                 config: EstimatorConfig, prior: Pose | None, measured: Turn | None) -> Basin:
+                 config: EstimatorConfig, prior: Pose | None,
+                 measured: MeasuredRotation | None) -> Basin:
     """
     Choose the basin of the camera's motion among starts and a hemisphere of directions.
 
     places: (N, 2) pixels of the matches; prior: the previous motion, which decides if the matches
     do not; measured: a measured rotation, with which the pose has to be consistent.
     """
-    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_to_sketch))
+    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_to_sketch))
     scale = max(refine_all(some, starts, Loss(), 0).scales().min(), MIN_SCALE)
     tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
     if measured is not None:
@@ -138,7 +139,7 @@ def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
 
 
 def _refine_and_choose(problem: JetProblem, places: Array, starts: list[Pose], tight: Loss,
-                       prior: Pose | None, measured: Turn | None = None) -> Basin:
+                       prior: Pose | None, measured: MeasuredRotation | None = None) -> Basin:
     """Refine starts on all matches, and choose the one of least cost as in `choose_basin`."""
     refined = refine_all(problem, starts, tight, BASIN_TUNING.steps_to_compare)
     possible, camera_in_minority = np.ones(len(refined), bool), False
@@ -149,7 +150,8 @@ def _refine_and_choose(problem: JetProblem, places: Array, starts: list[Pose], t
     best = basins.pop(likeliest(losses_at(problem, basins, tight), places, basins, prior))
     # The noise of the matches does not depend on the motion that they follow.
     residuals = epipolar_residuals(problem, best.R, best.t)
-    scale = min(map(core_scale, refined.r)) if camera_in_minority else core_scale(residuals.r)
+    scale = (min(map(clipped_scale, refined.r)) if camera_in_minority
+             else clipped_scale(residuals.r))
     return Basin(best, max(scale, MIN_SCALE), residuals, camera_in_minority, tuple(basins))
 
 
@@ -163,9 +165,9 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
     convergence, as some may lead to the same minimum; if that does not help, they are refined on
     all matches. If a rotation alone explains the matches, the choice does not matter.
     """
-    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.matches_predicted))
+    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_predicted))
     tight = Loss()
-    basins = starts = around(predicted, BASIN_TUNING.directions)
+    basins = starts = starts_around(predicted, BASIN_TUNING.directions)
     for steps in (0, *BASIN_TUNING.steps_predicted):
         found = refine_all(some, basins, tight, steps)
         scale = max(found.scales().min(), MIN_SCALE)
@@ -203,7 +205,7 @@ def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:
     """Return the basin of a single pose, without rivals."""
     residuals = epipolar_residuals(problem, pose.R, pose.t)
-    return Basin(pose, max(core_scale(residuals.r), MIN_SCALE), residuals)
+    return Basin(pose, max(clipped_scale(residuals.r), MIN_SCALE), residuals)
 
 
 def choose_among_rivals(problem: JetProblem, places: Array, solution: Solution,
@@ -243,7 +245,7 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
     steps = (axes[:, :2] * BASIN_TUNING.nearby_distance / np.sqrt(eigenvalues[:2])).T
     starts = map(Pose, *moved_all(solution.R, solution.t, solution.residuals.tangents,
                                   np.concatenate([steps, -steps])))
-    some = problem.subset(thinned(len(problem.blur), BASIN_TUNING.few_matches))
+    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.few_matches))
     refined = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_nearby).poses()
     bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(some.blur)
     others = _distinct(refined, solution, information, bound)[1:]
@@ -291,20 +293,20 @@ def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose |
                key=lambda number: unsigned_distance(prior, poses[number]))
 
 
-def _has_rotation(measured: Turn, sketch: Sketch) -> NDArray[np.bool_]:
+def _has_rotation(measured: MeasuredRotation, sketch: Sketch) -> NDArray[np.bool_]:
     """
     Return the (S,) bool mask of poses whose rotation is consistent with the measured one.
 
     The motion of an object that fills the image is also found under the measured rotation, with a
     translation that compensates for the difference; refined without it, its rotation drifts away.
     """
-    offsets = measured.off(sketch.R)
+    offsets = measured.correction(sketch.R)
     allowed = measured.covariance + BASIN_TUNING.rotation_noise**2 * np.eye(3)
     squared = (offsets * np.linalg.solve(allowed, offsets.T).T).sum(1)
     return np.asarray(squared < BASIN_TUNING.rotation_gate**2)
 
 
-def _rotation_prior(measured: Turn | None, scale: float) -> RotationPrior | None:
+def _rotation_prior(measured: MeasuredRotation | None, scale: float) -> RotationPrior | None:
     """
     Return a prior that draws rotations to the measured one while a basin is chosen.
 

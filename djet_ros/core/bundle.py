@@ -25,9 +25,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from djet_ros import compiled
-from djet_ros.core.geometry import inverse_of, rays, rotation_exp, rotation_log
+from djet_ros.core.geometry import inverse_intrinsics, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import median, times
-from djet_ros.core.radial import bending, bent, FARTHEST, straightened, stretch
+from djet_ros.core.radial import distort, distortion_jacobian, FARTHEST, stretch, undistort
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ class Poses:
     k1: float = 0.0
 
     @cached_property
-    def between(self) -> tuple[Array, Array]:
+    def relative_motions(self) -> tuple[Array, Array]:
         """Return motions from frame a to frame f: R (F, F, 3, 3), t (F, F, 3), indexed [f, a]."""
         R = np.einsum('fij,akj->faik', self.R, self.R)
         return R, self.t[:, None] - np.einsum('faij,aj->fai', R, self.t)
@@ -94,7 +94,7 @@ class Poses:
         return np.concatenate([rotation_log(turns), shifts], axis=1).ravel()
 
 
-class OfPrior(NamedTuple):
+class PriorCost(NamedTuple):
     """Cost of poses under a prior, and its gradient (6 F,)."""
 
     cost: float
@@ -118,11 +118,11 @@ class PosePrior:
         """Return a prior that fixes the first pose."""
         return cls(np.eye(6) * _FIXED, np.zeros(6), pose)
 
-    def at(self, poses: Poses) -> OfPrior:
+    def at(self, poses: Poses) -> PriorCost:
         """Return the cost of poses and its gradient."""
         step = poses.step_from(self.since)
         pull = self.H @ step
-        return OfPrior(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
+        return PriorCost(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
         """Add information H, g linearised at `poses`."""
@@ -218,7 +218,7 @@ class Landmarks:
         """Return the landmarks moved by a step (N, 3) of their inverse depths and points."""
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
 
-    def seen_otherwise(self, K: Array, before: float, after: float) -> Landmarks:
+    def with_corrected_images(self, K: Array, before: float, after: float) -> Landmarks:
         """
         Convert observations in images corrected for one k1 to images corrected for another.
 
@@ -226,10 +226,10 @@ class Landmarks:
         """
         def moved(pixels: Array) -> tuple[Array, Array]:
             """Return pixels (N, 2) in the new image, and Jacobians of the old by the new ones."""
-            straight = straightened(K, bent(K, pixels, before), after)
+            straight = undistort(K, distort(K, pixels, before), after)
             u = rays(K, straight)[:, :2]
-            back = bending(K, rays(K, pixels)[:, :2], before)
-            by_new = np.linalg.solve(back, bending(K, u, after))
+            back = distortion_jacobian(K, rays(K, pixels)[:, :2], before)
+            by_new = np.linalg.solve(back, distortion_jacobian(K, u, after))
             return straight, np.asarray(by_new, float)
 
         found, by_found = moved(self.found)
@@ -248,9 +248,9 @@ class Landmarks:
         return self.minima, self.roots, self.seen
 
 
-def in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
+def points_in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
     """Return landmarks (N, 3) in a frame, times their inverse depths in their anchors."""
-    R, t = poses.between
+    R, t = poses.relative_motions
     turned = R[frame, landmarks.anchors]
     places = times(turned, rays(K, landmarks.points))
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
@@ -296,13 +296,13 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     landmark, frame = np.nonzero(landmarks.seen)
     if compiled.library is not None:
         anchor, (residuals, off, straight, *at_places) = compiled.observe(
-            (landmark, frame), landmarks.anchors, poses.between,
+            (landmark, frame), landmarks.anchors, poses.relative_motions,
             (landmarks.points, landmarks.rho, landmarks.minima, landmarks.roots, landmarks.held,
-             landmarks.found), (K, inverse_of(K)), _tuning(poses.k1))
+             landmarks.found), (K, inverse_intrinsics(K)), _tuning(poses.k1))
         return Observed(landmark, frame, anchor, residuals, off, landmarks.held, K, poses.k1,
                         straight, *at_places)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
-    R, t = (motions[frame, anchor] for motions in poses.between)
+    R, t = (motions[frame, anchor] for motions in poses.relative_motions)
     rays_of_points = rays(K, landmarks.points)
     ray = rays_of_points[landmark]
     place = times(R, ray) + rho[:, None] * t
@@ -346,7 +346,7 @@ def _undistorted(observed: Observed) -> Array:
 def _by_undistorted(observed: Observed) -> tuple[Array, Array]:
     """Return the Jacobians of residuals (M, 2, 2) and (N, 2, 2) by undistorted pixels."""
     roots = np.concatenate([observed.root, observed.held])
-    turned = roots @ bending(observed.K, _undistorted(observed), observed.k1)
+    turned = roots @ distortion_jacobian(observed.K, _undistorted(observed), observed.k1)
     return turned[:len(observed.root)], turned[len(observed.root):]
 
 
@@ -376,7 +376,7 @@ def jacobians(observed: Observed) -> Jacobians:
     np.multiply(by_turned, -weight, out=by_anchor[:, :, 3:])
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
-    np.matmul(by_turned, inverse_of(K)[:, :2], out=by_own[:, :, 1:])
+    np.matmul(by_turned, inverse_intrinsics(K)[:, :2], out=by_own[:, :, 1:])
     by_k1, points_by_k1 = _by_k1(observed)
     return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
 
@@ -408,7 +408,7 @@ def noise_scale(observed: Observed) -> float:
     return float(np.sqrt(median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
 
 
-class OfK1(NamedTuple):
+class K1Estimate(NamedTuple):
     """Marginal information of k1, and its Newton step."""
 
     curvature: float
@@ -441,7 +441,7 @@ class Reduced:
         """Return the gradient (6 F,) over the poses."""
         return self._gradient[self._lens:]
 
-    def of_k1(self) -> OfK1:
+    def marginal_k1(self) -> K1Estimate:
         """
         Marginalise the poses too, without any prior on them, and return the information on k1.
 
@@ -452,7 +452,7 @@ class Reduced:
         gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), row)
         curvature = float(self._whole[0, 0] - gain @ row)
         slope = float(self._gradient[0] - gain @ self.g)
-        return OfK1(curvature, -slope / curvature if curvature > 0 else 0.0)
+        return K1Estimate(curvature, -slope / curvature if curvature > 0 else 0.0)
 
     def change(self, step: Array) -> Array:
         """Return the steps (N, 3) of the landmarks for a step (6 F,) of the poses."""
@@ -473,8 +473,8 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
-            (o.straight, o.held, o.off, weight), lens, (o.K, inverse_of(o.K)), _tuning(o.k1),
-            _DEPTH_INFORMATION, frames), lens)
+            (o.straight, o.held, o.off, weight), lens, (o.K, inverse_intrinsics(o.K)),
+            _tuning(o.k1), _DEPTH_INFORMATION, frames), lens)
     count, n, linear = len(weights), len(observed.off), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]

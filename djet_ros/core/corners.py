@@ -17,10 +17,10 @@ import cv2
 from djet_ros import compiled
 from djet_ros.core.cells import in_few_bytes, rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
-from djet_ros.core.masks import at, Mask
+from djet_ros.core.masks import Mask, masked_at
 from djet_ros.core.orb_pattern import REACH
 from djet_ros.core.paraboloid import quantile
-from djet_ros.core.parallel import each
+from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Features
 import numpy as np
 from numpy.typing import NDArray
@@ -91,8 +91,8 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
         return _detect_octave(gray, octave, most, contrast, mask, smoothed)
 
     wanted = [round(share * max_features) for share in _QUOTAS]
-    found = Features.concatenated(each(lambda octave: octave_corners(octave, wanted[octave]),
-                                       _DEFAULT_OCTAVES))
+    found = Features.concatenated(map_parallel(
+        lambda octave: octave_corners(octave, wanted[octave]), _DEFAULT_OCTAVES))
     if len(found) < _ENOUGH * sum(wanted[octave] for octave in _DEFAULT_OCTAVES):
         return Features.concatenated([found, octave_corners(_MIDDLE, max_features - len(found))])
     return replace(found, additional=lambda: octave_corners(_MIDDLE, wanted[_MIDDLE]))
@@ -112,7 +112,7 @@ def detect_large_corners(gray: Image, max_features: int, contrast: float,
     return Features.concatenated([small, large])
 
 
-def noise_of(image: Image) -> float:
+def image_noise(image: Image) -> float:
     """Estimate the standard deviation of image noise, in gray levels, from the flattest blocks."""
     if len(image) < _NOISE_BLOCK + 2 or image.shape[1] < _NOISE_BLOCK:
         return 0.0
@@ -221,16 +221,17 @@ def _detect_octave(gray: Image, octave: int, most: int, contrast: float, mask: M
     scale = _SCALES[octave]
     if min(gray.shape) <= 2 * scale * (REACH + 1):
         none = np.empty(0, np.float32)
-        return Features.described(np.empty((0, 2)), np.empty(0, np.int32), none, none,
-                                  np.empty((0, 32), np.uint8))
+        return Features.with_descriptors(np.empty((0, 2)), np.empty(0, np.int32), none, none,
+                                         np.empty((0, 32), np.uint8))
     image = _downscaled(gray, scale)
-    slopes, contrast = corner_slopes(image), max(contrast, _NOISE_FACTOR * noise_of(image))
+    slopes, contrast = corner_slopes(image), max(contrast, _NOISE_FACTOR * image_noise(image))
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
 
     found, strongest = _peaks(slopes, contrast, image.shape)
     points = _exact_peaks(slopes, found)
     # Maxima of the narrow radius are only used if there are not enough of the wide one.
-    wanted = np.ones(len(found), bool) if mask is None else ~at(mask, (points + 0.5) * zoom - 0.5)
+    wanted = (np.ones(len(found), bool) if mask is None
+              else ~masked_at(mask, (points + 0.5) * zoom - 0.5))
     if (strongest & wanted).sum() >= _ENOUGH * most:
         wanted &= strongest
     points, strengths = points.compress(wanted, axis=0), slopes.ravel()[found[wanted]]

@@ -8,7 +8,7 @@ from functools import cached_property
 from djet_ros import compiled
 from djet_ros.core.cells import CELL, group_by_cell, in_few_bytes
 from djet_ros.core.geometry import rotation_log, sphere_tangents
-from djet_ros.core.jet import epipolar_residuals, JetProblem, LEAST_CURVED, Loss, Residuals
+from djet_ros.core.jet import epipolar_residuals, JetProblem, LEAST_CURVATURE, Loss, Residuals
 from djet_ros.core.sketch import moved_all, refine_all
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -62,7 +62,7 @@ _MIN_RISE = 0.05
 _MIN_VARIANCE = 1e-18
 
 # Covariances of a pose that is not determined.
-UNKNOWN = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
+UNDETERMINED = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 
 # Share of the information in any direction of the pose that has to remain without the matches of
 # one cell.
@@ -97,16 +97,16 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     _, weights = loss(squared)
     H = (J * weights) @ J.T
     if not np.isfinite(H).all():
-        return UNKNOWN
+        return UNDETERMINED
     eigenvalues = np.linalg.eigvalsh(H)
     if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
-        return UNKNOWN
+        return UNDETERMINED
     curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
     cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or not (cells.determine_pose() and large.determine_pose()):
-        return UNKNOWN
-    shifts, inverses_left = without_each(H, cells.sums)
+        return UNDETERMINED
+    shifts, inverses_left = leave_one_out(H, cells.sums)
     size = cells.size(shifts)
     independent = _jackknife(cells, inverses_left, shifts)
     noise = float((weights * squared).sum() / weights.sum())
@@ -167,7 +167,7 @@ def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals:
     weighted = J * loss(residuals.r**2)[1]
     steps = np.zeros((3, 3, 3))
     steps[0, :2, :2], steps[1, 0, 2], steps[2, 1, 2] = sigma * np.eye(2), sigma, sigma
-    changes = [epipolar_residuals(problem.seen_with(K, K + step), pose.R, pose.t).r - residuals.r
+    changes = [epipolar_residuals(problem.with_camera(K, K + step), pose.R, pose.t).r - residuals.r
                for step in steps]
     shifts = np.linalg.solve(weighted @ J.T, weighted @ np.transpose(changes))
     lifted = lift(residuals.tangents) @ shifts
@@ -187,7 +187,7 @@ def _loss_curvature(H: Array, curvature: Array) -> Array | None:
     if shares.sum() <= 0:
         return None
     half = root @ axes
-    return np.asarray((half * np.maximum(shares, LEAST_CURVED)) @ half.T)
+    return np.asarray((half * np.maximum(shares, LEAST_CURVATURE)) @ half.T)
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,7 @@ def _small_sample_widening(cells: _Cells, growth: float) -> Array:
 def _summed_by_cell(H: Array, places: Array, J: Array, weights: Array, r: Array
                     ) -> tuple[_Cells, Array, Array]:
     """Return small cells, and pulls and products of cells of all sides: see `sums_of_cells`."""
-    order, codes = _along_curve(places)
+    order, codes = _morton_order(places)
     sums, first, pulls, products = sums_of_cells(J, weights, r, order, codes)
     middles = (places[order[first]] // CELL + 0.5) * CELL
     return _Cells(H, np.asarray(np.linalg.inv(H)), middles, sums), pulls, products
@@ -392,7 +392,7 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
     """
     Sum up the terms of matches over nested cells.
 
-    J (5, N), weights and r (N,) of matches; order, codes: (N,) from `_along_curve`. Returns for
+    J (5, N), weights and r (N,) of matches; order, codes: (N,) from `_morton_order`. Returns for
     small cells their sums (27, C), see `_Cells`, and the first (C,) of their matches in order; and
     for cells of each side, from the smallest on, sums of products: pulls (S, 5, 5) of the
     derivatives of the gradients by a common shift of a cell's residuals, and squares (S, 2) of
@@ -410,7 +410,7 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
             np.array([(sums[5:]**2).sum(1) for sums in by_side]))
 
 
-def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
+def leave_one_out(whole: Array, sums: Array) -> tuple[Array, Array]:
     """
     Return the shifts of the pose without the matches of each of C cells, to first order.
 
@@ -418,7 +418,7 @@ def without_each(whole: Array, sums: Array) -> tuple[Array, Array]:
     definite. Returns the shifts (5, C), and the sum (5, 5) of the inverses of H without each cell.
     """
     if compiled.library is not None:
-        return compiled.without_each(whole, sums)
+        return compiled.leave_one_out(whole, sums)
     left = np.asarray(np.linalg.inv(whole - sums[_FULL].T.reshape(-1, 5, 5)))
     return np.einsum('cij,jc->ic', left, sums[15:20]), left.sum(0)
 
@@ -430,7 +430,7 @@ def _match_terms(J: Array, weights: Array, r: Array) -> Array:
                            [weights * r, weights]])
 
 
-def _along_curve(places: Array) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
+def _morton_order(places: Array) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
     """
     Order points (N, 2) by nested cells; returns the order, and the sorted codes (N,).
 

@@ -15,16 +15,16 @@ from djet_ros.core.fusion import agrees
 from djet_ros.core.hamming import smooth
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
-from djet_ros.core.matching import match_predicted, match_widely, Matches, RIGID
+from djet_ros.core.matching import match_predicted, match_widely, Matches, MIN_RIGID_SHARE
 from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import run_both
-from djet_ros.core.radial import straight_image
+from djet_ros.core.radial import undistort_image
 from djet_ros.core.starts import (
     external_starts,
     five_point,
     hemisphere_starts,
-    Known,
+    KnownMotion,
     starting_poses,
 )
 from djet_ros.core.surfaces import (
@@ -35,7 +35,7 @@ from djet_ros.core.surfaces import (
     ResidualSurface,
 )
 from djet_ros.core.tracking import evaluate_at, Track, track_jointly
-from djet_ros.core.types import Array, Features, of_one_camera, Pose, RelativePose, Status, View
+from djet_ros.core.types import Array, Features, of_same_camera, Pose, RelativePose, Status, View
 from djet_ros.core.verdict import verdict
 import numpy as np
 from numpy.typing import NDArray
@@ -73,16 +73,16 @@ class TwoViewEstimator:
             raise ValueError('expected an image (H, W) uint8 and K (3, 3), got '
                              f'{gray.shape} {gray.dtype} and {K.shape}')
         if self.k1:
-            gray, left_out = straight_image(gray, K, self.k1, left_out)
+            gray, left_out = undistort_image(gray, K, self.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:
             features = self._detected(gray, mask, smoothed)
         return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
 
-    def seen(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
+    def undistorted(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
         """Return an image (H, W) undistorted as in its views, to whose pixels results refer."""
-        return straight_image(gray, K, self.k1)[0] if self.k1 else gray
+        return undistort_image(gray, K, self.k1)[0] if self.k1 else gray
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
         """Detect all features of a gray image (H, W) uint8, except where a mask (H, W) is True."""
@@ -97,7 +97,7 @@ class TwoViewEstimator:
         return detect(gray, config.max_features, config.corner_contrast, mask, smoothed)
 
     def estimate(self, previous: View, current: View, prior: RelativePose | None = None,
-                 known: Known | None = None) -> RelativePose:
+                 known: KnownMotion | None = None) -> RelativePose:
         """
         Estimate the motion from the previous to the current view.
 
@@ -106,7 +106,7 @@ class TwoViewEstimator:
         content: a failure is reported by the status. Raises ValueError if the views differ in size
         or camera matrix.
         """
-        known, timings = known or Known(), dict[str, float]()
+        known, timings = known or KnownMotion(), dict[str, float]()
         _require_one_camera(previous, current)
 
         # If the previous motion predicts the features, matches are searched nearby, and basins
@@ -131,7 +131,7 @@ class TwoViewEstimator:
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
-        return match_widely(previous, current, None, Known(), self.config.search_radius)
+        return match_widely(previous, current, None, KnownMotion(), self.config.search_radius)
 
     def estimate_matched(self, previous: View, current: View, x: Array, y: Array,
                          prior: RelativePose | None = None, observe: Observer | None = None,
@@ -170,7 +170,7 @@ class TwoViewEstimator:
 
         # Sign of t, covariance, status.
         result = self._verdict(pair, track)
-        measured = pair.known.turn
+        measured = pair.known.rotation
         if measured is None or agrees(measured, result):
             return result
 
@@ -227,7 +227,7 @@ class TwoViewEstimator:
         with _timed(pair.timings, 'jet'):
             surface = self._surface(pair)
             if self.config.method == 'djet':
-                surface.around(pair.y)
+                surface.fit_around(pair.y)
             return surface
 
     def _surface(self, pair: Pair) -> ResidualSurface:
@@ -255,7 +255,7 @@ class TwoViewEstimator:
 
 
 def _require_one_camera(previous: View, current: View) -> None:
-    if not of_one_camera(previous, current):
+    if not of_same_camera(previous, current):
         raise ValueError('views of a pair must have the same size and camera matrix; sizes are '
                          f'{previous.gray.shape} and {current.gray.shape}')
 
@@ -271,7 +271,7 @@ def _limits_from(prior: RelativePose) -> Limits:
     Most matches have to agree: with another moving body, the prior may be a compromise already.
     """
     noise = max(robust_scale(prior.residuals), _MIN_NOISE)
-    return Limits(_MAX_NOISE_GROWTH * noise, RIGID)
+    return Limits(_MAX_NOISE_GROWTH * noise, MIN_RIGID_SHARE)
 
 
 def _within_limits(result: RelativePose, limits: Limits) -> bool:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import cv2
 from djet_ros import compiled
 from djet_ros.core.masks import Mask
-from djet_ros.core.parallel import each, run_both
+from djet_ros.core.parallel import map_parallel, run_both
 from djet_ros.core.types import Array, Features
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
             gray, None if mask is None else np.where(mask, 0, 255).astype(np.uint8))
     if descriptors is None:
         descriptors = np.empty((0, 32), np.uint8)
-    return Features.described(
+    return Features.with_descriptors(
         points=np.array(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2),
         octaves=np.array([k.octave for k in keypoints], np.int32),
         angles=np.array([k.angle for k in keypoints], np.float32),
@@ -107,7 +107,7 @@ def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Arra
     best_here = np.full(len(here[0]), -np.inf, np.float32)
     left, right = _similarity_factors(there, here)
     bounds = [(slice(*strip[:2]), slice(*strip[2:])) for strip in strips.tolist()]
-    compared = each(lambda two: _best_matches(left[two[0]], right[two[1]]), bounds)
+    compared = map_parallel(lambda two: _best_matches(left[two[0]], right[two[1]]), bounds)
     for (strip, near), (nearest, highest, highest_here) in zip(bounds, compared):
         claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
         np.maximum(best_there[strip], highest, out=best_there[strip])

@@ -20,7 +20,7 @@ _DECIDED = 2 * np.log(1000)
 
 
 @dataclass(frozen=True)
-class Turn:
+class MeasuredRotation:
     """
     A rotation between two views measured without them, as by a gyro.
 
@@ -31,7 +31,7 @@ class Turn:
     R: Array
     covariance: Array
 
-    def off(self, R: Array) -> Array:
+    def correction(self, R: Array) -> Array:
         """Return the rotation vectors (…, 3) that correct R, (3, 3) or (N, 3, 3), to this one."""
         return rotation_log(self.R @ R.swapaxes(-1, -2))
 
@@ -44,18 +44,18 @@ class Turn:
         return bool(self._square(other) - self._square(R) > _DECIDED)
 
     def _square(self, R: Array) -> float:
-        z = self.off(R)
+        z = self.correction(R)
         return float(z @ np.linalg.solve(self.covariance + _SLACK**2 * np.eye(3), z))
 
 
-def agrees(turn: Turn, relative: RelativePose) -> bool:
+def agrees(turn: MeasuredRotation, relative: RelativePose) -> bool:
     """Return whether the rotation of a pair is consistent with the measured one."""
-    z = turn.off(relative.R)
+    z = turn.correction(relative.R)
     S = relative.covariance_6[:3, :3] + turn.covariance + _SLACK**2 * np.eye(3)
     return bool(np.isfinite(S).all() and z @ np.linalg.solve(S, z) < _SURPRISE)
 
 
-def fused(relative: RelativePose, turn: Turn) -> RelativePose:
+def fused(relative: RelativePose, turn: MeasuredRotation) -> RelativePose:
     """
     Update the rotation and direction of a pair by a measured rotation.
 
@@ -64,7 +64,7 @@ def fused(relative: RelativePose, turn: Turn) -> RelativePose:
     """
     covariance, t = relative.covariance_5, relative.t
     gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + turn.covariance)
-    step = gain @ turn.off(relative.R)
+    step = gain @ turn.correction(relative.R)
     keep = np.eye(5) - gain @ np.eye(3, 5)
     updated = keep @ covariance @ keep.T + gain @ turn.covariance @ gain.T
     R = rotation_exp(step[:3]) @ relative.R

@@ -86,7 +86,7 @@ def sphere_log(t: Array, other: Array) -> Array:
     return np.asarray(across * (np.arctan2(chord, along) / chord))
 
 
-def inverse_of(K: Array) -> Array:
+def inverse_intrinsics(K: Array) -> Array:
     """Return the inverse (3, 3) of a camera matrix, cached: it is used fifty times a frame."""
     return _inverse(np.asarray(K, float).tobytes())
 
@@ -100,7 +100,7 @@ def _inverse(matrix: bytes) -> Array:
 
 def rays(K: Array, points: Array) -> Array:
     """Return the viewing rays K^-1 x (N, 3) of pixels (N, 2), with z = 1."""
-    K_inv = inverse_of(K)
+    K_inv = inverse_intrinsics(K)
     # Component-major: half of the time, and the layout that most uses of them need.
     return np.asarray((K_inv[:, :2] @ points.T + K_inv[:, 2:]).T)
 
@@ -112,7 +112,7 @@ def essential(R: Array, t: Array) -> Array:
 
 def fundamental(K: Array, R: Array, t: Array) -> Array:
     """Fundamental matrix F = K^-T [t]_x R K^-1, (3, 3)."""
-    K_inv = inverse_of(K)
+    K_inv = inverse_intrinsics(K)
     return np.asarray(K_inv.T @ essential(R, t) @ K_inv)
 
 
@@ -234,7 +234,7 @@ def patch_warp(K: Array, R: Array, y: Array, depth_ratio: Array) -> Array:
     a warp are W, the derivative dy/dx, and the third is c, the relative change of the depth in B
     per pixel.
     """
-    M = K @ R @ inverse_of(K)
+    M = K @ R @ inverse_intrinsics(K)
     warp = np.empty((len(y), 3, 2))
     warp[:, :2] = M[..., :2, :2] - y[:, :, None] * M[..., 2:, :2]
     warp[:, 2] = M[..., 2, :2]
@@ -266,7 +266,7 @@ def inverses(A: Array) -> Array:
     return inverse
 
 
-def stretches(warp: Array) -> tuple[Array, Array]:
+def singular_values(warp: Array) -> tuple[Array, Array]:
     """Return the smallest and the largest singular values (N,) of matrices (N, 2, 2)."""
     size = (warp**2).sum((1, 2))
     area = np.abs(warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])

@@ -15,20 +15,20 @@ from typing import Any
 import cv2
 from djet_ros import compiled
 from djet_ros.core.hamming import (
-    ends_of,
+    endpoints_of,
     Image,
-    intensities_through,
-    looks_through,
-    MOST_NEARER,
+    ImagePoints,
+    invert_warps,
+    MAX_DEPTH_RATIO,
     passes,
     Pixels,
     require_describable,
-    Shown,
     sum_over_tests,
     Tests,
+    warped_intensities,
 )
 from djet_ros.core.orb_pattern import reach as reach_of, TESTS
-from djet_ros.core.parallel import each
+from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -61,28 +61,28 @@ def grades(p: NDArray[Any], q: NDArray[Any], grading: float,
     return np.asarray(np.clip(differences, -reach, reach), np.int16)
 
 
-def grades_through(warp: Array, images: Sequence[Shown], points: Array, grading: float,
-                   contrast: float | Array, tests: Tests = TESTS) -> Grades:
+def warped_grades(warp: Array, images: Sequence[ImagePoints], points: Array, grading: float,
+                  contrast: float | Array, tests: Tests = TESTS) -> Grades:
     """
-    Return grades (T, N) of tests on patches seen through warps, see `hamming.intensities_through`.
+    Return grades (T, N) of tests on patches seen through warps, see `hamming.warped_intensities`.
 
     contrast: as in `grades`.
     """
     if compiled.library is None:
-        return grades(*intensities_through(warp, images, points, tests), grading, contrast)
-    inverse, nearer, is_bent = looks_through(warp, tests)
+        return grades(*warped_intensities(warp, images, points, tests), grading, contrast)
+    inverse, nearer, is_bent = invert_warps(warp, tests)
     nearer[~is_bent] = 0
-    places, ends = points.astype(np.float32), ends_of(tests)
+    places, ends = points.astype(np.float32), endpoints_of(tests)
     of_each = np.broadcast_to(np.float32(contrast), len(points))
 
-    def look(task: tuple[list[Shown], slice]) -> Grades:
+    def look(task: tuple[list[ImagePoints], slice]) -> Grades:
         seen, some = task
-        return compiled.grades_through(
+        return compiled.warped_grades(
             seen, (inverse[some], nearer[some]), places[some], of_each[some], ends,
-            _largest_grade(grading), MOST_NEARER)
+            _largest_grade(grading), MAX_DEPTH_RATIO)
 
     none = np.empty((len(tests), 0), np.int16)
-    return np.concatenate([none, *each(look, passes(images))], axis=1)
+    return np.concatenate([none, *map_parallel(look, passes(images))], axis=1)
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,

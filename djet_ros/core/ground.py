@@ -344,7 +344,7 @@ def _tilt(m: Array) -> tuple[Array, Array]:
     return np.array([np.arctan2(z, y), np.arctan2(x, upright)]), J
 
 
-def turned(tilt: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
+def rotate_tilt(tilt: Array, R: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """
     Propagate pitch and roll of a plane through a rotation of the camera.
 

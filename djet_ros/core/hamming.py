@@ -16,7 +16,7 @@ import cv2
 from djet_ros import compiled
 from djet_ros.core.geometry import inverses
 from djet_ros.core.orb_pattern import reach, TESTS
-from djet_ros.core.parallel import each
+from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 Pixels = NDArray[np.int64]
 Tests = NDArray[np.int64]
 # An image, and the number of points in it, of points that are ordered by image.
-Shown = tuple[NDArray[Any], int]
+ImagePoints = tuple[NDArray[Any], int]
 
 # Points per pass of the 256 tests, which bounds the memory of their patches (2 MB).
 _BLOCK = 2048
@@ -39,7 +39,7 @@ _WARPED_BLOCK, _PASS = 256, 512
 _AFFINE_TOLERANCE = 0.02
 
 # chosen: limit of the depth ratio between a part of a patch and its centre.
-MOST_NEARER = 2.0
+MAX_DEPTH_RATIO = 2.0
 
 # Tests times points below which indexing each test point is faster than gathering patches.
 _GATHER_FROM = 20_000
@@ -95,9 +95,9 @@ def intensities(smoothed: NDArray[Any], points: Pixels,
     return patches[py, px], patches[qy, qx]
 
 
-def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
-                        tests: Tests = TESTS
-                        ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def warped_intensities(warp: Array, images: Sequence[ImagePoints], points: Array,
+                       tests: Tests = TESTS
+                       ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """
     Return intensities (T, N) float32 at both ends of T tests, on patches seen through warps.
 
@@ -106,8 +106,8 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
     dx that the warp dy = W dx / (1 + c^T dx) takes to it: dx = u / (1 - c^T u) with u = W^-1 dy.
     Beyond the image, border pixels are replicated.
     """
-    inverse, nearer, is_bent = looks_through(warp, tests)
-    ends, of_tests = ends_of(tests)
+    inverse, nearer, is_bent = invert_warps(warp, tests)
+    ends, of_tests = endpoints_of(tests)
     places = points.astype(np.float32)
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
@@ -117,19 +117,19 @@ def intensities_through(warp: Array, images: Sequence[Shown], points: Array,
         away = [inverse[block, axis] @ ends for axis in (0, 1)]
         bent = np.flatnonzero(is_bent[block])
         if len(bent):
-            depths = (1 - nearer[block][bent] @ ends).clip(1 / MOST_NEARER, MOST_NEARER)
+            depths = (1 - nearer[block][bent] @ ends).clip(1 / MAX_DEPTH_RATIO, MAX_DEPTH_RATIO)
             for along in away:
                 along[bent] /= depths
         x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
         cv2.remap(image, x, y, cv2.INTER_LINEAR, values[block], cv2.BORDER_REPLICATE)
 
-    each(look, blocks(floating(images)))
+    map_parallel(look, blocks(floating(images)))
     by_end = np.asarray(cv2.transpose(values)) if len(points) else values.T
     return by_end[of_tests[0]], by_end[of_tests[1]]
 
 
-def looks_through(warp: Array, tests: Tests
-                  ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def invert_warps(warp: Array, tests: Tests
+                 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """
     Invert warps (N, 3, 2): return W^-1 (N, 2, 2), c^T W^-1 (N, 2), and a mask (N,).
 
@@ -143,7 +143,7 @@ def looks_through(warp: Array, tests: Tests
     return inverse.astype(np.float32), nearer.astype(np.float32), bend > _AFFINE_TOLERANCE
 
 
-def blocks(images: Sequence[Shown], most: int = _WARPED_BLOCK
+def blocks(images: Sequence[ImagePoints], most: int = _WARPED_BLOCK
            ) -> list[tuple[NDArray[Any], slice]]:
     """Split the points of images into passes: tuples of an image and a slice of its points."""
     parts, end = [], 0
@@ -154,14 +154,14 @@ def blocks(images: Sequence[Shown], most: int = _WARPED_BLOCK
     return parts
 
 
-def floating(images: Sequence[Shown]) -> list[Shown]:
+def floating(images: Sequence[ImagePoints]) -> list[ImagePoints]:
     """Return images in float32, which OpenCV interpolates three times as fast."""
     return [(image.astype(np.float32, copy=False), count) for image, count in images]
 
 
-def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
+def passes(images: Sequence[ImagePoints]) -> list[tuple[list[ImagePoints], slice]]:
     """Split points into passes, each over one or more images of the same size."""
-    found: list[tuple[list[Shown], slice]] = []
+    found: list[tuple[list[ImagePoints], slice]] = []
     for image, some in blocks(images, _PASS):
         part = image, some.stop - some.start
         seen, begun = found[-1] if found else ([], some)
@@ -172,7 +172,7 @@ def passes(images: Sequence[Shown]) -> list[tuple[list[Shown], slice]]:
     return found
 
 
-def ends_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def endpoints_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the distinct points (2, E) of tests (T, 4), and the indices (2, T) of their ends."""
     return _ends(tests.tobytes())
 

@@ -19,19 +19,19 @@ from dataclasses import dataclass
 from djet_ros import compiled
 from djet_ros.core.geometry import (
     GENERATORS,
-    inverse_of,
+    inverse_intrinsics,
     rays,
     rotation_exp,
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import median, medians, middle_of, Paraboloids
+from djet_ros.core.paraboloid import median, median_of_sorted, medians, Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
 
 MAX_STEPS = 30
-DAMPING_AT_FIRST = 1e-4
+INITIAL_DAMPING = 1e-4
 _STEP_TOLERANCE = 1e-6  # rad; the best poses are accurate to a hundred times as much
 _GAIN_TOLERANCE = 1e-6
 _MAX_DAMPING = 1e6
@@ -40,13 +40,13 @@ _MAX_DAMPING = 1e6
 # weights alone (as in iteratively reweighted least squares) steps are too short; with the second
 # derivative of the robust loss alone they are too long where many matches are outliers. This
 # takes three quarters of the steps.
-LEAST_CURVED = 0.3
+LEAST_CURVATURE = 0.3
 
 # In the order of the arguments of djet_minimise.
-_LIMITS = np.array([_STEP_TOLERANCE, _GAIN_TOLERANCE, _MAX_DAMPING, LEAST_CURVED])
+_LIMITS = np.array([_STEP_TOLERANCE, _GAIN_TOLERANCE, _MAX_DAMPING, LEAST_CURVATURE])
 _LOSSES = ('none', 'huber', 'cauchy', 'geman_mcclure')
 
-# Cut-off of `core_scale` in robust standard deviations, and its rounds (chosen).
+# Cut-off of `clipped_scale` in robust standard deviations, and its rounds (chosen).
 _CLIPPING, _CLIPPING_ROUNDS = 2.5, 8
 
 # Standard deviation over median absolute deviation of a normal distribution.
@@ -80,11 +80,11 @@ class JetProblem:
         places = np.arange(len(self.blur))[chosen]
         return JetProblem(*(values.take(places, axis=-1) for values in self.matches))
 
-    def seen_with(self, K: Array, other: Array) -> JetProblem:
+    def with_camera(self, K: Array, other: Array) -> JetProblem:
         """Return the problem with the same pixels under another camera matrix than K."""
-        A = inverse_of(other) @ K
+        A = inverse_intrinsics(other) @ K
         return JetProblem(A @ self.rays_x, A @ self.rays_y,
-                          spread_of_rays(inverse_of(K) @ other, self.spread),
+                          ray_covariances(inverse_intrinsics(K) @ other, self.spread),
                           np.linalg.det(A) * self.blur)
 
     @property
@@ -145,7 +145,7 @@ class Loss:
         raise ValueError(f"loss is '{self.name}'; choose none, huber, cauchy or geman_mcclure")
 
     @property
-    def numbers(self) -> tuple[int, float]:
+    def encoded(self) -> tuple[int, float]:
         """Return the index of the loss, as compiled code takes it, and its scale."""
         return _LOSSES.index(self.name), self.scale
 
@@ -175,9 +175,9 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
         spread *= _floored_minimum_values(paraboloids, minima)
     widths = np.abs(spread[0] + spread[2]) / 2
     spread /= max(median(widths), 1e-12) if len(minima) else 1.0
-    spread = spread_of_rays(K, spread)
+    spread = ray_covariances(K, spread)
     # |g| grows with the sine of the angle from the epipole, so that a distance there is an angle.
-    pixel = np.linalg.det(inverse_of(K)[:2, :2])
+    pixel = np.linalg.det(inverse_intrinsics(K)[:2, :2])
     blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
     return JetProblem(rays(K, x).T, rays(K, minima).T, spread, blur)
 
@@ -187,9 +187,9 @@ def entries(S: Array) -> Array:
     return np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
 
 
-def spread_of_rays(K: Array, spread: Array) -> Array:
+def ray_covariances(K: Array, spread: Array) -> Array:
     """Convert covariances of pixels to covariances of rays, both as entries 11, 12, 22 (3, N)."""
-    (a, b), (c, d) = inverse_of(K)[:2, :2]
+    (a, b), (c, d) = inverse_intrinsics(K)[:2, :2]
     return np.asarray(np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
                                 [c * c, 2 * c * d, d * d]]) @ spread)
 
@@ -208,7 +208,7 @@ def _floored_minimum_values(paraboloids: Paraboloids, minima: Array) -> Array:
 def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     """Return the residuals at (R, t) with their analytic Jacobian over 3 + 2 parameters."""
     if compiled.library is not None:
-        return Residuals(*compiled.minimise(problem.matches, Loss().numbers, 0, DAMPING_AT_FIRST,
+        return Residuals(*compiled.minimise(problem.matches, Loss().encoded, 0, INITIAL_DAMPING,
                                             _LIMITS, R, t)[2])
     tangents = sphere_tangents(t)
     # t and the two tangent directions in which it moves.
@@ -245,17 +245,17 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
     the initial pose, if they have been computed already.
     """
     if compiled.library is not None:
-        R, t, left = compiled.minimise(problem.matches, loss.numbers, max_steps,
-                                       DAMPING_AT_FIRST, _LIMITS, R, t)
+        R, t, left = compiled.minimise(problem.matches, loss.encoded, max_steps,
+                                       INITIAL_DAMPING, _LIMITS, R, t)
         return Solution(R, t, Residuals(*left))
     residuals = residuals or epipolar_residuals(problem, R, t)
     cost, weights = _cost(residuals, loss)
-    damping = DAMPING_AT_FIRST
+    damping = INITIAL_DAMPING
     for _ in range(max_steps):
         step = _step(residuals, weights, loss, damping)
         if step is None:
             break
-        R_new, t_new = moved(R, t, residuals.tangents, step)
+        R_new, t_new = retract(R, t, residuals.tangents, step)
         trial = epipolar_residuals(problem, R_new, t_new)
         trial_cost, trial_weights = _cost(trial, loss)
         if trial_cost < cost:
@@ -271,7 +271,7 @@ def minimise(problem: JetProblem, R: Array, t: Array, loss: Loss,
     return Solution(R, t, residuals)
 
 
-def moved(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
+def retract(R: Array, t: Array, tangents: Array, step: Array) -> tuple[Array, Array]:
     """Apply a step (5,) to a pose: a rotation vector from the left, in rad; t along the sphere."""
     t = t + tangents @ step[3:]  # a tangential step never shortens t
     return rotation_exp(step[:3]) @ R, t / np.sqrt(t @ t)
@@ -289,7 +289,7 @@ def robust_scales(residuals: Array) -> Array:
     return _SIGMA_OVER_MAD * medians(np.abs(residuals))
 
 
-def core_scale(residuals: Array) -> float:
+def clipped_scale(residuals: Array) -> float:
     """
     Return the standard deviation of the inliers by iterated clipping, even if they are a minority.
 
@@ -301,7 +301,7 @@ def core_scale(residuals: Array) -> float:
     ordered = np.sort(np.abs(residuals))
     count = len(ordered)
     for _ in range(1 + _CLIPPING_ROUNDS):
-        scale = _SIGMA_OVER_MAD * middle_of(ordered, count) if count else 1.0
+        scale = _SIGMA_OVER_MAD * median_of_sorted(ordered, count) if count else 1.0
         before, count = count, int(ordered.searchsorted(_CLIPPING * scale))
         if count == before or not scale:
             break
@@ -322,7 +322,7 @@ def _step(residuals: Residuals, weights: Array, loss: Loss, damping: float) -> A
     of the robust loss, or a share of the match's weight if that is more.
     """
     J, r = residuals.jacobian, residuals.r
-    H = (J * np.maximum(loss.curvature(r * r), LEAST_CURVED * weights)) @ J.T
+    H = (J * np.maximum(loss.curvature(r * r), LEAST_CURVATURE * weights)) @ J.T
     gradient = J @ (weights * residuals.sign * r)
     diagonal = H.diagonal()
     if not np.isfinite(H).all() or not diagonal.any():

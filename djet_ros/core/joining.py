@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from djet_ros.core.geometry import inverse_of, rays
+from djet_ros.core.geometry import inverse_intrinsics, rays
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     entries,
     epipolar_residuals,
     JetProblem,
+    ray_covariances,
     Solution,
-    spread_of_rays,
 )
 from djet_ros.core.paraboloid import median, quantile
-from djet_ros.core.patches import Placed
+from djet_ros.core.patches import Aligned
 from djet_ros.core.types import Array
 import numpy as np
 
@@ -42,8 +42,8 @@ _HETEROGENEITY = 2.0
 _NEGLIGIBLE = 1e-12
 
 
-def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Placed
-                ) -> JetProblem:
+def fuse_alignment(problem: JetProblem, solution: Solution, K: Array, placed: Aligned
+                   ) -> JetProblem:
     """
     Fuse the N surface measurements of a problem with patch alignment.
 
@@ -53,19 +53,19 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     `_relative_noise`. Matches without a minimum stay unchanged.
     """
     found = replace(problem, rays_y=rays(K, placed.places).T,
-                    spread=spread_of_rays(K, entries(placed.covariances)),
+                    spread=ray_covariances(K, entries(placed.covariances)),
                     blur=np.zeros(len(placed.places)))
     off = epipolar_residuals(found, solution.R, solution.t).r
-    S, T = (core_scale(r)**2 * measured.spread
+    S, T = (clipped_scale(r)**2 * measured.spread
             for measured, r in ((problem, solution.residuals.r), (found, off)))
     has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
     there = np.flatnonzero(has_minimum)
     rays_y, joined = problem.rays_y.copy(), S.copy()
-    way, joined[:, there] = join(*(values.take(there, axis=1) for values in (
+    way, joined[:, there] = fuse(*(values.take(there, axis=1) for values in (
         found.rays_y[:2] - rays_y[:2], S, T)))
     rays_y[:2, there] += way
     # Residuals are in pixels for a match of median curvature again.
-    G = inverse_of(K)[:2, :2]
+    G = inverse_intrinsics(K)[:2, :2]
     width = np.trace(G @ G.T)
     spread = joined * (width / max(median(np.abs(joined[0] + joined[2])), 1e-300))
     blur = problem.blur * (np.abs(spread[0] + spread[2])
@@ -73,7 +73,7 @@ def with_places(problem: JetProblem, solution: Solution, K: Array, placed: Place
     return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
 
 
-def join(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
+def fuse(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
     """
     Fuse two measurements of N positions: by surfaces, with S (3, N), and by alignment, with T.
 
@@ -91,7 +91,7 @@ def join(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
     return _multiply(S, way), left * _relative_noise((apart * way).sum(0))
 
 
-def joined_places(minima: Array, spread: Array, placed: Placed) -> tuple[Array, Array]:
+def fuse_positions(minima: Array, spread: Array, placed: Aligned) -> tuple[Array, Array]:
     """
     Fuse minima (N, 2) of surfaces with aligned positions, without a pose to calibrate them by.
 
@@ -106,7 +106,7 @@ def joined_places(minima: Array, spread: Array, placed: Placed) -> tuple[Array, 
         squared = (apart * _multiply(_inverse(S), apart)).sum(0)
         S = S * max(median(squared) / (2 * np.log(2)),
                     median(T[0] + T[2]) / median(S[0] + S[2]))
-    way, joined = join(apart, S, T)
+    way, joined = fuse(apart, S, T)
     return minima + way.T, joined[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
 
 

@@ -25,13 +25,13 @@ def choose_landmarks(x: Array, rho: Array, present: Array, side: float, room: in
     # Near points have the most parallax. Selecting by their own noisy depths would select those
     # with the largest errors, and bias each step short: by 6 % over 300 small images. So depth is
     # judged by neighbours.
-    nearest = np.argsort(-np.floor(around_patches(x, np.log2(rho)) / _CLASSES), kind='stable')
+    nearest = np.argsort(-np.floor(surrounding_means(x, np.log2(rho)) / _CLASSES), kind='stable')
     cells, taken = (cells_of(points, side) for points in (x[nearest], present))
     rank = rank_in_cells(cells) + np.isin(cells, taken)
     return np.asarray(nearest[np.argsort(rank, kind='stable')[:max(room, 0)]])
 
 
-def around_patches(points: Array, values: Array) -> Array:
+def surrounding_means(points: Array, values: Array) -> Array:
     """
     Return means (N,) of the values of other points (N, 2) around each, outside its own patch.
 

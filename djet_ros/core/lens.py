@@ -25,16 +25,16 @@ from djet_ros.core.covariance import LARGE_CELLS
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     epipolar_residuals,
     JetProblem,
-    LEAST_CURVED,
+    LEAST_CURVATURE,
     Loss,
     minimise,
     Solution,
 )
 from djet_ros.core.paraboloid import times
-from djet_ros.core.starts import thinned
+from djet_ros.core.starts import subsampled
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 
@@ -119,7 +119,7 @@ class MatchedPair:
         inliers were selected with the calibration under test.
         """
         voting = np.flatnonzero(relative.voting)
-        some = voting[thinned(len(voting), MOST_MATCHES)]
+        some = voting[subsampled(len(voting), MOST_MATCHES)]
         x, y = (rays(K, points[some])[:, :2] for points in (relative.x, relative.placed))
         return cls(x, y, Pose(relative.R, relative.t))
 
@@ -230,7 +230,7 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
     """Linearise a pair at some k1, with its pose refined for that k1."""
     problem, by_pixel = _problem(pair, lens, k1)
     R, t = pair.pose.R, pair.pose.t
-    noise = max(core_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
+    noise = max(clipped_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
     loss = Loss('geman_mcclure', _LOSS_SCALE * noise)
     solution = minimise(problem, R, t, loss)
     r = solution.residuals.r
@@ -240,11 +240,11 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
     by_own_k1 = r - left * (squares[1].sum() / max(squares[0].sum(), 1e-300))
     # The second derivative of a robust loss is below its weights (Huber, Robust Statistics,
     # section 7.6): two thirds of them for normal noise.
-    squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), LEAST_CURVED)
+    squares[0] *= max(loss.curvature(r * r).sum() / weights.sum(), LEAST_CURVATURE)
     moved = displacements(problem.rays_y[:2].T, lens, k1)
     share = np.sqrt((weights * left * left).sum() / max((weights * moved * moved).sum(), 1e-300))
     pulls = (weights * left / noise)[:, None] * _across_lines(problem, solution, by_pixel)
-    return Linearised(replace(pair, pose=solution.pose), float(share), core_scale(by_own_k1),
+    return Linearised(replace(pair, pose=solution.pose), float(share), clipped_scale(by_own_k1),
                       squares / noise**2, pulls)
 
 

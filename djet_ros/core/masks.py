@@ -23,7 +23,7 @@ def blocked(left_out: Mask) -> Mask:
     return np.asarray(cv2.dilate(left_out.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def at(mask: Mask | None, points: NDArray[np.float64] | NDArray[np.int64]) -> Mask:
+def masked_at(mask: Mask | None, points: NDArray[np.float64] | NDArray[np.int64]) -> Mask:
     """Return the mask at points (N, 2) in pixels, (N,) bool; False outside or without one."""
     result = np.zeros(len(points), bool)
     if mask is None or not len(points):

@@ -19,14 +19,14 @@ from djet_ros.core.prediction import (
     predict_constant_motion,
     search_radius_after,
 )
-from djet_ros.core.starts import Known
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
 
 # chosen: share of inliers in a rigid scene; 0.6 was the least observed there, with the preset
 # fast, and 0.2 to 0.6 with a lorry in view.
-RIGID = 0.55
+MIN_RIGID_SHARE = 0.55
 
 # Share of the inliers expected from the previous pair that predicted matches have to reach.
 _MIN_SHARE = 0.8
@@ -65,7 +65,7 @@ class PredictedMatches(NamedTuple):
     motion: Pose
 
 
-def match_predicted(previous: View, current: View, prior: RelativePose | None, known: Known,
+def match_predicted(previous: View, current: View, prior: RelativePose | None, known: KnownMotion,
                     search_radius: float) -> PredictedMatches | None:
     """
     Track features from where the previous motion predicts them; None if too few are nearby.
@@ -73,8 +73,8 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
     Also None with a measured rotation, and if the scene is not rigid: then a wide search gives the
     choice of motions. search_radius: as a share of the longer image side.
     """
-    if (prior is None or known.turn is not None or search_radius >= 1
-            or prior.inliers.sum() < _MIN_MATCHES or prior.inliers.mean() < RIGID):
+    if (prior is None or known.rotation is not None or search_radius >= 1
+            or prior.inliers.sum() < _MIN_MATCHES or prior.inliers.mean() < MIN_RIGID_SHARE):
         return None
     reach = min(flow_reach(NEAR_LEVELS), search_radius * max(current.gray.shape))
     motion = Pose(prior.R if known.guess is None else known.guess.R, prior.t)
@@ -93,7 +93,7 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
     return PredictedMatches(Matches(x, y.take(first, axis=0)), bits[first], motion)
 
 
-def match_widely(previous: View, current: View, prior: RelativePose | None, known: Known,
+def match_widely(previous: View, current: View, prior: RelativePose | None, known: KnownMotion,
                  search_radius: float) -> Matches:
     """
     Match features within the search radius of where the rotation alone would bring them.
@@ -110,7 +110,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
     rotated = predict_at_infinity(there, here, current.K, rotations, radius,
-                                  measured=known.turn is not None)
+                                  measured=known.rotation is not None)
     y, bits = track_features(previous, current, rotated, radius)
     pairs = _match_rotated(previous, current, rotated, prior, radius)
     y, bits = _resolved(previous, current, y, bits, pairs)

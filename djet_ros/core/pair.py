@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.starts import Known
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, Pose, View
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class Pair:
     x: Array
     y: Array
     prior: Pose | None = None
-    known: Known = field(default_factory=Known)
+    known: KnownMotion = field(default_factory=KnownMotion)
     predicted: Pose | None = None
     limits: Limits = field(default_factory=Limits)
     bits: Array | None = None

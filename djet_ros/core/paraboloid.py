@@ -37,7 +37,7 @@ class Paraboloids:
 
     def minima(self) -> Array:
         """Return the stationary points y* = centre - A'^-1 b (N, 2)."""
-        return np.asarray(self.centres + self.ways)
+        return np.asarray(self.centres + self.minimum_offsets)
 
     @cached_property
     def inverses(self) -> Array:
@@ -45,7 +45,7 @@ class Paraboloids:
         return inverse_2x2(self.A)
 
     @cached_property
-    def ways(self) -> Array:
+    def minimum_offsets(self) -> Array:
         """Return the displacements (N, 2) from the centres to the minima."""
         return -times(self.inverses, self.b)
 
@@ -57,12 +57,12 @@ class Paraboloids:
             self.centres, self.A, self.b, self.c, self.usable)))
         # Cached properties are kept.
         vars(some).update((name, value.take(places, axis=0)) for name, value in vars(self).items()
-                          if name in ('inverses', 'ways'))
+                          if name in ('inverses', 'minimum_offsets'))
         return some
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
         """Return a mask (N,) of those with a minimum within `radius` along either axis."""
-        return np.asarray(largest(self.ways) <= radius)
+        return np.asarray(largest(self.minimum_offsets) <= radius)
 
     def values(self, y: Array) -> Array:
         """Evaluate the paraboloids at pixels y (N, 2); returns (N,)."""
@@ -129,7 +129,7 @@ def middles(ordered: Array) -> Array:
         ordered[..., half] if odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
 
 
-def middle_of(ordered: Array, count: int) -> float:
+def median_of_sorted(ordered: Array, count: int) -> float:
     """Return the median of the first `count` of (N,) sorted values."""
     return (ordered.item((count - 1) // 2) + ordered.item(count // 2)) / 2
 

@@ -41,7 +41,7 @@ def run_both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[
     return done, later.result() if running else second()
 
 
-def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
+def map_parallel(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
     """Map a function over many small tasks in two threads; results in the order of the tasks."""
     if len(tasks) < 2:
         return [work(task) for task in tasks]
@@ -53,7 +53,7 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
     return [shares[i % 2][i // 2] for i in range(len(tasks))]
 
 
-def started_beside(work: Callable[[], Result]) -> Callable[[], Result]:
+def start_in_background(work: Callable[[], Result]) -> Callable[[], Result]:
     """
     Start a function in the background; returns a function to call once for its result.
 

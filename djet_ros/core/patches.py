@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import cv2
 from djet_ros import compiled
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import blocks, floating, gather_patches, Image, passes, Shown
+from djet_ros.core.hamming import blocks, floating, gather_patches, Image, ImagePoints, passes
 from djet_ros.core.paraboloid import times
-from djet_ros.core.parallel import each
+from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -58,7 +58,7 @@ _PARAMETERS = 4
 _BLOCK = 1024
 
 
-class Placed(NamedTuple):
+class Aligned(NamedTuple):
     """
     Positions (N, 2) of patches, and their covariances (N, 2, 2) in square pixels.
 
@@ -71,12 +71,12 @@ class Placed(NamedTuple):
     covariances: Array
 
 
-def as_matched(y: Array) -> Placed:
+def unaligned(y: Array) -> Aligned:
     """Return positions y (N, 2) as they are, with unit covariances."""
-    return Placed(y.copy(), np.tile(np.eye(2), (len(y), 1, 1)))
+    return Aligned(y.copy(), np.tile(np.eye(2), (len(y), 1, 1)))
 
 
-def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Placed:
+def align_patches(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Aligned:
     """
     Align patches around x (N, 2) of one gray image with another, starting from y (N, 2).
 
@@ -88,49 +88,49 @@ def place_exactly(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     stay at y.
     """
     if compiled.library is not None and len(y):
-        return place_all([(there, len(x))], x, warp, here, y)
+        return align_all([(there, len(x))], x, warp, here, y)
     places, covariances = y.copy(), np.empty((len(y), 2, 2))
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
-        places[block], covariances[block] = place_all(
+        places[block], covariances[block] = align_all(
             [(there, len(x[block]))], x[block], warp[block], here, y[block])
 
-    each(refine, range(0, len(y), _BLOCK))
-    return Placed(places, covariances)
+    map_parallel(refine, range(0, len(y), _BLOCK))
+    return Aligned(places, covariances)
 
 
-def place_all(images: Sequence[Shown], x: Array, warp: Array, here: Image, y: Array
-              ) -> Placed:
-    """Align patches as `place_exactly`, with x (N, 2) ordered by several gray images."""
+def align_all(images: Sequence[ImagePoints], x: Array, warp: Array, here: Image, y: Array
+              ) -> Aligned:
+    """Align patches as `align_patches`, with x (N, 2) ordered by several gray images."""
     inside = within(y, here.shape, _MARGIN)
     # Patches near the border are aligned elsewhere, and their result is discarded.
     began = np.where(inside[:, None], y, _MARGIN)
     if compiled.library is None or min(here.shape) <= 2 * _MARGIN or not len(x):
-        places, noise, spread = expect(images, x, warp).stepped(here, began, inside)
+        places, noise, spread = templates(images, x, warp).align(here, began, inside)
     else:
         places, noise, spread = _stepped(images, x, warp, here, began, inside)
-    return Placed(np.where(inside[:, None], places, y),
-                  noise[:, None, None] * spread + _LEAST_ERROR**2 * np.eye(2))
+    return Aligned(np.where(inside[:, None], places, y),
+                   noise[:, None, None] * spread + _LEAST_ERROR**2 * np.eye(2))
 
 
-def _stepped(images: Sequence[Shown], x: Array, warp: Array, here: Image, began: Array,
+def _stepped(images: Sequence[ImagePoints], x: Array, warp: Array, here: Image, began: Array,
              inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Run `Expected.stepped` compiled."""
+    """Run `Templates.align` compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
     tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _MAX_SHIFT], float)
 
-    def step(task: tuple[list[Shown], slice]) -> tuple[Array, Array, Array]:
+    def step(task: tuple[list[ImagePoints], slice]) -> tuple[Array, Array, Array]:
         seen, some = task
-        return compiled.place(seen, here, points[some], inverse[some], began[some], inside[some],
+        return compiled.align(seen, here, points[some], inverse[some], began[some], inside[some],
                               tuning)
 
     places, noise, spread = (np.concatenate(values)
-                             for values in zip(*each(step, passes(images))))
+                             for values in zip(*map_parallel(step, passes(images))))
     return places, noise, spread
 
 
-class Expected(NamedTuple):
+class Templates(NamedTuple):
     """
     N templates of P pixels: patches warped into the current image.
 
@@ -144,8 +144,8 @@ class Expected(NamedTuple):
     gray: Gray
     contrasts: Array
 
-    def stepped(self, here: Image, began: Array, inside: NDArray[np.bool_]
-                ) -> tuple[Array, Array, Array]:
+    def align(self, here: Image, began: Array, inside: NDArray[np.bool_]
+              ) -> tuple[Array, Array, Array]:
         """
         Align the templates with an image by Gauss-Newton, starting from `began` (N, 2).
 
@@ -164,7 +164,7 @@ class Expected(NamedTuple):
 class _CurrentPatches:
     """Patches of the current image around moving positions, and products with templates."""
 
-    def __init__(self, expected: Expected, image: Image, places: Array) -> None:
+    def __init__(self, expected: Templates, image: Image, places: Array) -> None:
         self._expected, self._image, self._whole = expected, image, np.floor(places)
         self._patches = _around(image, self._whole)
         self._products = _products(expected.slopes, self._patches)
@@ -197,7 +197,7 @@ class _CurrentPatches:
         return places - self._whole
 
 
-def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
+def templates(images: Sequence[ImagePoints], points: Array, warp: Array) -> Templates:
     """
     Return templates: the patches around points (N, 2) as they look through warps (N, 3, 2).
 
@@ -224,7 +224,7 @@ def expect(images: Sequence[Shown], points: Array, warp: Array) -> Expected:
     xx, xy, yy = (np.einsum('pn,pn->n', slopes[one], slopes[other]).astype(float)
                   for one, other in ((0, 0), (0, 1), (1, 1)))
     G = np.stack([xx + _LEAST_SLOPE, xy, xy, yy + _LEAST_SLOPE], axis=1).reshape(-1, 2, 2)
-    return Expected(slopes, inverses(G), gray, contrast)
+    return Templates(slopes, inverses(G), gray, contrast)
 
 
 def _around(image: Image, whole: Array) -> Gray:

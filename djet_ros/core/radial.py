@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import cv2
-from djet_ros.core.geometry import inverse_of, rays
+from djet_ros.core.geometry import inverse_intrinsics, rays
 from djet_ros.core.masks import Mask
 from djet_ros.core.types import Array
 import numpy as np
@@ -31,14 +31,14 @@ def stretch(u: Array, k1: float) -> Array:
     return np.asarray(1 + np.minimum(np.maximum(moved, -FARTHEST), FARTHEST))
 
 
-def bending(K: Array, u: Array, k1: float) -> Array:
+def distortion_jacobian(K: Array, u: Array, k1: float) -> Array:
     """Return the Jacobians (N, 2, 2) of distorted by undistorted pixels, at points u (N, 2)."""
     by_point = 2 * k1 * u[:, :, None] * u[:, None]
     by_point[:, [0, 1], [0, 1]] += stretch(u, k1)
-    return np.asarray(K[:2, :2] @ by_point @ inverse_of(K)[:2, :2])
+    return np.asarray(K[:2, :2] @ by_point @ inverse_intrinsics(K)[:2, :2])
 
 
-def straight_rays(K: Array, pixels: Array, k1: float) -> Array:
+def undistorted_rays(K: Array, pixels: Array, k1: float) -> Array:
     """Return the viewing rays (N, 3), with z = 1, of pixels (N, 2) distorted by k1."""
     towards = rays(K, pixels)
     u = seen = towards[:, :2]
@@ -48,12 +48,12 @@ def straight_rays(K: Array, pixels: Array, k1: float) -> Array:
     return towards
 
 
-def straightened(K: Array, pixels: Array, k1: float) -> Array:
+def undistort(K: Array, pixels: Array, k1: float) -> Array:
     """Return pixels (N, 2) undistorted by k1."""
-    return _pixels(K, straight_rays(K, pixels, k1)[:, :2])
+    return _pixels(K, undistorted_rays(K, pixels, k1)[:, :2])
 
 
-def bent(K: Array, pixels: Array, k1: float) -> Array:
+def distort(K: Array, pixels: Array, k1: float) -> Array:
     """Return pixels (N, 2) distorted by k1."""
     u = rays(K, pixels)[:, :2]
     return _pixels(K, u * stretch(u, k1))
@@ -70,8 +70,8 @@ class _Remap(NamedTuple):
     unseen: Mask
 
 
-def straight_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask | None = None,
-                   before: float = 0.0) -> tuple[NDArray[np.uint8], Mask | None]:
+def undistort_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask | None = None,
+                    before: float = 0.0) -> tuple[NDArray[np.uint8], Mask | None]:
     """
     Undistort an image (H, W) by k1; also return the mask of pixels to leave out.
 
@@ -93,7 +93,7 @@ def straight_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask 
 def _remap(matrix: bytes, shape: tuple[int, int], k1: float, before: float) -> _Remap:
     K, (height, width) = np.frombuffer(matrix).reshape(3, 3), shape
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1, dtype=float)
-    x, y = straightened(K, bent(K, pixels.reshape(-1, 2), k1), before).T.reshape(2, height, width)
+    x, y = undistort(K, distort(K, pixels.reshape(-1, 2), k1), before).T.reshape(2, height, width)
     # The outermost pixels extend half a pixel beyond their centres.
     unseen = ((np.abs(x - (width - 1) / 2) > width / 2)
               | (np.abs(y - (height - 1) / 2) > height / 2))

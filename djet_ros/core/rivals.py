@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import cv2
 from djet_ros.core.cells import sum_by_cell
 from djet_ros.core.geometry import chirality_signs, inverse_depths, rays, unit
-from djet_ros.core.jet import core_scale, JetProblem, Loss, robust_scale
+from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
-from djet_ros.core.starts import around, thinned
+from djet_ros.core.starts import starts_around, subsampled
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,7 @@ def preferences(losses: Array, places: Array, chosen: int) -> Array:
 
 def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> list[Pose]:
     """Optimise rivals to the minima of their basins, on a subset of the matches."""
-    some = problem.subset(thinned(len(problem.blur), _REFINED_ON))
+    some = problem.subset(subsampled(len(problem.blur), _REFINED_ON))
     return refine_all(some, rivals, loss, _STEPS).poses()
 
 
@@ -145,7 +145,7 @@ def is_planar(x: Array, y: Array, noise: float) -> bool:
     Nearly all of them have to, and as closely as their noise allows: with larger errors, depths
     may remain that determine the motion. noise: robust standard deviation in pixels.
     """
-    some = thinned(len(x), _REFINED_ON)
+    some = subsampled(len(x), _REFINED_ON)
     H, _ = cv2.findHomography(x[some], y[some], cv2.USAC_MAGSAC, _INLIER * noise)
     return H is not None and _fits_homography(np.asarray(H, np.float64), x, y, noise)
 
@@ -169,7 +169,7 @@ def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival
     decides between the two, which gives the preference. noise: as for ``is_planar``; None if the
     scene is not planar, or both motions are the same.
     """
-    few, some = (thinned(len(x), count) for count in (_SCREENED_ON, _REFINED_ON))
+    few, some = (subsampled(len(x), count) for count in (_SCREENED_ON, _REFINED_ON))
     # A few matches suffice to reject a plane in most scenes.
     if _induced_homography(pose, K, x[few], y[few], noise) is None:
         return None
@@ -237,8 +237,8 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
 def _fit_motion(alone: JetProblem, near: Pose, scale: float) -> Pose:
     """Fit the motion with most inliers among some matches, from starts around another motion."""
     rough, tight = (Loss('geman_mcclure', share * scale) for share in (_OUTLIER, _INLIER))
-    some = alone.subset(thinned(len(alone.blur), _MAX_OUTLIERS))
-    found = refine_all(some, around(near, _DIRECTIONS), rough, _STEPS)
+    some = alone.subset(subsampled(len(alone.blur), _MAX_OUTLIERS))
+    found = refine_all(some, starts_around(near, _DIRECTIONS), rough, _STEPS)
     seen = refine_all(alone, found.poses(), tight, 1)
     best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
     refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
@@ -266,7 +266,7 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     alone = problem.subset(~fixed)
     world = _fit_motion(alone, pose, scale)
     # Matches that stay in place are less noisy than those that move.
-    scale = max(core_scale(refine_all(alone, [world], Loss(), 0).r[0]), scale)
+    scale = max(clipped_scale(refine_all(alone, [world], Loss(), 0).r[0]), scale)
     tight = refine_all(alone, [world], Loss('geman_mcclure', _INLIER * scale), _STEPS)
     world = _with_chirality(alone, tight.pose(0), np.abs(tight.r[0]) < _INLIER * scale)
     off = _distances(problem, refine_all(problem, [world], Loss(), 0))

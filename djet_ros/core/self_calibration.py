@@ -39,14 +39,14 @@ class SelfCalibration:
     Estimate of k1.
 
     mean, covariance: (2,) and (2, 2) of k1, if there is any, and of the systematic error that
-    looks like it, in pixels; first: prior standard deviation of k1; undone: k1 that images
+    looks like it, in pixels; first: prior standard deviation of k1; corrected_k1: k1 that images
     are already corrected for, and unsure: its standard deviation when that was chosen.
     """
 
     mean: Array
     covariance: Array
     first: float
-    undone: float = 0.0
+    corrected_k1: float = 0.0
     unsure: float = np.inf
 
     @classmethod
@@ -63,7 +63,7 @@ class SelfCalibration:
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
-    def certain(self) -> bool:
+    def significant(self) -> bool:
         """Return whether the distortion is significant."""
         return abs(float(self.mean[0])) > _CERTAIN * self.sigma
 
@@ -81,12 +81,12 @@ class SelfCalibration:
         return float(self.mean[0] / (1 + none))
 
     @property
-    def left(self) -> float:
+    def residual_k1(self) -> float:
         """Return the expected k1 that remains in images as they are corrected now."""
-        return self.k1 - self.undone
+        return self.k1 - self.corrected_k1
 
     @property
-    def due(self) -> bool:
+    def needs_update(self) -> bool:
         """
         Return whether images should be corrected with a new k1.
 
@@ -94,14 +94,14 @@ class SelfCalibration:
         all, and never back and forth, as the variance never grows.
         """
         if np.isinf(self.unsure):
-            return self.certain
+            return self.significant
         return 2 * self.sigma**2 < self.unsure**2
 
-    def straightened(self) -> SelfCalibration:
+    def corrected(self) -> SelfCalibration:
         """Return the same after images have been corrected for the expected k1."""
-        return replace(self, undone=self.k1, unsure=self.sigma)
+        return replace(self, corrected_k1=self.k1, unsure=self.sigma)
 
-    def told(self, k1: float, variance: float, left: float) -> SelfCalibration:
+    def update(self, k1: float, variance: float, left: float) -> SelfCalibration:
         """
         Update the estimate with the result of one window, by a Kalman filter.
 
@@ -115,6 +115,6 @@ class SelfCalibration:
         noise = variance + (_ANOTHER * self.first)**2
         gain = self.covariance @ row / (row @ self.covariance @ row + noise)
         covariance = self.covariance - np.outer(gain, row @ self.covariance)
-        off = self.undone + k1 - row @ self.mean
+        off = self.corrected_k1 + k1 - row @ self.mean
         return replace(self, mean=self.mean + gain * off,
                        covariance=(covariance + covariance.T) / 2)

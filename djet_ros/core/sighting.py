@@ -12,19 +12,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from djet_ros.core.bundle import in_frame, Landmarks, Poses, projected
+from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
 from djet_ros.core.geometry import inverses, patch_warp, slant_warp
-from djet_ros.core.joining import joined_places
-from djet_ros.core.masks import at
+from djet_ros.core.joining import fuse_positions
+from djet_ros.core.masks import masked_at
 from djet_ros.core.paraboloid import Paraboloids
-from djet_ros.core.patches import place_all, Placed
+from djet_ros.core.patches import align_all, Aligned
 from djet_ros.core.surfaces import (
-    CLOSE,
-    comparable,
-    contrasts_of,
+    contrast_ratios,
     DescriptorDistances,
+    has_moderate_stretch,
     no_paraboloids,
-    with_minimum,
+    resolve_indefinite,
+    SMALL_WINDOW,
 )
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Sighted:
+class LandmarkObservations:
     """Observed landmarks: indices (M,), pixels (M, 2), and roots (M, 2, 2) of their precision."""
 
     which: NDArray[np.int64]
@@ -54,7 +54,7 @@ class Sighting:
     poses: Poses
     landmarks: Landmarks
 
-    def look(self, reach: int) -> Sighted | None:
+    def look(self, reach: int) -> LandmarkObservations | None:
         """Observe landmarks within `reach` pixels of their prediction; None if none is found."""
         here, distances = self.views[-1], self.distances
         mine, expected, warps = self._predict(reach)
@@ -63,19 +63,19 @@ class Sighting:
         # about their prediction. A second, small window around the first estimate does not.
         mine, fits = self._around(mine, warps[mine], expected[mine], reach)
         close = fits.minima()
-        good = distances.describable(close, here.tested.shape, CLOSE // 2)
-        good &= ~at(here.mask, close)
+        good = distances.describable(close, here.surface_gray.shape, SMALL_WINDOW // 2)
+        good &= ~masked_at(here.mask, close)
         mine = mine[good]
-        mine, fits = self._around(mine, warps[mine], close[good], CLOSE // 2)
+        mine, fits = self._around(mine, warps[mine], close[good], SMALL_WINDOW // 2)
         if not len(mine):
             return None
         minima = fits.minima()
         # The residual of a least-squares fit estimates its noise variance.
         left = np.maximum(fits.values(minima), 1e-3)
-        places, spread = joined_places(minima, fits.inverses * left[:, None, None],
-                                       self._aligned(mine, warps[mine], minima))
+        places, spread = fuse_positions(minima, fits.inverses * left[:, None, None],
+                                        self._aligned(mine, warps[mine], minima))
         halves = np.asarray(np.linalg.cholesky(inverses(spread)), float)
-        return Sighted(mine, places, halves.transpose(0, 2, 1))
+        return LandmarkObservations(mine, places, halves.transpose(0, 2, 1))
 
     def _predict(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
         """
@@ -84,22 +84,22 @@ class Sighting:
         Also returns the predicted pixels (N, 2) and warps (N, 3, 2) of all landmarks.
         """
         landmarks, newest = self.landmarks, len(self.views) - 1
-        places = in_frame(self.K, self.poses, landmarks, newest)
+        places = points_in_frame(self.K, self.poses, landmarks, newest)
         expected = projected(self.K, places, self.poses.k1)
         here = self.views[newest]
-        wanted = (places[:, 2] > 0) & ~at(here.mask, expected) & self.distances.describable(
-            expected, here.tested.shape, reach)
+        wanted = (places[:, 2] > 0) & ~masked_at(here.mask, expected) & self.distances.describable(
+            expected, here.surface_gray.shape, reach)
         # A landmark that neither of the last two frames observed is lost.
         wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
         which = np.argsort(landmarks.anchors, kind='stable')
         which = which[wanted[which]]
         anchors = landmarks.anchors[which]
-        R, t = (motions[newest, anchors] for motions in self.poses.between)
+        R, t = (motions[newest, anchors] for motions in self.poses.relative_motions)
         seen = expected[which], 1 / places[which, 2]
         slope = landmarks.rho[which, None] * landmarks.slopes[which]
         warps = np.empty((len(landmarks), 3, 2))
         warps[which] = patch_warp(self.K, R, *seen) + slant_warp(self.K, t, *seen, slope)
-        return which[comparable(warps[which])], expected, warps
+        return which[has_moderate_stretch(warps[which])], expected, warps
 
     def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
                 ) -> tuple[NDArray[np.int64], Paraboloids]:
@@ -111,23 +111,23 @@ class Sighting:
         """
         if not len(mine):
             return mine, no_paraboloids(0)
-        here, (anchors, counts) = self.views[-1].tested, self._anchor_counts(mine)
+        here, (anchors, counts) = self.views[-1].surface_gray, self._anchor_counts(mine)
         # Contrast at the sampled places; that at the prediction would bias the scale.
         strengths = self.distances.strengths(here, np.rint(places).astype(np.int64))
-        contrasts = contrasts_of(strengths, self.landmarks.strengths[mine], counts)
-        references = self.distances.shifted(
-            [(self.views[anchor].tested, count) for anchor, count in zip(anchors, counts)],
+        contrasts = contrast_ratios(strengths, self.landmarks.strengths[mine], counts)
+        references = self.distances.shifted_references(
+            [(self.views[anchor].surface_gray, count) for anchor, count in zip(anchors, counts)],
             self.landmarks.found[mine], places, warps, contrasts)
-        fits = self.distances.around(references, here, places, radius)
-        fits, _ = with_minimum(fits, 'drop')
+        fits = self.distances.fit_around(references, here, places, radius)
+        fits, _ = resolve_indefinite(fits, 'drop')
         good = fits.usable & fits.minimum_within(radius)
         return mine[good], fits.of(good)
 
-    def _aligned(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Placed:
+    def _aligned(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Aligned:
         """Align patches of landmarks (M,), ordered by their anchors, from places (M, 2)."""
         images = [(self.views[anchor].gray, count)
                   for anchor, count in zip(*self._anchor_counts(mine))]
-        return place_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
+        return align_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
 
     def _anchor_counts(self, mine: NDArray[np.int64]
                        ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -21,7 +21,7 @@ from djet_ros.core.geometry import (
     sphere_tangents,
     unit,
 )
-from djet_ros.core.jet import DAMPING_AT_FIRST, JetProblem, Loss, robust_scales
+from djet_ros.core.jet import INITIAL_DAMPING, JetProblem, Loss, robust_scales
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -95,11 +95,11 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
     """
     R, t = np.array([start.R for start in starts]), np.array([start.t for start in starts])
     if compiled.library is not None and rotation_prior is None:
-        return Sketch(*compiled.refine_all(problem.matches, loss.numbers, steps,
-                                           DAMPING_AT_FIRST, R, t))
+        return Sketch(*compiled.refine_all(problem.matches, loss.encoded, steps,
+                                           INITIAL_DAMPING, R, t))
     products = _products(problem)
     here = _evaluate(problem, products, R, t, loss, rotation_prior)
-    damping = np.full(len(R), DAMPING_AT_FIRST)
+    damping = np.full(len(R), INITIAL_DAMPING)
     for _ in range(steps):
         tangents, H, gradient = _normal_equations(products, R, t, here, rotation_prior)
         R_new, t_new = moved_all(R, t, tangents, _damped_steps(H, gradient, damping))
@@ -131,7 +131,7 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     that costs less is taken.
     """
     if compiled.library is not None:
-        return compiled.losses_in_front(problem.matches, loss.numbers, (sketch.R, sketch.t),
+        return compiled.losses_in_front(problem.matches, loss.encoded, (sketch.R, sketch.t),
                                         (sketch.r, sketch.sign), signs)
     t = sketch.t[:, :, None]
     m = sketch.R @ problem.rays_x
@@ -213,5 +213,5 @@ def _damped_steps(H: Array, gradient: Array, damping: Array) -> Array:
 
 
 def moved_all(R: Array, t: Array, tangents: Array, steps: Array) -> tuple[Array, Array]:
-    """Move one or S poses by steps (S, 5), as ``jet.moved`` does for a single one."""
+    """Move one or S poses by steps (S, 5), as ``jet.retract`` does for a single one."""
     return rotation_exp(steps[:, :3]) @ R, unit(t + (tangents @ steps[:, 3:, None])[..., 0])

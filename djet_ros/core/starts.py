@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
-from djet_ros.core.fusion import Turn
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import in_front, nearest_rotation, rays, unit
 from djet_ros.core.types import Array, Pose
 import numpy as np
@@ -66,23 +66,23 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownMotion:
     """
     Measurements of a motion from other sources than the images.
 
-    turn: its rotation with covariance, as from a gyro; guess: an approximate pose, as from another
-    odometry.
+    rotation: its rotation with covariance, as from a gyro; guess: an approximate pose, as from
+    another odometry.
     """
 
-    turn: Turn | None = None
+    rotation: MeasuredRotation | None = None
     guess: Pose | None = None
 
     def rotations(self) -> list[Array]:
         """Return the measured rotations, (3, 3) each, the most certain first."""
-        return [one.R for one in (self.turn, self.guess) if one is not None]
+        return [one.R for one in (self.rotation, self.guess) if one is not None]
 
 
-def external_starts(K: Array, x: Array, y: Array, known: Known) -> list[Pose]:
+def external_starts(K: Array, x: Array, y: Array, known: KnownMotion) -> list[Pose]:
     """
     Collect starts from external measurements: the guess, and the rotation with directions.
 
@@ -90,13 +90,13 @@ def external_starts(K: Array, x: Array, y: Array, known: Known) -> list[Pose]:
     y: (N, 2) pixels, the most reliable matches first.
     """
     starts = [] if known.guess is None else [known.guess]
-    if known.turn is not None:
-        some = thinned(len(x), _MAX_MATCHES)
-        starts += [Pose(known.turn.R, t)
-                   for t in translation_directions(K, x[some], y[some], known.turn.R)]
+    if known.rotation is not None:
+        some = subsampled(len(x), _MAX_MATCHES)
+        starts += [Pose(known.rotation.R, t)
+                   for t in translation_directions(K, x[some], y[some], known.rotation.R)]
         if known.guess is not None:
-            starts.append(Pose(known.turn.R, known.guess.t))
-        starts.append(Pose(known.turn.R, FORWARD))
+            starts.append(Pose(known.rotation.R, known.guess.t))
+        starts.append(Pose(known.rotation.R, FORWARD))
     return starts
 
 
@@ -127,7 +127,7 @@ def translation_directions(K: Array, x: Array, y: Array, R: Array) -> list[Array
     return found
 
 
-def thinned(count: int, most: int) -> slice:
+def subsampled(count: int, most: int) -> slice:
     """Return a slice that takes at most so many of a count of matches, evenly spaced."""
     return slice(None, None, max(1, -(-count // most)))
 
@@ -147,7 +147,7 @@ def _hemisphere(count: int) -> Array:
     return directions
 
 
-def around(pose: Pose, count: int) -> list[Pose]:
+def starts_around(pose: Pose, count: int) -> list[Pose]:
     """
     Return a pose and its rotation with the forward and hemisphere directions, as starts.
 

@@ -13,19 +13,19 @@ from typing import Any, Protocol
 
 import cv2
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import inverses, stretches
-from djet_ros.core.graded import graded_surfaces, grades, grades_through, smooth_finely
+from djet_ros.core.geometry import inverses, singular_values
+from djet_ros.core.graded import graded_surfaces, grades, smooth_finely, warped_grades
 from djet_ros.core.hamming import (
     describable,
     hamming_surfaces,
     Image,
+    ImagePoints,
     intensities,
-    intensities_through,
     Pixels,
-    Shown,
     smooth,
+    warped_intensities,
 )
-from djet_ros.core.masks import at
+from djet_ros.core.masks import masked_at
 from djet_ros.core.orb_pattern import pattern
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
@@ -37,8 +37,8 @@ from djet_ros.core.paraboloid import (
     project_to_positive,
     times,
 )
-from djet_ros.core.patches import as_matched, place_exactly, Placed, within
-from djet_ros.core.starts import thinned
+from djet_ros.core.patches import align_patches, Aligned, unaligned, within
+from djet_ros.core.starts import subsampled
 from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ _MAX_STRETCH = 2.0
 _POSITION_TOLERANCE = 0.05
 
 # Side in pixels of the window sampled where the minimum is predicted.
-CLOSE = 3
+SMALL_WINDOW = 3
 
 # Matches and tests that the contrast ratio is estimated from, and its limit.
 _CONTRAST_MATCHES, _CONTRAST_TESTS = 200, 32
@@ -78,7 +78,7 @@ class ResidualSurface(Protocol):
 
     x: Array
 
-    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
+    def fit_around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """
         Return paraboloids of the residual, valid in the neighbourhood of y (N, 2).
 
@@ -87,11 +87,11 @@ class ResidualSurface(Protocol):
         """
         ...
 
-    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
+    def aligned(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Aligned:
         """
         Return positions of the chosen matches (N,) estimated independently of the surface, near y.
 
-        Only for matches with a usable surface; warp: as in ``around``.
+        Only for matches with a usable surface; warp: as in ``fit_around``.
         """
         ...
 
@@ -103,11 +103,11 @@ class _ImageSurface:
         self.x = x
         self._there, self._here = previous.gray, current.gray
 
-    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
+    def aligned(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Aligned:
         """Return positions from patch alignment through the warp; y itself without a warp."""
         if warp is None:
-            return as_matched(y[chosen])
-        return place_exactly(self._there, self._here, *(
+            return unaligned(y[chosen])
+        return align_patches(self._there, self._here, *(
             values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
 
@@ -125,9 +125,9 @@ class DescriptorSurface(_ImageSurface):
         super().__init__(previous, current, x)
         self._config = config
         self._distances = DescriptorDistances(config)
-        self._previous, self._current = previous, current.tested
-        self._has_reference = (self._distances.describable(x, previous.tested.shape)
-                               & ~at(previous.mask, x))
+        self._previous, self._current = previous, current.surface_gray
+        self._has_reference = (self._distances.describable(x, previous.surface_gray.shape)
+                               & ~masked_at(previous.mask, x))
         self._mask = current.mask
         self._latest = no_paraboloids(len(x))
         # The warp of each match's reference, if it was sampled through one, and the offset of x
@@ -137,21 +137,21 @@ class DescriptorSurface(_ImageSurface):
         self._offset = x - np.rint(x) if config.warp_reference else np.zeros_like(x)
         self._contrast: float | None = None
 
-    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
+    def fit_around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Fit paraboloids to the surfaces around the whole pixels nearest to y."""
         if warp is None:
             return self._around_pixels(y)
         moved = largest(self._latest.centres - y) > _POSITION_TOLERANCE
         warped = largest(warp - self._warp) > _WARP_TOLERANCE
-        usable = self._usable(np.rint(y), CLOSE // 2)
+        usable = self._usable(np.rint(y), SMALL_WINDOW // 2)
         # Most matches do not move from one round to the next.
         stale = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(stale[:, None, None], warp, self._warp)
         self._is_warped |= stale
         there, here, seen = (values.compress(stale, axis=0) for values in (self.x, y, warp))
         return self._merged(stale, usable, y, self._distances.between_pixels(
-            self._previous.tested, there, self._current, here, seen,
-            self._contrast_around(y, usable), CLOSE // 2))
+            self._previous.surface_gray, there, self._current, here, seen,
+            self._contrast_around(y, usable), SMALL_WINDOW // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
         """Fit paraboloids with references at whole pixels, as in the paper."""
@@ -164,7 +164,7 @@ class DescriptorSurface(_ImageSurface):
         self._warp[stale], self._is_warped[stale] = np.eye(3, 2), False
         pixels = np.rint(self.x).astype(np.int64)
         references = self._distances.reference(
-            self._previous.tested, pixels[stale], self._contrast_around(centres, usable))
+            self._previous.surface_gray, pixels[stale], self._contrast_around(centres, usable))
         surfaces = self._distances.surfaces(references, self._current, centres[stale], radius)
         return self._merged(stale, usable, y, fit_paraboloids(
             surfaces, centres[stale] + self._offset[stale], self._config.window_sigma))
@@ -173,9 +173,10 @@ class DescriptorSurface(_ImageSurface):
         """Estimate the contrast ratio at the initial matches, once."""
         if self._contrast is None:
             there = np.flatnonzero(usable)
-            there = there[thinned(len(there), _CONTRAST_MATCHES)]
+            there = there[subsampled(len(there), _CONTRAST_MATCHES)]
             self._contrast = self._distances.contrast(
-                self._previous.tested, np.rint(self.x[there]).astype(np.int64), self._current,
+                self._previous.surface_gray, np.rint(self.x[there]).astype(np.int64),
+                self._current,
                 np.rint(y[there]).astype(np.int64))
         return self._contrast
 
@@ -188,7 +189,7 @@ class DescriptorSurface(_ImageSurface):
         return replace(self._latest, centres=np.where(np.isnan(latest), y, latest))
 
     def _usable(self, centres: NDArray[Any], radius: int) -> NDArray[np.bool_]:
-        return self._has_reference & ~at(self._mask, centres) & self._distances.describable(
+        return self._has_reference & ~masked_at(self._mask, centres) & self._distances.describable(
             centres, self._current.shape, radius)
 
 
@@ -201,7 +202,7 @@ class DescriptorDistances:
         self._tests = pattern(config.binary_tests, config.patch_scale)
 
     def seen(self, gray: Image) -> NDArray[Any]:
-        """Smooth an image (H, W) for the tests: the input of all methods here (View.tested)."""
+        """Smooth an image (H, W) for the tests: View.surface_gray, the input of all methods."""
         return (smooth_finely if self._grading else smooth)(gray, self._scale)
 
     def describable(self, points: NDArray[Any], shape: tuple[int, ...],
@@ -215,11 +216,11 @@ class DescriptorDistances:
 
         A change of exposure changes it. Binary tests are invariant to contrast: 1.
         """
-        some = thinned(len(x), _CONTRAST_MATCHES)
-        return contrast_of(self.strengths(here, y[some]), self.strengths(there, x[some]))
+        some = subsampled(len(x), _CONTRAST_MATCHES)
+        return contrast_ratio(self.strengths(here, y[some]), self.strengths(there, x[some]))
 
     def strengths(self, seen: NDArray[Any], points: Pixels) -> Array:
-        """Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_of``."""
+        """Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_ratio``."""
         if not self._grading:
             return np.ones(len(points))
         p, q = intensities(seen, points, self._tests[:_CONTRAST_TESTS])
@@ -238,11 +239,11 @@ class DescriptorDistances:
         p, q = intensities(seen, np.asarray(points, np.int64), self._tests)
         return grades(p, q, self._grading, contrast) if self._grading else p < q
 
-    def _warped_descriptors(self, warp: Array, images: Sequence[Shown], points: Array,
+    def _warped_descriptors(self, warp: Array, images: Sequence[ImagePoints], points: Array,
                             contrast: float | Array) -> NDArray[Any]:
         if self._grading:
-            return grades_through(warp, images, points, self._grading, contrast, self._tests)
-        return np.less(*intensities_through(warp, images, points, self._tests))
+            return warped_grades(warp, images, points, self._grading, contrast, self._tests)
+        return np.less(*warped_intensities(warp, images, points, self._tests))
 
     def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:
@@ -259,11 +260,11 @@ class DescriptorDistances:
         References are taken between pixels, so that a minimum at y falls on a whole pixel, where
         the fit has no bias. warp: (N, 3, 2) from the patches around x to those around y.
         """
-        references = self.shifted([(there, len(x))], x, y, warp, contrast)
-        return self.around(references, here, y, radius)
+        references = self.shifted_references([(there, len(x))], x, y, warp, contrast)
+        return self.fit_around(references, here, y, radius)
 
-    def shifted(self, there: Sequence[Shown], x: Array, y: Array, warp: Array,
-                contrast: float | Array) -> NDArray[Any]:
+    def shifted_references(self, there: Sequence[ImagePoints], x: Array, y: Array, warp: Array,
+                           contrast: float | Array) -> NDArray[Any]:
         """
         Return descriptors (T, N) next to x for which a minimum at y falls on a whole pixel.
 
@@ -272,8 +273,8 @@ class DescriptorDistances:
         back = times(inverses(warp[:, :2]), y - np.rint(y))
         return self._warped_descriptors(warp, there, x - back, contrast)
 
-    def around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
-               radius: int) -> Paraboloids:
+    def fit_around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
+                   radius: int) -> Paraboloids:
         """Fit paraboloids to the distances around y (N, 2) from shifted references (T, N)."""
         centres = np.rint(y).astype(np.int64)
         return _without_pixel_locking(
@@ -296,10 +297,11 @@ class PhotometricSurface(_ImageSurface):
             for order in ((1, 0), (0, 1))]
         self._previous = previous.smoothed.astype(np.float32)
         self._reference = self._sample(self._previous, x)
-        self._has_reference = self._inside(x, previous.smoothed.shape) & ~at(previous.mask, x)
+        self._has_reference = (self._inside(x, previous.smoothed.shape)
+                               & ~masked_at(previous.mask, x))
         self._mask = current.mask
 
-    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
+    def fit_around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Return the second-order expansion of the intensity residual at sub-pixel positions y."""
         reference = (self._reference if warp is None
                      else self._sample(self._previous, self.x, warp))
@@ -310,7 +312,8 @@ class PhotometricSurface(_ImageSurface):
         A = np.stack([a11, a12, a12, a22], axis=1).reshape(-1, 2, 2).astype(float)
         b = -np.stack([(gx * difference) @ W, (gy * difference) @ W], axis=1).astype(float)
         c = (difference**2 @ W).astype(float)
-        usable = self._has_reference & self._inside(y, self._image.shape) & ~at(self._mask, y)
+        usable = (self._has_reference & self._inside(y, self._image.shape)
+                  & ~masked_at(self._mask, y))
         return Paraboloids(np.array(y, float), A, b, c, usable)
 
     def _sample(self, image: NDArray[np.float32], points: Array,
@@ -342,36 +345,36 @@ class ReprojectionSurface:
         self._A = (np.repeat(np.eye(2)[None], len(y), axis=0) if covariances is None
                    else inverses(covariances))
 
-    def around(self, y: Array, warp: Array | None = None) -> Paraboloids:
+    def fit_around(self, y: Array, warp: Array | None = None) -> Paraboloids:
         """Return the same paraboloid wherever the keypoint has moved."""
         n = len(y)
         return Paraboloids(self._y, self._A, np.zeros((n, 2)), np.zeros(n), np.ones(n, bool))
 
-    def placed(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Placed:
+    def aligned(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Aligned:
         """Return y: there is no independent estimate."""
-        return as_matched(y[chosen])
+        return unaligned(y[chosen])
 
 
-def contrast_of(here: Array, there: Array) -> float:
+def contrast_ratio(here: Array, there: Array) -> float:
     """Return the contrast ratio of two images, by texture strengths (N,) at the same points."""
     if not len(here):
         return 1.0
     return min(max(median(here / there), 1 / _MAX_CONTRAST_RATIO), _MAX_CONTRAST_RATIO)
 
 
-def contrasts_of(here: Array, there: Array, counts: NDArray[np.int64]) -> Array:
+def contrast_ratios(here: Array, there: Array, counts: NDArray[np.int64]) -> Array:
     """Return contrast ratios (N,) for points of several images, `counts` of each in turn."""
     ratios = medians_of_parts(here / there, counts)
     return np.repeat(np.clip(ratios, 1 / _MAX_CONTRAST_RATIO, _MAX_CONTRAST_RATIO), counts)
 
 
-def comparable(warp: Array) -> NDArray[np.bool_]:
+def has_moderate_stretch(warp: Array) -> NDArray[np.bool_]:
     """Return a mask (N,) of the warps (N, 3, 2) with a moderate stretch."""
-    least, most = stretches(warp[:, :2])
+    least, most = singular_values(warp[:, :2])
     return np.asarray((least > 1 / _MAX_STRETCH) & (most < _MAX_STRETCH))
 
 
-def with_minimum(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloids, int]:
+def resolve_indefinite(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloids, int]:
     """
     Apply the policy for indefinite surfaces; return the paraboloids and the number of these.
 
@@ -398,7 +401,7 @@ def _without_pixel_locking(fitted: Paraboloids) -> Paraboloids:
 
     First-order inverse of d - k sin(2 pi d) / (2 pi), the estimate of a displacement d in pixels.
     """
-    drawn = _PIXEL_LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.ways)
+    drawn = _PIXEL_LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.minimum_offsets)
     return replace(fitted, b=fitted.b - times(fitted.A, drawn))
 
 

@@ -16,7 +16,7 @@ from djet_ros.core.basins import (
     MIN_SCALE,
 )
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.fusion import Turn
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import (
     depth_ratio,
     epipolar_lines,
@@ -29,7 +29,7 @@ from djet_ros.core.geometry import (
     slant_warp,
 )
 from djet_ros.core.jet import (
-    core_scale,
+    clipped_scale,
     epipolar_residuals,
     jet_problem,
     JetProblem,
@@ -40,10 +40,10 @@ from djet_ros.core.jet import (
     robust_scale,
     Solution,
 )
-from djet_ros.core.joining import with_places
+from djet_ros.core.joining import fuse_alignment
 from djet_ros.core.pair import Limits, Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
-from djet_ros.core.patches import as_matched, Placed
+from djet_ros.core.patches import Aligned, unaligned
 from djet_ros.core.rivals import (
     continues_motion,
     DECIDED,
@@ -61,8 +61,13 @@ from djet_ros.core.rivals import (
 )
 from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import slopes_of_all
-from djet_ros.core.starts import Known
-from djet_ros.core.surfaces import comparable, ReprojectionSurface, ResidualSurface, with_minimum
+from djet_ros.core.starts import KnownMotion
+from djet_ros.core.surfaces import (
+    has_moderate_stretch,
+    ReprojectionSurface,
+    ResidualSurface,
+    resolve_indefinite,
+)
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +122,7 @@ class Track:
     residuals: Residuals
     voting: NDArray[np.bool_]
     minima: Array
-    placed: Placed
+    placed: Aligned
     y_opt: Array
     losses: Array
     indefinite: int
@@ -158,7 +163,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     move, the camera's motion is returned, as far as it can be identified. None if too few matches
     have a usable surface, or if the pair exceeds its limits.
     """
-    all_alive, measured = np.ones(len(pair.y), bool), pair.known.turn
+    all_alive, measured = np.ones(len(pair.y), bool), pair.known.rotation
     algorithm = _Algorithm(pair, surface, config, all_alive)
     track = algorithm.run(starts, predicted, pair.limits)
     if track is None or len(starts) == 1:
@@ -193,7 +198,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
 
 def _images_only(pair: Pair) -> Pair:
     """Return a pair without measurements from other sources than the images."""
-    return replace(pair, known=Known())
+    return replace(pair, known=KnownMotion())
 
 
 def _resolve_basins(algorithm: _Algorithm, track: Track, pair: Pair, surface: ResidualSurface,
@@ -341,7 +346,7 @@ class _Algorithm:
             fits = self._fits(by_points)
             # Re-projection paraboloids always have a minimum.
             paraboloids, no_minimum = ((fits, 0) if by_points
-                                       else with_minimum(fits, self._config.indefinite))
+                                       else resolve_indefinite(fits, self._config.indefinite))
             # Match culling: a keypoint without a surface is dropped, and keeps its last loss.
             voting = self._voting(paraboloids)
             if (voting.sum() < self._config.min_matches
@@ -382,7 +387,7 @@ class _Algorithm:
         """Fit surfaces around the keypoints, or paraboloids of re-projection errors."""
         surface = (ReprojectionSurface(self._surface.x, self._pair.y) if by_points
                    else self._surface)
-        return surface.around(self._keypoints, self._warp)
+        return surface.fit_around(self._keypoints, self._warp)
 
     def _voting(self, paraboloids: Paraboloids) -> NDArray[np.bool_]:
         """Return which matches (N,) take part in the pose; drop those without a surface."""
@@ -400,7 +405,7 @@ class _Algorithm:
                               config.weigh_by_fit and not by_points)
         if len(poses) > 1:
             basin = choose_basin(problem, places, poses, config, self._pair.prior,
-                                 self._pair.known.turn)
+                                 self._pair.known.rotation)
         elif not poses and predicted is not None:
             basin = choose_predicted_basin(problem, places, predicted, config)
         else:
@@ -416,15 +421,15 @@ class _Algorithm:
         return _Optimised(voting, places, problem, loss, solution, converged, basin.rivals)
 
     def _concluded(self, found: _Optimised
-                   ) -> tuple[_Optimised, Placed, tuple[Rival, ...], tuple[Rival, ...]]:
+                   ) -> tuple[_Optimised, Aligned, tuple[Rival, ...], tuple[Rival, ...]]:
         """Add photometric alignment, and compare the pose with rivals and nearby minima."""
         pair, voting = self._pair, found.voting
         rivals: tuple[Rival, ...] = ()
         self.noise = _scale(found.solution.residuals.r)
-        placed = as_matched(pair.y)
+        placed = unaligned(pair.y)
         if self._config.join_matches and self._config.method != 'rpe':
             # Step 2 once more: photometric alignment is a measurement of its own.
-            exactly = self._surface.placed(pair.y, self._warp, voting)
+            exactly = self._surface.aligned(pair.y, self._warp, voting)
             placed.places[voting], placed.covariances[voting] = exactly
             found = _with_photometric(found, self._K, exactly, self._config)
         if self.first.rivals:
@@ -453,11 +458,11 @@ class _Algorithm:
             self._warp, self._plausible = _warps(pose, self._K, self._surface.x, optimum)
 
 
-def _with_photometric(found: _Optimised, K: Array, placed: Placed, config: EstimatorConfig
+def _with_photometric(found: _Optimised, K: Array, placed: Aligned, config: EstimatorConfig
                       ) -> _Optimised:
     """Optimise the pose by surfaces and photometric alignment together."""
     solution = found.solution
-    problem = with_places(found.problem, solution, K, placed)
+    problem = fuse_alignment(found.problem, solution, K, placed)
     agreeing = np.abs(solution.residuals.r) < found.loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t)
     loss = replace(found.loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
@@ -467,16 +472,16 @@ def _with_photometric(found: _Optimised, K: Array, placed: Placed, config: Estim
 
 def evaluate_at(surface: ResidualSurface, K: Array, y: Array, pose: Pose) -> Track:
     """Evaluate the surfaces at a pose without optimising it: the result of method five_point."""
-    paraboloids = surface.around(y)
+    paraboloids = surface.fit_around(y)
     voting = paraboloids.usable
     problem = jet_problem(K, surface.x, paraboloids)
     residuals = epipolar_residuals(problem, pose.R, pose.t)
     optimum = _optimum_on_line(paraboloids, surface.x, fundamental(K, pose.R, pose.t))
-    return Track(pose, problem, Loss(), residuals, voting, paraboloids.minima(), as_matched(y),
+    return Track(pose, problem, Loss(), residuals, voting, paraboloids.minima(), unaligned(y),
                  optimum, paraboloids.values(optimum), 0)
 
 
-def _camera_motion(second: SecondMotion, prior: Pose | None, measured: Turn | None
+def _camera_motion(second: SecondMotion, prior: Pose | None, measured: MeasuredRotation | None
                    ) -> tuple[Pose, Pose, bool]:
     """
     Return the motion of the camera, that of another body, and whether the choice is a guess.
@@ -489,7 +494,8 @@ def _camera_motion(second: SecondMotion, prior: Pose | None, measured: Turn | No
     return second.both[taken], second.both[1 - taken], decided is None
 
 
-def _decide_camera(second: SecondMotion, prior: Pose | None, measured: Turn | None) -> int | None:
+def _decide_camera(second: SecondMotion, prior: Pose | None,
+                   measured: MeasuredRotation | None) -> int | None:
     """
     Return which of two motions, 0 or 1, is the camera's; None if undecided.
 
@@ -514,7 +520,7 @@ def _decide_camera(second: SecondMotion, prior: Pose | None, measured: Turn | No
 
 
 def _scale(residuals: Array) -> float:
-    return max(core_scale(residuals), MIN_SCALE)
+    return max(clipped_scale(residuals), MIN_SCALE)
 
 
 def _optimum_on_line(paraboloids: Paraboloids, x: Array, F: Array) -> Array:
@@ -548,7 +554,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     # Unit scale without parallax or on the epipole; not plausible behind the camera.
     seen = np.where(np.isfinite(seen), seen, np.where(np.isnan(seen), 1.0, -1.0))
     warp = patch_warp(K, pose.R, y, seen)
-    plausible = (seen > 0) & comparable(warp)
+    plausible = (seen > 0) & has_moderate_stretch(warp)
     warp = np.where(plausible[:, None, None], warp, np.eye(3, 2))
     # The slant of a patch is estimated from the depths of its neighbours.
     there = np.flatnonzero(plausible)
@@ -556,6 +562,6 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
     slopes = slopes_of_all(x, rho, TRACK_TUNING.depth_noise / K[0, 0] * sigma)
     slanted = warp.take(there, axis=0) + slant_warp(K, pose.t, y, seen[there], slopes)
-    slant_ok = comparable(slanted)
+    slant_ok = has_moderate_stretch(slanted)
     warp[there[slant_ok]] = slanted[slant_ok]
     return warp, plausible

@@ -72,8 +72,9 @@ class Features:
                    lambda: np.concatenate([one() for one in describe]))
 
     @classmethod
-    def described(cls, points: Array, octaves: NDArray[np.int32], angles: NDArray[np.float32],
-                  responses: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:
+    def with_descriptors(cls, points: Array, octaves: NDArray[np.int32],
+                         angles: NDArray[np.float32], responses: NDArray[np.float32],
+                         descriptors: NDArray[np.uint8]) -> Features:
         """Create features with descriptors that are computed already."""
         return cls(points, octaves, angles, responses, lambda: descriptors)
 
@@ -105,7 +106,7 @@ class Picture(Protocol):
         """Return the camera matrix."""
 
 
-def of_one_camera(one: Picture, other: Picture) -> bool:
+def of_same_camera(one: Picture, other: Picture) -> bool:
     """Return whether two images have the same size and camera matrix, as a pair requires."""
     return one.gray.shape == other.gray.shape and np.array_equal(one.K, other.K)
 
@@ -116,16 +117,16 @@ class View:
     One image, prepared for the estimator.
 
     gray: (H, W) uint8, undistorted; K: (3, 3) camera matrix; features: its features; smoothed:
-    (H, W) uint8, gray as ORB's binary tests sample it; tested: (H, W), gray as the tests of the
-    descriptor surfaces sample it; mask: (H, W) bool, True where neither a feature nor a surface
-    may be, or None.
+    (H, W) uint8, gray as ORB's binary tests sample it; surface_gray: (H, W), gray as the tests of
+    the descriptor surfaces sample it; mask: (H, W) bool, True where neither a feature nor a
+    surface may be, or None.
     """
 
     gray: NDArray[np.uint8]
     K: Array
     features: Features
     smoothed: NDArray[np.uint8]
-    tested: NDArray[Any]
+    surface_gray: NDArray[Any]
     mask: NDArray[np.bool_] | None = None
 
 

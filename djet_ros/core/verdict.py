@@ -111,7 +111,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
                 *([Pose(R, -t)] if sign_open and t.any() else [])))
 
 
-def as_turn(relative: RelativePose, K: Array) -> RelativePose:
+def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
     """
     Return a pair without parallax as a pure rotation (status NO_PARALLAX).
 

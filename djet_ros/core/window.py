@@ -18,14 +18,14 @@ from typing import Any
 
 from djet_ros.core.bundle import (
     eliminate,
-    in_frame,
     Landmarks,
     noise_scale,
     observe,
     Observed,
-    OfPrior,
+    points_in_frame,
     PosePrior,
     Poses,
+    PriorCost,
     projected,
     Reduced,
 )
@@ -41,7 +41,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.jet import Loss
 from djet_ros.core.landmark_choice import choose_landmarks
 from djet_ros.core.paraboloid import median
-from djet_ros.core.radial import straight_image, straight_rays, straightened
+from djet_ros.core.radial import undistort, undistort_image, undistorted_rays
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.sighting import Sighting
 from djet_ros.core.slants import slopes
@@ -109,7 +109,7 @@ _ROTATION_INFORMATION = 1e6
 
 
 @dataclass(frozen=True)
-class Addition:
+class WindowStep:
     """
     Motion of the newest frame as the window estimates it, with its length.
 
@@ -133,7 +133,7 @@ class Window:
 
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
 
-    settled: (M, 3) landmarks, in the newest frame, that were refined for the last time;
+    final_landmarks: (M, 3) landmarks, in the newest frame, that were refined for the last time;
     lens: estimate of the distortion of the images.
     """
 
@@ -145,7 +145,7 @@ class Window:
         """Reset everything but the estimate of the lens; this frame is the first."""
         self._K, self._views = view.K, [view]
         self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
-        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.left)
+        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.residual_k1)
         self._is_keyframe, self._has_landmarks = [True], [False]
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
@@ -157,7 +157,7 @@ class Window:
         self._latest: tuple[RelativePose, float] | None = None
         # The pair whose length was last asked for, and the ratios by landmarks.
         self._cached_ratios: tuple[RelativePose, tuple[Array, Array]] | None = None
-        self.settled = np.empty((0, 3))
+        self.final_landmarks = np.empty((0, 3))
 
     @property
     def is_new(self) -> bool:
@@ -169,7 +169,7 @@ class Window:
         """Return whether the newest frame is a keyframe."""
         return self._is_keyframe[-1]
 
-    def add(self, view: View, relative: RelativePose, guess: float) -> Addition:
+    def add(self, view: View, relative: RelativePose, guess: float) -> WindowStep:
         """
         Add the next frame and its pair with the newest one, and refine.
 
@@ -197,7 +197,7 @@ class Window:
             addition = replace(addition, length=length)
         # Marginalise the previous frame unless it is a keyframe, and the oldest keyframe beyond
         # the limit.
-        self.settled = np.empty((0, 3))
+        self.final_landmarks = np.empty((0, 3))
         if len(self._views) > 2 and not self._is_keyframe[-2]:
             self._marginalise_landmarks(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
             self._marginalise_frame(len(self._views) - 2)
@@ -210,23 +210,23 @@ class Window:
         self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
 
-    def tell(self, motion: Array) -> None:
+    def record_published(self, motion: Array) -> None:
         """Record the motion (4, 4) published for the newest step, in the unit of the track."""
         self._published = self._published @ motion
 
-    def straighten(self, newest: View) -> None:
+    def correct_images(self, newest: View) -> None:
         """
         Continue with images corrected for the expected k1, of which newest is the first.
 
         Earlier observations are moved to where the corrected images would show them.
         """
-        before, self.lens = self.lens.undone, self.lens.straightened()
+        before, self.lens = self.lens.corrected_k1, self.lens.corrected()
         self._views = [*(self._corrected(view, before) for view in self._views[:-1]), newest]
-        moved = self._landmarks.seen_otherwise(self._K, before, self.lens.undone)
+        moved = self._landmarks.with_corrected_images(self._K, before, self.lens.corrected_k1)
         # Patches that leave the image are dropped.
-        inside = self._distances.describable(moved.found, newest.tested.shape)
+        inside = self._distances.describable(moved.found, newest.surface_gray.shape)
         self._landmarks = moved.of(inside)
-        self._poses = replace(self._poses, k1=self.lens.left)
+        self._poses = replace(self._poses, k1=self.lens.residual_k1)
         self._latest = None
 
     def _corrected(self, view: View, before: float) -> View:
@@ -235,8 +235,8 @@ class Window:
 
         Only its images that are still needed: landmarks are not created in it again.
         """
-        gray, _ = straight_image(view.gray, self._K, self.lens.undone, before=before)
-        return replace(view, gray=gray, tested=self._distances.seen(gray))
+        gray, _ = undistort_image(view.gray, self._K, self.lens.corrected_k1, before=before)
+        return replace(view, gray=gray, surface_gray=self._distances.seen(gray))
 
     def landmarks(self) -> Array:
         """Return the reliable landmarks as points (M, 3) in the newest frame."""
@@ -246,7 +246,7 @@ class Window:
         """Return the reliable ones of landmarks (N,), as points (M, 3) in the newest frame."""
         sure = self._landmarks.of(np.asarray(
             chosen & (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
-        places = in_frame(self._K, self._poses, sure, len(self._views) - 1)
+        places = points_in_frame(self._K, self._poses, sure, len(self._views) - 1)
         return np.asarray(places / sure.rho[:, None])
 
     def _projected(self, places: Array) -> Array:
@@ -255,7 +255,7 @@ class Window:
 
     def _rays(self, pixels: Array) -> Array:
         """Return the viewing rays (N, 3), with z = 1, of distorted pixels (N, 2)."""
-        return straight_rays(self._K, pixels, self._poses.k1)
+        return undistorted_rays(self._K, pixels, self._poses.k1)
 
     def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
         """
@@ -276,7 +276,7 @@ class Window:
         length = _weighted_median(ratios, weights)
         return (length, self._tuning.length_sigma) if length > 0 else unknown
 
-    def told_length(self, relative: RelativePose) -> tuple[float, float] | None:
+    def pair_length(self, relative: RelativePose) -> tuple[float, float] | None:
         """
         Return the length of a pair by landmarks and its standard error; None if there are too few.
 
@@ -324,7 +324,7 @@ class Window:
         into x.
         """
         before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
-        places = in_frame(self._K, self._poses, before, len(self._views) - 1)
+        places = points_in_frame(self._K, self._poses, before, len(self._views) - 1)
         ahead = places[:, 2] > 0
         return self._nearest(x, self._projected(places[ahead]),
                              before.rho[ahead] / places[ahead, 2])
@@ -339,7 +339,7 @@ class Window:
         near = np.isfinite(away)
         return rho[near], match[near]
 
-    def agreement(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
+    def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
         Count the landmarks that agree with a motion, and those that were tested.
 
@@ -382,8 +382,8 @@ class Window:
         if not few:
             turn = self._poses.R[newest] @ self._poses.R[last].T
             turned, moved = (self._projected(places) for places in (
-                in_frame(self._K, self._poses, here, last) @ turn.T,
-                in_frame(self._K, self._poses, here, newest)))
+                points_in_frame(self._K, self._poses, here, last) @ turn.T,
+                points_in_frame(self._K, self._poses, here, newest)))
             few = median(np.linalg.norm(moved - turned, axis=1)) > self._tuning.parallax
         self._is_keyframe[-1] = few
 
@@ -430,17 +430,18 @@ class Window:
         rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
         ahead, off = rho > 0, tuning.slant_noise / self._K[0, 0] * sigma
         surfaces = x[ahead], rho[ahead], off[ahead]
-        usable = (rho > 0) & self._distances.describable(x, self._views[anchor].tested.shape)
+        usable = (rho > 0) & self._distances.describable(x, self._views[anchor].surface_gray.shape)
         x, rho = x[usable], rho[usable]
         here = self._landmarks.of(self._landmarks.seen[:, anchor])
-        present = self._projected(in_frame(self._K, self._poses, here, anchor))
-        side = tuning.cell * np.sqrt(self._views[anchor].tested.size / tuning.landmarks)
+        present = self._projected(points_in_frame(self._K, self._poses, here, anchor))
+        side = tuning.cell * np.sqrt(self._views[anchor].surface_gray.size / tuning.landmarks)
         chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(here))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
             x, rho / length, anchor, len(self._views),
-            straightened(self._K, x, self._poses.k1), slopes(*surfaces, x),
-            self._distances.strengths(self._views[anchor].tested, np.rint(x).astype(np.int64))))
+            undistort(self._K, x, self._poses.k1), slopes(*surfaces, x),
+            self._distances.strengths(self._views[anchor].surface_gray,
+                                      np.rint(x).astype(np.int64))))
 
     def _observe_landmarks(self) -> None:
         """Observe landmarks in the newest frame."""
@@ -465,13 +466,13 @@ class Window:
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
         np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
         # Relative to the newest step: the unit may be much longer or shorter.
-        length = float(np.linalg.norm(self._poses.between[1][-1, -2]))
+        length = float(np.linalg.norm(self._poses.relative_motions[1][-1, -2]))
         in_front = self._landmarks.rho * length > -self._tuning.negative_parallax
         self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1) & in_front))
         return H
 
-    def _line_search(self, observed: Observed, prior: OfPrior, step: Array, change: Array
-                     ) -> tuple[Observed, OfPrior]:
+    def _line_search(self, observed: Observed, prior: PriorCost, step: Array, change: Array
+                     ) -> tuple[Observed, PriorCost]:
         """Apply a step of poses and landmarks, halved until the cost does not grow."""
         poses, landmarks, scale = self._poses, self._landmarks, self._scale
         cost = self._cost(observed, scale) + prior.cost
@@ -518,7 +519,7 @@ class Window:
         weight = self._scale**-2
         return eliminate(observed, weights * weight, weight, len(self._views), lens)
 
-    def _newest_motion(self, H: Array) -> Addition:
+    def _newest_motion(self, H: Array) -> WindowStep:
         """Return the newest motion, and the uncertainty of its length."""
         R = self._poses.R[-1] @ self._poses.R[-2].T
         t = self._poses.t[-1] - R @ self._poses.t[-2]
@@ -532,8 +533,8 @@ class Window:
         J = np.eye(6)
         J[3:, :3] = -skew(t)
         # Rounding may leave no positive variance.
-        return Addition(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
-                        J @ covariance @ J.T, self._corrected_step())
+        return WindowStep(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
+                          J @ covariance @ J.T, self._corrected_step())
 
     def _corrected_step(self) -> Array:
         """
@@ -557,18 +558,18 @@ class Window:
         divided by that number. The prior of marginalised frames keeps the k1 of its time.
         """
         observed = observe(self._K, self._poses, self._landmarks)
-        k1 = self._reduced(observed, lens=True).of_k1()
+        k1 = self._reduced(observed, lens=True).marginal_k1()
         _, weights = self._robust_losses(observed, self._scale)
         if k1.curvature > 0:
-            self.lens = self.lens.told(
+            self.lens = self.lens.update(
                 self._poses.k1 + k1.step, self._tuning.keyframes / k1.curvature,
                 self._scale * np.sqrt(k1.curvature / weights.sum()))
-            self._poses = replace(self._poses, k1=self.lens.left)
+            self._poses = replace(self._poses, k1=self.lens.residual_k1)
 
     def _marginalise_landmarks(self, chosen: NDArray[np.bool_]) -> None:
         """Marginalise the chosen landmarks (N,) into the prior, before a frame is removed."""
         everything = self._landmarks
-        self.settled = np.concatenate([self.settled, self._places(chosen)])
+        self.final_landmarks = np.concatenate([self.final_landmarks, self._places(chosen)])
         self._landmarks = everything.of(chosen)
         reduced = self._reduced(observe(self._K, self._poses, self._landmarks))
         self._prior.add(reduced.H, reduced.g, self._poses)

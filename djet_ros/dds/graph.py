@@ -271,7 +271,7 @@ class Graph:
             change = self._waiting.attach if wanted else self._waiting.detach
             change(subscription.condition)
 
-    def offers(self, topic: str) -> list[PublisherInfo]:
+    def publishers_of(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
         return [PublisherInfo(f'participant {one.participant_key}', _ros_type(one.type_name),
                               _profile(one.qos)) for one in _alive(self._publications)

@@ -84,9 +84,9 @@ class DdsMiddleware:
         return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
                                   batch=100 if ready is None else 1, ready=ready)
 
-    def offers(self, topic: str) -> list[PublisherInfo]:
+    def publishers_of(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
-        return self._graph.offers(topic)
+        return self._graph.publishers_of(topic)
 
     def published(self, kind: str) -> list[str]:
         """Return the topics of a ROS type that have a publisher."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
@@ -54,7 +54,7 @@ def extract(recording: BagRecording, folder: Path) -> Path:
     for topic, _, message in recording.messages():
         if topic == recording.info_topic:
             camera = camera or Camera.from_info(
-                message, means_rectified('auto', recording.image_topic))
+                message, is_rectified('auto', recording.image_topic))
         elif topic == recording.ground_truth_topic:
             truth.add(*pose_of(message))
         elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):

@@ -18,7 +18,7 @@ from djet_ros import compiled
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.orb_pattern import REACH
-from djet_ros.core.parallel import started_beside
+from djet_ros.core.parallel import start_in_background
 from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
@@ -117,7 +117,7 @@ class _Pipeline:
         start = perf_counter()
         view = self._ahead or self._view_of(index)
         last = len(self._sequence) - 1
-        following = started_beside(lambda: self._view_of(min(index + 1, last)))
+        following = start_in_background(lambda: self._view_of(min(index + 1, last)))
         if self._view is not None:
             self._prior = self._estimator.estimate(self._view, view, self._prior)
         self._view, self._ahead = view, following()
@@ -193,8 +193,8 @@ def view_bytes(view: View) -> int:
     """Return the memory of a frame's view in bytes."""
     features = view.features
     arrays: tuple[NDArray[Any], ...] = (
-        view.gray, view.smoothed, view.tested, features.points, features.octaves, features.angles,
-        features.responses, features.descriptors)
+        view.gray, view.smoothed, view.surface_gray, features.points, features.octaves,
+        features.angles, features.responses, features.descriptors)
     return sum(array.nbytes for array in arrays)
 
 

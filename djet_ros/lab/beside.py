@@ -23,8 +23,9 @@ from djet_ros.lab.scenes.panel import World
 from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
-from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
-from djet_ros.replay.pair_errors import angles_off
+from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.replay.pair_errors import angle_errors
 import numpy as np
 from numpy.typing import NDArray
 
@@ -184,7 +185,7 @@ class _Run:
     def _moment(self, index: int, result: OdometryResult, previous: int) -> Moment:
         true_motion = np.linalg.inv(self._poses[previous]) @ self._poses[index]
         tracked = result.status in TRACKED
-        rotation, direction = angles_off(result.motion, true_motion)
+        rotation, direction = angle_errors(result.motion, true_motion)
         if not tracked:
             rotation = float('nan')
         if not tracked or not result.motion[:3, 3].any():

@@ -17,7 +17,7 @@ from djet_ros.core.estimator_config import preset
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.summary import spread_of
-from djet_ros.odometry.visual_odometry import camera_motion
+from djet_ros.odometry.result import camera_motion
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.replay.pair_errors import motion_errors
 import numpy as np

@@ -21,8 +21,9 @@ from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.lab.sequences import Dataset, opened, plain_name
-from djet_ros.odometry.visual_odometry import camera_motion, VisualOdometry
-from djet_ros.replay.pair_errors import angles_off
+from djet_ros.odometry.result import camera_motion
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.replay.pair_errors import angle_errors
 import numpy as np
 from scipy.stats import beta, chi2
 
@@ -152,7 +153,7 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
     true_motion = np.linalg.inv(poses[previous]) @ poses[current]
     if not np.isfinite(true_motion).all():
         return
-    rotation, direction = angles_off(camera_motion(pose), true_motion)
+    rotation, direction = angle_errors(camera_motion(pose), true_motion)
     if not len(pose.x):
         rotation = float('nan')
     if not pose.t.any():

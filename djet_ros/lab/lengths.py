@@ -21,10 +21,11 @@ from djet_ros.core.types import Array, TRACKED
 from djet_ros.lab.scenes import make_scene
 from djet_ros.lab.scenes.sequence import FRAME_PERIOD
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import Common
 from djet_ros.odometry.uncertainty import PathCovariance
-from djet_ros.odometry.visual_odometry import OdometryResult, VisualOdometry
-from djet_ros.replay.drift import drift, one_factor, scale_change
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.replay.drift import drift, path_scale, scale_change
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -119,7 +120,7 @@ def drive_results(chunk: DriveChunk, truth: Array, alone: Sequence[OdometryResul
                   metric: Sequence[OdometryResult]) -> Drive:
     """Compare two runs over the same frames with true poses (N, 4, 4)."""
     found = np.array([result.pose for result in alone])
-    unit = one_factor(found[:, :3, 3], truth[:, :3, 3])
+    unit = path_scale(found[:, :3, 3], truth[:, :3, 3])
     found[:, :3, 3] *= unit
     drifted = drift(truth, found)
     hidden = slice(_LEAD, _LEAD + chunk.hidden)

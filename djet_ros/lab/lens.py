@@ -19,7 +19,7 @@ from djet_ros.core.lens import (
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.style import COLOURS, figure
-from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
@@ -107,7 +107,7 @@ def examine(recording: Recording, config: Config, advance: Callable[[], None]) -
             every *= 2
     if len(informative) < LEAST_PAIRS:
         raise DjetError(_too_few(len(informative), pairs))
-    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
+    rectified = is_rectified(config.odometry.rectified, recording.image_topic)
     return LensReport(seen.camera, seen.info, rectified, pairs,
                       trusted_fit(informative, seen.camera))
 

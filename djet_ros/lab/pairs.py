@@ -19,7 +19,7 @@ from djet_ros.lab.chains import CHAINS, Points
 from djet_ros.lab.methods import Method
 from djet_ros.lab.sequences import Dataset, opened
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.visual_odometry import camera_motion
+from djet_ros.odometry.result import camera_motion
 from djet_ros.replay.pair_errors import has_direction, motion_errors
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,7 @@ from djet_ros.core.types import Array, View
 from djet_ros.errors import DjetError
 from djet_ros.lab import panels
 from djet_ros.lab.style import figure
-from djet_ros.odometry.images import BadMessage, decoded, narrowed
+from djet_ros.odometry.images import BadMessage, decoded, to_8_bits
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,7 +45,7 @@ class Similarity:
 def read_image(path: Path) -> Gray:
     """Read a PNG or JPEG file as gray image (H, W). Raises DjetError."""
     try:
-        return narrowed(decoded(np.fromfile(path, np.uint8)))
+        return to_8_bits(decoded(np.fromfile(path, np.uint8)))
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror or error}') from error
     except BadMessage as problem:

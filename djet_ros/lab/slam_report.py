@@ -17,7 +17,7 @@ from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.posegraph.graph_files import write_graph
-from djet_ros.posegraph.offline import PARAMETERS, Slam, travelled
+from djet_ros.posegraph.offline import PARAMETERS, Slam, trajectory_length
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
@@ -40,7 +40,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     holds all edges, including those that the robust kernel rejected.
     """
     frames, graph = slam.frames, slam.optimised.graph
-    ways = {'before': slam.before(), 'after': slam.after()}
+    ways = {'before': slam.odometry_poses(), 'after': slam.optimised_poses()}
     for which, poses in ways.items():
         StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{which}_tum.txt')
     for kind in ('g2o', 'csv'):
@@ -54,7 +54,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
         'rejected': {kind: slam.optimised.rejected(kind) for kind in ('link', 'loop')
                      if kinds[kind]},
-        'way': travelled(slam.before()), 'parameters': parameters,
+        'way': trajectory_length(slam.odometry_poses()), 'parameters': parameters,
         'version': __version__}
     known = np.isfinite(truth).all(axis=(1, 2))
     if known.sum() > 2:
@@ -86,7 +86,7 @@ def _evo(folder: Path, which: str, scaled: bool) -> dict[str, float]:
 
 def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
     """Plot the trajectory from above, before and after, and both errors over time."""
-    ways = {'before': slam.before()[:, :3, 3], 'after': slam.after()[:, :3, 3]}
+    ways = {'before': slam.odometry_poses()[:, :3, 3], 'after': slam.optimised_poses()[:, :3, 3]}
     if truth is not None:
         ways = {which: aligned(way, truth[:, :3, 3], slam.metric)
                 for which, way in ways.items()}

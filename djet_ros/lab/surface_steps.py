@@ -139,14 +139,15 @@ def _draw_round(axes: Axes, trace: Trace, match: int, index: int) -> None:
     step, y, distances = trace.rounds[index], trace.y[match], DescriptorDistances(trace.config)
     x, centre = trace.x[match], np.rint(y).astype(np.int64)
     if step.warp is None:
-        reference = distances.reference(trace.previous.tested, np.rint(x)[None])
+        reference = distances.reference(trace.previous.surface_gray, np.rint(x)[None])
     else:
         # The reference of this iteration, shifted to integer pixels.
         ahead = step.keypoints[match] - np.rint(step.keypoints[match])
         reference = distances.reference(
-            trace.previous.tested, (x - np.linalg.solve(step.warp[match, :2], ahead))[None],
+            trace.previous.surface_gray, (x - np.linalg.solve(step.warp[match, :2], ahead))[None],
             warp=step.warp[[match]])
-    surface = distances.surfaces(reference, trace.current.tested, centre[None], RADIUS)[:, :, 0]
+    surface = distances.surfaces(reference, trace.current.surface_gray, centre[None],
+                                 RADIUS)[:, :, 0]
     panels.draw_patch(axes, trace.current.gray, centre, RADIUS)
     panels.draw_heat(axes, surface, centre, 0.75)
     if step.fits.usable[match]:

@@ -155,7 +155,7 @@ class GraphSession:
                 self._publish(self._slam.work())
                 self._log_loops()
                 continue
-            self._slam.face_values = self._node_values()
+            self._slam.node_values = self._node_values()
             self._publish(task.do())
             self._latencies.add(task.since)
             if self._slam.problem is not None:

@@ -112,7 +112,7 @@ class Middleware(Protocol):
         the middleware, and other topics continue. Used only if ``publishers_block``.
         """
 
-    def offers(self, topic: str) -> Sequence[PublisherInfo]:
+    def publishers_of(self, topic: str) -> Sequence[PublisherInfo]:
         """Return the publishers of a topic, by its resolved name."""
 
     def published(self, kind: str) -> Sequence[str]:

@@ -11,13 +11,13 @@ from djet_ros.errors import DjetError
 
 # Read-only parameters: those of subscriptions and the queue, the frames and axes of published
 # poses, on which other nodes rely, and the mask file, which is read once.
-FIXED = (
+FIXED_PARAMETERS = (
     'ros.image_transport', 'ros.qos_reliability', 'ros.qos_depth', 'ros.queue_policy',
     'ros.queue_size', 'odometry.frame_convention', 'odometry.camera_frame',
     'odometry.odom_frame', 'odometry.base_frame', 'odometry.mask_file')
 
 # Parameters of the odometry that the pose graph node also uses, besides estimator.*.
-SHARED = (
+SHARED_PARAMETERS = (
     'preset', 'odometry.scale_uncertainty', 'odometry.rectified', 'odometry.residual_k1',
     'odometry.gray_range', 'odometry.frame_convention', 'odometry.camera_frame',
     'odometry.base_frame', 'odometry.mask', 'odometry.mask_file', 'ros.image_transport',

@@ -338,7 +338,7 @@ class Session:
             if silent:
                 # No image is queued that arrived before this CameraInfo.
                 self._take_info(self._newest_info)
-                self._tracker.no_image_comes()
+                self._tracker.images_stopped()
             if self._tracker.state is not State.PAUSED:
                 self._log_missing_inputs(silent)
             if monotonic() - self._last_diagnostics > _DIAGNOSTICS_PERIOD:
@@ -381,7 +381,7 @@ class Session:
         waiting = self._queue.peek()
         following = None if waiting is None else waiting.image
         if following is not None:
-            tracker.expect(following)
+            tracker.prepare_ahead(following)
         self._publish(tracker.image(received.image, following))
         self._latencies.add(received.at)
         self._log_problem()
@@ -399,7 +399,7 @@ class Session:
             self._side_input_arrived.clear()
             with self._lock:
                 self._feed_side_inputs(self._side_input_cutoff(received))
-                while (lacking := self._tracker.lacks(received.image)) and \
+                while (lacking := self._tracker.needs(received.image)) and \
                         self._feed_next_side_input(received.at + _MAX_SIDE_INPUT_TIMEOUT):
                     pass
             since = max(received.at, self._last_side_input) if patient else received.at
@@ -410,7 +410,7 @@ class Session:
 
     def _wait_for_next_if_ahead(self, received: _Received) -> None:
         with self._lock:
-            leaps = self._tracker.leaps(received.image)
+            leaps = self._tracker.follows_gap(received.image)
         if leaps and received.at > self._forgotten:
             self._queue.peek(timeout=_NEXT_IMAGE_TIMEOUT)
 
@@ -433,9 +433,9 @@ class Session:
         return True
 
     def _mount_side_inputs(self, image_frame: str) -> None:
-        for what, (parent, child) in self._tracker.wanted_mountings(image_frame).items():
+        for what, (parent, child) in self._tracker.missing_mountings(image_frame).items():
             if (mounting := self._wiring.transform(parent, child)) is not None:
-                self._tracker.mount_beside(what, mounting)
+                self._tracker.mount_sensor(what, mounting)
                 self._log_and_return(f'mounting of {child} on {parent} received from tf')
 
     def _mount(self, image_frame: str) -> None:
@@ -465,10 +465,10 @@ class Session:
             self._log_problem()
 
     def _update_node_diagnostics(self) -> None:
-        self._tracker.face_values = self._node_values()
+        self._tracker.node_values = self._node_values()
         waiting = self._queue.weight
         # Warn before anything is lost.
-        self._tracker.face_complaints = [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint(
+        self._tracker.node_complaints = [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint(
             'images pile up', 'WARN', (
                 f'{waiting * 1e-6:.0f} MB of images are queued; from '
                 f'{MAX_QUEUE_BYTES * 1e-6:.0f} MB on images are dropped, unless their publisher '

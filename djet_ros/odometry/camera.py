@@ -3,7 +3,7 @@ Camera model of a CameraInfo: camera matrix of the undistorted image, and undist
 
 Rectified images have the camera matrix in P and no distortion, raw ones K and D. Messages do not
 say which they are; the parameter ``odometry.rectified`` does, and its value ``auto`` decides by
-the name of the image topic, see ``means_rectified``. Images without distortion by that may have a
+the name of the image topic, see ``is_rectified``. Images without distortion by that may have a
 residual one, ``odometry.residual_k1``.
 """
 
@@ -72,7 +72,7 @@ class Camera:
         """
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
-        self._distortion = _distortion(model, D) if distorts(model, D) else None
+        self._distortion = _distortion(model, D) if is_distorted(model, D) else None
         if self._distortion is not None and K[0, 1]:
             raise BadMessage('bad_calibration', (
                 f'the skew {K[0, 1]:g} of images with a distortion is not known to OpenCV; '
@@ -96,7 +96,7 @@ class Camera:
         _check_camera(K)
         check_lens(K, _whole_size(info))
         model = info.distortion_model or 'plumb_bob'
-        if rectified or not distorts(model, D):
+        if rectified or not is_distorted(model, D):
             return cls(_of_image(K, info), np.array([residual_k1, 0, 0, 0, 0]), size,
                        remedy=_OF_PARAMETER)
         if residual_k1:
@@ -217,7 +217,7 @@ class Camera:
                 f'{self._remedy}'))
 
 
-def means_rectified(rectified: str, image_topic: str) -> bool:
+def is_rectified(rectified: str, image_topic: str) -> bool:
     """
     Return whether images are rectified, by the parameter or, for 'auto', by the topic.
 
@@ -236,7 +236,7 @@ def means_rectified(rectified: str, image_topic: str) -> bool:
     return False
 
 
-def distorts(model: str, D: Array) -> bool:
+def is_distorted(model: str, D: Array) -> bool:
     """
     Return whether coefficients D of a model make an image other than a pinhole's.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.types import Array, of_one_camera, Status, View
+from djet_ros.core.types import Array, of_same_camera, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,6 +60,6 @@ def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:
     gap = (current.stamp_ns - previous.stamp_ns) * 1e-9
     if gap < 0 or gap > max_gap:
         return Status.TIME_JUMP
-    if not of_one_camera(previous, current):
+    if not of_same_camera(previous, current):
         return Status.SIZE_CHANGED
     return Status.OK

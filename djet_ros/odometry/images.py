@@ -113,13 +113,13 @@ def gray_image(message: Any, limits: tuple[int, int] = WHOLE_RANGE) -> Gray:
     range these are the upper 8 bits. The result may share memory with the message.
     """
     if not hasattr(message, 'encoding'):
-        return _demosaiced(narrowed(_compressed(message), limits), message.format)
+        return _demosaiced(to_8_bits(_compressed(message), limits), message.format)
     pixels, values = _raw(message)
     # No copy without padding, as most cameras send it.
-    return np.ascontiguousarray(pixels.to_gray(narrowed(values, limits)))
+    return np.ascontiguousarray(pixels.to_gray(to_8_bits(values, limits)))
 
 
-def narrowed(values: NDArray[Any], limits: tuple[int, int] = WHOLE_RANGE) -> NDArray[np.uint8]:
+def to_8_bits(values: NDArray[Any], limits: tuple[int, int] = WHOLE_RANGE) -> NDArray[np.uint8]:
     """Return values of 16 bits as 8-bit gray levels by limits; 8-bit values are unchanged."""
     return values if values.dtype == np.uint8 else _levels_of_values(limits).take(values)
 

@@ -15,7 +15,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from itertools import pairwise
 
-from djet_ros.core.fusion import Turn
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.types import Array
 from djet_ros.odometry.stamped import Stamped
 import numpy as np
@@ -139,7 +139,7 @@ class Gyro:
         """Return whether there is a sample at the stamp of an image, or after it."""
         return self._rates.covers(stamp_ns + self.offset_ns)
 
-    def turn(self, start_ns: int, end_ns: int) -> Turn | None:
+    def turn(self, start_ns: int, end_ns: int) -> MeasuredRotation | None:
         """Return the camera's rotation between two images; None if it was not measured."""
         if self.to_camera is None or (integral := self._integral(start_ns, end_ns)) is None:
             return None
@@ -147,7 +147,7 @@ class Gyro:
         measured = (self.noise.density**2 * integral.seconds + integral.interpolation
                     + self.noise.walk**2 * integral.seconds**3 / 3)
         covariance = measured * np.eye(3) + by_bias @ self._bias_at(end_ns) @ by_bias.T
-        return Turn(C @ integral.turn.T @ C.T, covariance)
+        return MeasuredRotation(C @ integral.turn.T @ C.T, covariance)
 
     def learn(self, start_ns: int, end_ns: int, R: Array, covariance: Array) -> None:
         """
@@ -165,7 +165,7 @@ class Gyro:
         noise = turn.covariance - J @ P @ J.T + covariance
         gain = P @ J.T @ np.linalg.inv(J @ P @ J.T + noise)
         keep = np.eye(3) - gain @ J
-        self.bias = self.bias - gain @ turn.off(R)
+        self.bias = self.bias - gain @ turn.correction(R)
         self.bias_covariance = keep @ P @ keep.T + gain @ noise @ gain.T
         self._bias_ns = end_ns
 
@@ -176,7 +176,7 @@ class Gyro:
             return False
         sigma = float(np.sqrt(np.linalg.eigvalsh(turn.covariance)[-1]))
         white = self.noise.density * np.sqrt(integral.samples / integral.seconds)
-        angle = float(np.linalg.norm(turn.off(np.eye(3))))
+        angle = float(np.linalg.norm(turn.correction(np.eye(3))))
         return bool(sigma < _SIGMA_AT_REST and angle < _AT_REST * sigma
                     and (integral.spread < _NOISE_AT_REST * white).all())
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.parallel import started_beside
+from djet_ros.core.parallel import start_in_background
 from djet_ros.core.types import View
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.images import few_levels, FewLevels, Gray, gray_image
@@ -56,7 +56,7 @@ class Preprocessor:
         """Begin to prepare an image in parallel, unless that has begun."""
         if any(one.message is message for one in self._ahead):
             return
-        self._ahead.append(_Ahead(message, settings, started_beside(
+        self._ahead.append(_Ahead(message, settings, start_in_background(
             lambda: _preprocessed(message, settings, with_view))))
 
     def image(self, message: Any, settings: Settings) -> Preprocessed:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from djet_ros.core.fusion import agrees, fused, Turn
-from djet_ros.core.starts import Known
+from djet_ros.core.fusion import agrees, fused, MeasuredRotation
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.odometry.guess import Guess, initial_pose
 from djet_ros.odometry.inertial import Gyro
@@ -48,14 +48,14 @@ class MotionPriors:
             if sensor is not None:
                 sensor.forget_before(stamp_ns)
 
-    def of(self, span_ns: Span) -> Known:
+    def of(self, span_ns: Span) -> KnownMotion:
         """Return the priors of a pair: of the rotation only while the gyro agrees with images."""
         motion = self.guess.motion(*span_ns) if self.guess else None
         trusted = self.gyro is not None and self.gyro.trusted
-        return Known(self._turn(span_ns) if trusted else None,
-                     None if motion is None else initial_pose(motion))
+        return KnownMotion(self._turn(span_ns) if trusted else None,
+                           None if motion is None else initial_pose(motion))
 
-    def _turn(self, span_ns: Span) -> Turn | None:
+    def _turn(self, span_ns: Span) -> MeasuredRotation | None:
         """Return the rotation that the gyro measured, if it did."""
         return None if self.gyro is None else self.gyro.turn(*span_ns)
 
@@ -73,14 +73,14 @@ class MotionPriors:
         return (self.gyro is not None and not self.gyro.ever_agreed
                 and relative.status not in TRACKED)
 
-    def judge(self, turn: Turn, relative: RelativePose) -> bool:
+    def judge(self, turn: MeasuredRotation, relative: RelativePose) -> bool:
         """Return whether the gyro's rotation agrees with that of a pair, and count it."""
         agreed = agrees(turn, relative)
         if self.gyro is not None:
             self.gyro.judge(agreed)
         return agreed
 
-    def fuse(self, relative: RelativePose, prior: Turn | None, span_ns: Span,
+    def fuse(self, relative: RelativePose, prior: MeasuredRotation | None, span_ns: Span,
              learn: bool) -> RelativePose:
         """
         Return the pair fused with the gyro's rotation; DEGENERATE if both disagree.

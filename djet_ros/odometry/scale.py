@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Protocol
 
 from djet_ros.config.sections import OdometryConfig
-from djet_ros.core.ground import Ground, GroundMotion, SIGHT, turned
+from djet_ros.core.ground import Ground, GroundMotion, rotate_tilt, SIGHT
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
 from djet_ros.odometry.guess import Guess
@@ -352,7 +352,7 @@ class CameraHeightScale(ScaleSource):
         if not np.isfinite(covariance).all():
             self._P = self._P + np.diag([0.0, *_WANDERING[1:]**2 * seconds])
             return
-        lean, by_lean, by_turn = turned(self._x[1:], relative.R, covariance)
+        lean, by_lean, by_turn = rotate_tilt(self._x[1:], relative.R, covariance)
         way = max(float(self._x[0]), 0.0) * seconds
         J = block_diag(1.0, by_lean)
         self._x = np.array([self._x[0], *lean])

@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from djet_ros.core.covariance import lift, UNKNOWN
+from djet_ros.core.covariance import lift, UNDETERMINED
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import sphere_tangents
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, Status, View
-from djet_ros.core.verdict import as_turn
-from djet_ros.core.window import Addition, Window
+from djet_ros.core.verdict import as_pure_rotation
+from djet_ros.core.window import Window, WindowStep
 from djet_ros.odometry.scale import Length, ScaleSource
 from djet_ros.odometry.scale_filter import ScaleFilter
 import numpy as np
@@ -103,7 +103,7 @@ class TrackScale:
         """
         if self._speed is None or not self._uses_landmarks:
             return np.empty((0, 3))
-        places = self._window.settled if settled else self._window.landmarks()
+        places = self._window.final_landmarks if settled else self._window.landmarks()
         return places * self._filter.factor
 
     # Radial distortion
@@ -114,16 +114,17 @@ class TrackScale:
         if not self._uses_landmarks or self._speed is None:
             return None
         lens = self._window.lens
-        return lens if lens.certain or lens.undone else None
+        return lens if lens.significant or lens.corrected_k1 else None
 
     @property
     def k1_due(self) -> float | None:
         """Return the k1 that is to be removed from images from now on; None for no change."""
-        return self._window.lens.k1 if self._uses_landmarks and self._window.lens.due else None
+        lens = self._window.lens
+        return lens.k1 if self._uses_landmarks and lens.needs_update else None
 
-    def straighten(self, newest: View) -> None:
+    def correct_images(self, newest: View) -> None:
         """Continue with images without that k1; newest: the newest frame without it."""
-        self._window.straighten(newest)
+        self._window.correct_images(newest)
         self._lens = self._window.lens
 
     def forget_lens(self) -> None:
@@ -179,7 +180,7 @@ class TrackScale:
         length = self._filter.scaled(addition.length, sigma, measured.known)
         return self._onward(relative, length, addition)
 
-    def _onward(self, relative: RelativePose, length: Length, addition: Addition,
+    def _onward(self, relative: RelativePose, length: Length, addition: WindowStep,
                 as_measured: bool = False) -> Step:
         """
         Return a step that continues the track as the window has it.
@@ -190,7 +191,7 @@ class TrackScale:
         onward = addition.onward.copy()
         if as_measured or not relative.t.any():
             onward[:3, 3] = -addition.length * relative.R.T @ relative.t
-        self._window.tell(onward)
+        self._window.record_published(onward)
         onward[:3, 3] *= length.value / addition.length
         return Step(relative, length, onward)
 
@@ -209,9 +210,9 @@ class TrackScale:
             self.begin(current)
         elif (addition := self._added(current, relative, self._speed * seconds)) is not None:
             self._wander(addition, seconds, parallax=True)
-            self._window.tell(motion)
+            self._window.record_published(motion)
 
-    def _added(self, view: View, relative: RelativePose, guess: float) -> Addition | None:
+    def _added(self, view: View, relative: RelativePose, guess: float) -> WindowStep | None:
         """Add a frame to the window; return None and restart if it has no length."""
         if not self._window.is_new or relative.t.any():
             try:
@@ -226,7 +227,7 @@ class TrackScale:
         self.begin(view)
         return None
 
-    def _wander(self, addition: Addition, seconds: float, parallax: bool) -> float:
+    def _wander(self, addition: WindowStep, seconds: float, parallax: bool) -> float:
         """
         Update speed and factor variance, return the length's standard deviation as a share of it.
 
@@ -257,7 +258,7 @@ class TrackScale:
         if relative.status is Status.OK:
             if agrees is False:
                 return ambiguous(relative)
-            return as_turn(relative, K) if self.lacks_parallax(relative) else relative
+            return as_pure_rotation(relative, K) if self.lacks_parallax(relative) else relative
         if agrees and all(self.agrees(rival, relative.x, relative.y) is False
                           for rival in relative.rivals):
             return replace(relative, status=Status.OK)
@@ -273,7 +274,7 @@ class TrackScale:
         """
         if self.is_new:
             return None
-        consistent, tested = self._window.agreement(pose, x, y)
+        consistent, tested = self._window.count_agreeing(pose, x, y)
         if tested < _FEW:
             return None
         return bool(bdtr(consistent, tested, _CONSISTENT) >= _SIGNIFICANCE)
@@ -282,18 +283,18 @@ class TrackScale:
         """Return whether the pair's length, by the depths of landmarks, is not significant."""
         if self.is_new:
             return False
-        length = self._window.told_length(relative)
+        length = self._window.pair_length(relative)
         return length is not None and length[0] < _OUT_OF_NOISE * length[1]
 
 
 def ambiguous(relative: RelativePose) -> RelativePose:
     """Return a pair as AMBIGUOUS, with unknown covariance: other evidence contradicts it."""
-    return replace(relative, status=Status.AMBIGUOUS, covariance_5=UNKNOWN[0],
-                   covariance_6=UNKNOWN[1])
+    return replace(relative, status=Status.AMBIGUOUS, covariance_5=UNDETERMINED[0],
+                   covariance_6=UNDETERMINED[1])
 
 
-def _by_window(relative: RelativePose, addition: Addition, usual: float
-               ) -> tuple[RelativePose, Addition]:
+def _by_window(relative: RelativePose, addition: WindowStep, usual: float
+               ) -> tuple[RelativePose, WindowStep]:
     """
     Return a pair without parallax with the motion of the window, if that determines it.
 

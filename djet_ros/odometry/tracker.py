@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 from djet_ros import compiled
 from djet_ros.config.sections import Config, NODE_NAME, OdometryConfig
 from djet_ros.core.types import Array, STARTED, TRACKED, View
-from djet_ros.odometry.beside import AuxiliaryInputs
-from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.auxiliary import AuxiliaryInputs
+from djet_ros.odometry.camera import Camera, is_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
 from djet_ros.odometry.frame import Frame
@@ -74,8 +74,8 @@ class Tracker:
                  still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config = config
         # What a front end adds to each diagnostics message, such as its latency.
-        self.face_values: dict[str, str] = {}
-        self.face_complaints: list[Complaint] = []
+        self.node_values: dict[str, str] = {}
+        self.node_complaints: list[Complaint] = []
         self._message_type = message_type
         self._image_topic = image_topic
         self._speed_topics = speed_topics
@@ -161,7 +161,7 @@ class Tracker:
         try:
             config = self.config.odometry
             self._camera = Camera.from_info(
-                message, means_rectified(config.rectified, self._image_topic),
+                message, is_rectified(config.rectified, self._image_topic),
                 config.residual_k1)
         except BadMessage as problem:
             self._camera = None
@@ -178,7 +178,7 @@ class Tracker:
         """Return the camera of the newest CameraInfo; None if there is no usable one."""
         return self._camera
 
-    def expect(self, message: Any) -> None:
+    def prepare_ahead(self, message: Any) -> None:
         """
         Prepare an image ahead, in parallel with the work on the one before it.
 
@@ -192,7 +192,7 @@ class Tracker:
     def _settings(self, camera: Camera) -> Settings:
         return Settings(camera, self._odometry.estimator, self.config.odometry.gray_limits())
 
-    def leaps(self, image: Any) -> bool:
+    def follows_gap(self, image: Any) -> bool:
         """
         Return whether an image comes after a gap of more than max_gap, or has a wrong stamp.
 
@@ -206,7 +206,7 @@ class Tracker:
         """
         Process an Image or a CompressedImage, return the messages to publish.
 
-        following: the image after it, if known; it matters only if this one ``leaps``.
+        following: the image after it, if known; it matters only if this one ``follows_gap``.
         """
         self.counts.received += 1
         stamp = stamp_ns(message.header)
@@ -264,7 +264,7 @@ class Tracker:
         self._paused = False
         self._await()
 
-    def no_image_comes(self) -> None:
+    def images_stopped(self) -> None:
         """Note that no image has come for a while; for front ends, which have a clock."""
         self._await()
         self._rate = StampRate()
@@ -304,25 +304,25 @@ class Tracker:
         """Take the mask of an image, for odometry.mask."""
         self._inputs.mask(message)
 
-    def lacks(self, image: Any) -> str:
+    def needs(self, image: Any) -> str:
         """
         Return the name of an input that an image still needs, or an empty string.
 
         A front end should wait for it for a moment; later it is of no use to the image.
         """
-        return self._inputs.lacks(stamp_ns(image.header), frame_of(image.header))
+        return self._inputs.needs(stamp_ns(image.header), frame_of(image.header))
 
-    def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
+    def missing_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
         """Return frames (parent, child) with an unknown transform, keyed by 'imu' or 'guess'."""
-        return self._inputs.wanted_mountings(image_frame)
+        return self._inputs.missing_mountings(image_frame)
 
     @property
     def wants_frames(self) -> bool:
         """Return whether transforms are still to be looked up on tf."""
         return not self.mounted or self._inputs.wants_mountings
 
-    def mount_beside(self, what: str, mounting: Array) -> None:
-        """Take a transform (4, 4) of ``wanted_mountings``."""
+    def mount_sensor(self, what: str, mounting: Array) -> None:
+        """Take a transform (4, 4) of ``missing_mountings``."""
         self._inputs.mount(what, mounting)
 
     def count_dropped(self, reason: str, number: int = 1) -> None:
@@ -341,7 +341,7 @@ class Tracker:
         more = self._of_calibration
         return [*self._health.complaints(self._scale, self.mounted),
                 *(one for one in more if one is not None),
-                *self.complaints_beside, *self.face_complaints]
+                *self.complaints_of_inputs, *self.node_complaints]
 
     @property
     def _of_calibration(self) -> tuple[Complaint | None, ...]:
@@ -353,11 +353,11 @@ class Tracker:
         """Return the problems of a whole recording."""
         found = (self._health.stamps_stood(), self._health.few_levels(),
                  self._health.never_measured(self._scale), self._health.two_cameras(),
-                 *self._of_calibration, *self.complaints_beside)
+                 *self._of_calibration, *self.complaints_of_inputs)
         return [one for one in found if one is not None]
 
     @property
-    def complaints_beside(self) -> list[Complaint]:
+    def complaints_of_inputs(self) -> list[Complaint]:
         """Return the problems of the inputs other than images."""
         return self._inputs.complaints(self.last.frame_id if self.last else '')
 
@@ -370,7 +370,7 @@ class Tracker:
         if (lens := self._odometry.lens) is not None:
             diagnosis.values['distortion left (k1)'] = f'{lens.k1:.4f} +- {lens.sigma:.4f}'
         diagnosis.values.update(self._inputs.values())
-        diagnosis.values.update(self.face_values)
+        diagnosis.values.update(self.node_values)
         return diagnosis
 
     def diagnostics(self, stamp: int) -> Outgoing:
@@ -386,7 +386,7 @@ class Tracker:
             return None
         return Outgoing('debug_image', self._messages.picture(
             self._frame.stamp_ns, self._frame.frame_id,
-            debug_image(self._odometry.estimator.seen(self._frame.gray, self._frame.K),
+            debug_image(self._odometry.estimator.undistorted(self._frame.gray, self._frame.K),
                         self.last.relative)))
 
     def landmarks(self) -> Outgoing | None:
@@ -424,8 +424,8 @@ class Tracker:
     def _astray(self, image: Any, following: Any, newest: Frame) -> str:
         """Return 'ahead' if only this image leaps, but not the one after it; otherwise ''."""
         continues = (following is not None and stamp_ns(following.header) > newest.stamp_ns
-                     and not self.leaps(following))
-        return 'ahead' if continues and self.leaps(image) else ''
+                     and not self.follows_gap(following))
+        return 'ahead' if continues and self.follows_gap(image) else ''
 
     def _out_of_order(self, stamp: int, newest: Frame) -> str:
         """Return why an image cannot follow the newest one: 'equal_stamp', 'late' or ''."""

@@ -137,7 +137,7 @@ class PathCovariance:
             with_common + np.outer(along, common.variances))
 
 
-def in_a_chain(covariance: Array) -> Array:
+def inflated_for_chain(covariance: Array) -> Array:
     """
     Return the covariance (6, 6) of a pair for a pose graph, whose edges have independent errors.
 

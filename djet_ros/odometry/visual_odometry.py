@@ -8,10 +8,10 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.self_calibration import SelfCalibration
-from djet_ros.core.starts import Known
+from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import (
     Array,
-    of_one_camera,
+    of_same_camera,
     RelativePose,
     Status,
     TRACKED,
@@ -144,7 +144,7 @@ class VisualOdometry:
         status = continuity(last, frame, self._config.max_gap) if last else Status.FIRST_FRAME
         backwards = bool(last and frame.stamp_ns < last.stamp_ns)
         # After a gap it may also be of another camera.
-        other_camera = last is not None and not of_one_camera(last, frame)
+        other_camera = last is not None and not of_same_camera(last, frame)
         if (backwards or other_camera) and self._forget_distortion():
             view = None
         # Detect its features, for this pair and for those whose reference it will be.
@@ -169,18 +169,18 @@ class VisualOdometry:
         # Estimate the length of its translation, and integrate it.
         return self._tracked(frame, view, pair, span)
 
-    def _verified(self, view: View, pair: RelativePose, priors: Known,
+    def _verified(self, view: View, pair: RelativePose, priors: KnownMotion,
                   span: Span) -> RelativePose:
         """Return the pair fused with the gyro's rotation; other evidence may reject it."""
         # A gyro that has never agreed may be why the pair is bad: judge it by images alone.
-        if priors.turn is not None and self._priors.may_mislead(pair):
+        if priors.rotation is not None and self._priors.may_mislead(pair):
             alone = self._estimator.estimate(self._reference.view, view, self._last_pair,
-                                             replace(priors, turn=None))
+                                             replace(priors, rotation=None))
             if alone.status in TRACKED:
-                self._priors.judge(priors.turn, alone)
+                self._priors.judge(priors.rotation, alone)
         pair = self._scale.verified(pair, self._reference.view.K)
         # What bridges bad pairs may be the motion of what made them bad: it calibrates no gyro.
-        pair = self._priors.fuse(pair, priors.turn, span, learn=not self._bad_pairs)
+        pair = self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
         # After a standstill without any rotation, something that fills the image may move. Most
         # cameras turn a little as they start; one on a rail may not, and is trusted after a while.
         doubtful = (pair.status is Status.OK
@@ -254,7 +254,7 @@ class VisualOdometry:
         waits = self._waits_for_parallax(pair)
         step = (Step(pair, self._scale.expected_length(span)) if waits
                 else self._scale.of_step(span, view, pair))
-        trajectory = self._trajectory.stepped(step)
+        trajectory = self._trajectory.align(step)
         result = self._result(
             frame, pair, step.length, camera_motion(step.relative, step.length.value),
             motion_covariance(step.relative, step.length), trajectory,
@@ -291,7 +291,7 @@ class VisualOdometry:
         """
         self._estimator = TwoViewEstimator(self._estimator.config, k1)
         self._renew_reference_view()
-        self._scale.straighten(self._reference.view)
+        self._scale.correct_images(self._reference.view)
 
     def _renew_reference_view(self) -> None:
         """Prepare the reference's view by the present estimator; its old matches are void."""

@@ -67,7 +67,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
                                         for _ in range(3 + len(_FEATURES)))
         return KeyframeImage(replace(frame, gray=gray, K=K,
                                      left_out=left_out if left_out.size else None),
-                             Features.described(**dict(zip(_FEATURES, features))))
+                             Features.with_descriptors(**dict(zip(_FEATURES, features))))
 
     def __contains__(self, number: object) -> bool:
         """Return whether there is such a keyframe, without reading it."""

@@ -12,7 +12,7 @@ from typing import Any
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, means_rectified, same_camera
+from djet_ros.odometry.camera import Camera, is_rectified, same_camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
@@ -53,10 +53,10 @@ class LiveSlam:
                  still_mask: NDArray[np.bool_] | None = None) -> None:
         self.config, self.slam = config, config.slam
         # Values that the live node adds to each diagnostics message.
-        self.face_values: dict[str, str] = {}
+        self.node_values: dict[str, str] = {}
         self._messages = MessageFactory(message_type)
         self._node = node
-        self._rectified = means_rectified(config.odometry.rectified, image_topic)
+        self._rectified = is_rectified(config.odometry.rectified, image_topic)
         # Pose of the camera's optical frame in the frame whose poses are published.
         self._mounting = np.eye(4)
         if config.odometry.frame_convention == 'body':
@@ -221,7 +221,7 @@ class LiveSlam:
             'relative poses missing': str(self._steps.missing),
             **{f'messages rejected: {topic}': str(count)
                for topic, count in sorted(self.rejected.items())},
-            **self.face_values}
+            **self.node_values}
         return Outgoing('/diagnostics', self._messages.diagnostics(
             stamp, f'{self._node}: pose graph', level,
             f'{summary}: {self.problem}' if self.problem else summary, values,

@@ -13,13 +13,13 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import inverse_depths, rays, unit
 from djet_ros.core.masks import blocked
-from djet_ros.core.radial import straight_image
-from djet_ros.core.types import Array, of_one_camera, RelativePose, Status, TRACKED, View
+from djet_ros.core.radial import undistort_image
+from djet_ros.core.types import Array, of_same_camera, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
+from djet_ros.odometry.result import camera_motion
 from djet_ros.odometry.scale import Length, unknown
 from djet_ros.odometry.uncertainty import motion_covariance
-from djet_ros.odometry.visual_odometry import camera_motion
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.places import PlaceIndex
 from djet_ros.posegraph.pose_graph import Edge
@@ -73,7 +73,7 @@ class EdgeFinder:
         number = self._first + len(self._times)
         gray, left_out = frame.gray, frame.left_out
         if k1:
-            gray, left_out = straight_image(gray, frame.K, k1, left_out)
+            gray, left_out = undistort_image(gray, frame.K, k1, left_out)
         features = self._near.features(gray, None if left_out is None else blocked(left_out))
         self._kept[number] = KeyframeImage(frame, features)
         self._time += max(frame.stamp_ns - self._stamp_ns, 0)
@@ -132,7 +132,7 @@ class EdgeFinder:
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
         k1 = self._lens(current)
         view, other = self._view(current, k1), self._view(place, k1)
-        if not of_one_camera(view, other):
+        if not of_same_camera(view, other):
             return
         relative = self._wide.estimate(view, other)
         if relative.status in TRACKED and self._is_verified(relative):

@@ -44,11 +44,11 @@ class Slam:
         """Whether the odometry's lengths are in metres."""
         return self.scale is Scale.METRIC
 
-    def before(self) -> Array:
+    def odometry_poses(self) -> Array:
         """Return the poses (N, 4, 4) of all frames by odometry."""
         return self.frames.poses
 
-    def after(self) -> Array:
+    def optimised_poses(self) -> Array:
         """Return the optimised poses (N, 4, 4) of all frames, each fixed in its keyframe."""
         keyframes, factors = self.optimised.graph.poses, self.optimised.factors
         return np.array([keyframes[offset.keyframe] @ rescaled_motion(
@@ -81,6 +81,6 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
         return Slam(frames, offsets, growing.optimise(), scale_of(steps))
 
 
-def travelled(poses: Array) -> float:
+def trajectory_length(poses: Array) -> float:
     """Return the length of the trajectory through poses (N, 4, 4)."""
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.uncertainty import in_a_chain, rotated
+from djet_ros.odometry.uncertainty import inflated_for_chain, rotated
 import numpy as np
 from numpy.typing import NDArray
 
@@ -108,7 +108,7 @@ class Edge(Motion):
         """Return the edge with the covariance inflated for correlated errors of the odometry."""
         if self.kind != 'odometry':
             return self
-        return replace(self, covariance=in_a_chain(self.covariance))
+        return replace(self, covariance=inflated_for_chain(self.covariance))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, means_rectified
+from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
@@ -42,7 +42,7 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
 
 def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tuple[Camera, Any]]:
     """Yield the images of a recording with their cameras, once masks has their masks."""
-    rectified = means_rectified(config.odometry.rectified, recording.image_topic)
+    rectified = is_rectified(config.odometry.rectified, recording.image_topic)
     camera: Camera | None = None
     mask_topic = recording.beside.get('mask', '') if config.odometry.mask else ''
     waiting: deque[tuple[int, Camera, Any]] = deque()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.odometry.scale import Scale
-from djet_ros.odometry.uncertainty import in_a_chain, symmetric, UNKNOWN_MOTION
+from djet_ros.odometry.uncertainty import inflated_for_chain, symmetric, UNKNOWN_MOTION
 from djet_ros.posegraph.pose_graph import Edge, Motion, PoseGraph
 import numpy as np
 
@@ -77,7 +77,7 @@ def unobserved_motion(before: Step, step: Step) -> tuple[Array, Array]:
         variances = np.linalg.eigvalsh(grown)
         if (variances[0] > _ROUNDING * np.trace(step.rotation_covariance)
                 and variances[-1] < _MAX_ROTATION_VARIANCE):
-            covariance[3:, 3:] = in_a_chain(grown)
+            covariance[3:, 3:] = inflated_for_chain(grown)
     return np.asarray(np.linalg.inv(before.pose) @ step.pose), covariance
 
 

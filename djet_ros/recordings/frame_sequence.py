@@ -9,9 +9,9 @@ from typing import Any
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, check_lens, distorts
+from djet_ros.odometry.camera import Camera, check_lens, is_distorted
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, narrowed
+from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, to_8_bits
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
 from djet_ros.recordings.imu import ImuTrack
 import numpy as np
@@ -70,7 +70,7 @@ class FrameSequence:
     @property
     def distorted(self) -> bool:
         """Return whether the images in the files are distorted."""
-        return distorts(self.model, self.distortion)
+        return is_distorted(self.model, self.distortion)
 
     def raw(self, index: int) -> NDArray[Any]:
         """Return the gray image (H, W) of a frame as stored, uint8 or uint16."""
@@ -122,7 +122,7 @@ class ImageFiles:
 
     def gray(self, index: int) -> NDArray[np.uint8]:
         """Return one image (H, W) uint8, the upper 8 bits of a 16-bit one."""
-        return narrowed(self.pixels(index))
+        return to_8_bits(self.pixels(index))
 
     def pixels(self, index: int) -> NDArray[Any]:
         """Return the image (H, W), uint8 or uint16, of a file; colours become gray."""

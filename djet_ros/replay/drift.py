@@ -62,7 +62,7 @@ def drift(truth: Array, estimate: Array) -> Drift | None:
                  len(first), int(length.max()))
 
 
-def one_factor(places: Array, truth: Array) -> float:
+def path_scale(places: Array, truth: Array) -> float:
     """Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread."""
     here, there = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
     return float(there / here) if here > 0 else 1.0

@@ -47,11 +47,11 @@ def motion_errors(status: Status, motion: Array, true_motion: Array) -> tuple[fl
     """Return the errors of rotation and direction of a motion (4, 4) in degrees, or NaN."""
     if status not in (Status.OK, Status.NO_PARALLAX):
         return float('nan'), float('nan')
-    rotation, direction = angles_off(motion, true_motion)
+    rotation, direction = angle_errors(motion, true_motion)
     return rotation, direction if status is Status.OK else float('nan')
 
 
-def angles_off(motion: Array, true_motion: Array) -> tuple[float, float]:
+def angle_errors(motion: Array, true_motion: Array) -> tuple[float, float]:
     """
     Return the angular errors of rotation and direction of a motion (4, 4), in degrees.
 

@@ -34,7 +34,7 @@ from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
 from djet_ros.replay.alignment import aligned, position_rmse
-from djet_ros.replay.drift import drift, one_factor, scale_change
+from djet_ros.replay.drift import drift, path_scale, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder, UNFINISHED
@@ -187,9 +187,9 @@ class Replay:
                 continue
             following = self._after_the_first
             if now_ns is not None and (
-                    (following is None and self._tracker.leaps(first.message))
+                    (following is None and self._tracker.follows_gap(first.message))
                     or (now_ns - first.stamp_ns < _SIDE_INPUT_TIMEOUT_NS
-                        and self._tracker.lacks(first.message))):
+                        and self._tracker.needs(first.message))):
                 break
             self._image(self._waiting.popleft(), following)
             done += 1
@@ -213,13 +213,13 @@ class Replay:
         number, processed = tracker.counts.received, tracker.counts.processed
         rejected = tracker.counts.rejected.total()
         frame = frame_of(message.message.header)
-        for what, (parent, child) in tracker.wanted_mountings(frame).items():
+        for what, (parent, child) in tracker.missing_mountings(frame).items():
             if (mounting := self._frames.transform(parent, child)) is not None:
-                tracker.mount_beside(what, mounting)
+                tracker.mount_sensor(what, mounting)
         if not tracker.mounted:
             self._mount(frame)
         if self._following is not None:
-            tracker.expect(self._following.message)
+            tracker.prepare_ahead(self._following.message)
         started = perf_counter()
         outgoing = tracker.image(message.message, following)
         seconds = perf_counter() - started
@@ -362,7 +362,7 @@ class Replay:
         elif log.scale is Scale.UNKNOWN:
             unit = 'steps of unit length'
         elif log.scale is Scale.RELATIVE and known.size:
-            estimate[:, :3, 3] *= one_factor(estimate[known, :3, 3], truth[known, :3, 3])
+            estimate[:, :3, 3] *= path_scale(estimate[known, :3, 3], truth[known, :3, 3])
             title += '\n(common scale from ground truth)'
         elif log.scale is Scale.RELATIVE:
             unit = 'lengths of the first step'
@@ -448,7 +448,7 @@ class _Log:
             return None
         poses = np.array([step.pose for step in self.steps])[known]
         if self.scale is Scale.RELATIVE:
-            poses[:, :3, 3] *= one_factor(poses[:, :3, 3], truth[known][:, :3, 3])
+            poses[:, :3, 3] *= path_scale(poses[:, :3, 3], truth[known][:, :3, 3])
         found = drift(truth[known], poses)
         if found is None or not any(step.tracked for step in self.steps):
             return None

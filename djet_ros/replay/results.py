@@ -26,8 +26,8 @@ from djet_ros.config.yaml_files import dump_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import KEYFRAME_WORDS
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing
-from djet_ros.odometry.visual_odometry import OdometryResult
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing

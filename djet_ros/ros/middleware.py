@@ -181,7 +181,7 @@ class RosMiddleware:
         """Subscribe to a topic; ready is not used; overrides as for ``advertise``."""
         return RosSubscription(self._node, topic, kind, callback, profile)
 
-    def offers(self, topic: str) -> list[PublisherInfo]:
+    def publishers_of(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
         return [PublisherInfo(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
                               _profile(one.qos_profile))

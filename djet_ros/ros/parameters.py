@@ -13,10 +13,10 @@ from djet_ros.config.sections import Config
 from djet_ros.config.yaml_files import is_ros_own, why_unused
 from djet_ros.errors import DjetError, one_line
 from djet_ros.live.parameters import (
-    FIXED,
+    FIXED_PARAMETERS,
     live_choices,
     ODOMETRY_PARAMETERS,
-    SHARED,
+    SHARED_PARAMETERS,
     tf_reason,
     with_live_values,
 )
@@ -114,7 +114,7 @@ def graph_parameters(node: Node) -> Config:
         _require('tf2_msgs', 'tf2-msgs', 'slam.publish_tf is true')
     if config.odometry.base_frame:
         _require_frames(config)
-    _declare(node, (item for item in flat(config).values() if item.name in SHARED
+    _declare(node, (item for item in flat(config).values() if item.name in SHARED_PARAMETERS
                     or item.name.startswith(('estimator.', 'slam.'))), given, read_only=True)
     return config
 
@@ -146,7 +146,7 @@ def descriptor(item: FlatParameter, *, read_only: bool = False) -> ParameterDesc
     """Return the ROS descriptor of a parameter: text, range, choices, read-only."""
     says, choices = item.description, live_choices(item)
     result = ParameterDescriptor(
-        description=says.text, read_only=read_only or item.name in FIXED,
+        description=says.text, read_only=read_only or item.name in FIXED_PARAMETERS,
         additional_constraints=f'one of: {", ".join(choices)}' if choices else '')
     if says.minimum is None or says.maximum is None:
         return result

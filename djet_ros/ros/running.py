@@ -7,7 +7,7 @@ import re
 from threading import Event
 
 from djet_ros.errors import DjetError, one_line
-from djet_ros.live.face import Face
+from djet_ros.live.base_node import LiveNode
 import rclpy
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -20,7 +20,7 @@ _REFUSALS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsE
              NameValidationException, ParameterException)
 
 
-def own_words() -> list[str]:
+def non_ros_arguments() -> list[str]:
     """Return the non-ROS arguments of the command line; DjetError if ROS's are invalid."""
     try:
         return list(remove_ros_args()[1:])
@@ -28,12 +28,12 @@ def own_words() -> list[str]:
         raise _refused(error) from None
 
 
-# What rcl reads besides the command line, which own_words has checked.
+# What rcl reads besides the command line, which non_ros_arguments has checked.
 _ENVIRONMENT = ('ROS_DOMAIN_ID, RMW_IMPLEMENTATION, ROS_LOG_DIR and the settings of the '
                 'middleware such as CYCLONEDDS_URI or FASTRTPS_DEFAULT_PROFILES_FILE')
 
 
-def run_node(name: str, make: Callable[[Node], Face], stop: Event) -> int:
+def run_node(name: str, make: Callable[[Node], LiveNode], stop: Event) -> int:
     """
     Run a node until stop is set; return the exit code, 1 if its worker thread failed.
 

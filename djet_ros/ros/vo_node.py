@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from djet_ros.live.face import Face
-from djet_ros.live.odometry_face import OdometryFace
+from djet_ros.live.base_node import LiveNode
+from djet_ros.live.odometry_node import OdometryNode
 from djet_ros.ros.middleware import RosMiddleware
 from djet_ros.ros.parameters import Parameters
 from rclpy.node import Node
 
 
-def make(node: Node) -> Face:
+def make(node: Node) -> LiveNode:
     """Create the odometry from the parameters of a node, which may change at run time."""
     parameters = Parameters(node)
-    odometry = OdometryFace(RosMiddleware(node), parameters.config)
+    odometry = OdometryNode(RosMiddleware(node), parameters.config)
     parameters.call_on_change(odometry.connect, odometry.configure)
     return odometry

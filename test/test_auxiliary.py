@@ -13,7 +13,7 @@ import cv2
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle
-from djet_ros.core.masks import at, blocked
+from djet_ros.core.masks import blocked, masked_at
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
@@ -89,7 +89,7 @@ def played(one: Tracker, drive: Drive, imu: list[Any], black: tuple[int, ...] = 
     """Play images with the samples up to them, return the messages."""
     waiting, outgoing = list(imu), []
     for i in range(len(drive.images)):
-        while waiting and one.lacks(drive.image(i)):
+        while waiting and one.needs(drive.image(i)):
             one.imu(waiting.pop(0))
         gray = np.zeros_like(drive.images[i]) if i in black else None
         outgoing += one.image(drive.image(i, gray))
@@ -113,7 +113,7 @@ def test_without_a_gyro_its_messages_change_nothing(drive: Drive) -> None:
     assert heard[0] == heard[1]
 
 
-def test_a_gyro_whose_clock_is_ahead_is_heard_by_that_of_the_images(drive: Drive) -> None:
+def test_the_imu_offset_corrects_the_clock_of_a_gyro(drive: Drive) -> None:
     ahead = drive.imu()
     for message in ahead:
         message.header.stamp = MAKE.time(stamp_of(message) + 250_000_000)
@@ -125,7 +125,7 @@ def test_a_gyro_whose_clock_is_ahead_is_heard_by_that_of_the_images(drive: Drive
     assert true == known != unknown
 
 
-def test_orientation_goes_on_through_darkness() -> None:
+def test_a_gyro_continues_the_orientation_through_darkness() -> None:
     """A camera stands for three seconds, starts, and sees nothing for another two."""
     drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
     one = tracker(**IMU)
@@ -145,7 +145,7 @@ def test_orientation_goes_on_through_darkness() -> None:
     assert one.last is not None and one.last.status.value == 'OK'
 
 
-def test_without_a_gyro_orientation_is_not_known_after_darkness() -> None:
+def test_without_a_gyro_the_orientation_after_darkness_is_unknown() -> None:
     drive, one = Drive(), tracker()
     for i in range(8):
         one.image(drive.image(i, np.zeros_like(drive.images[i]) if i > 3 else None))
@@ -156,12 +156,12 @@ def test_without_a_gyro_orientation_is_not_known_after_darkness() -> None:
 def test_an_image_lacks_the_gyro_until_there_is_a_sample_at_its_stamp(drive: Drive) -> None:
     one = tracker(**IMU)
     samples = drive.imu()
-    assert one.lacks(drive.image(1)) == 'imu'
+    assert one.needs(drive.image(1)) == 'imu'
     for message in samples[:20]:  # up to 95 ms
         one.imu(message)
-    assert one.lacks(drive.image(1)) == 'imu'
+    assert one.needs(drive.image(1)) == 'imu'
     one.imu(samples[20])
-    assert one.lacks(drive.image(1)) == ''
+    assert one.needs(drive.image(1)) == ''
 
 
 @pytest.mark.parametrize(('what', 'name', 'text'), [
@@ -170,7 +170,7 @@ def test_an_image_lacks_the_gyro_until_there_is_a_sample_at_its_stamp(drive: Dri
     ('nan', 'gyro samples of no use', '241 of 241 samples|of .* samples: not a rate'),
     ('unmounted', 'no mounting of imu', "where 'imu' is on 'camera'"),
 ])
-def test_what_is_wrong_with_a_gyro_is_said_and_stalls_nothing(
+def test_problems_of_a_gyro_are_reported_and_block_nothing(
         drive: Drive, what: str, name: str, text: str) -> None:
     one = tracker(**{**IMU, **({'odometry.imu_rotation': ''} if what == 'unmounted' else {})})
     samples = drive.imu()
@@ -189,7 +189,7 @@ def test_what_is_wrong_with_a_gyro_is_said_and_stalls_nothing(
     assert one.diagnosis().level == 'WARN'
 
 
-def test_a_gyro_that_is_mounted_otherwise_is_said_and_not_gone_by() -> None:
+def test_a_gyro_with_a_wrong_mounting_is_reported_and_not_used() -> None:
     long = Drive(frames=45)
     one = tracker(**{**IMU, 'odometry.imu_rotation': '0 0 0 1'})
     for message in long.imu():
@@ -203,7 +203,7 @@ def test_a_gyro_that_is_mounted_otherwise_is_said_and_not_gone_by() -> None:
 
 
 @pytest.mark.parametrize('text', ['1 0 0', '1 1 1 1', 'a b c d', 'nan 0 0 1'])
-def test_a_rotation_that_is_none_is_refused(text: str) -> None:
+def test_an_invalid_rotation_is_refused(text: str) -> None:
     with pytest.raises(DjetError, match="imu_rotation is '.*'; give a quaternion"):
         from_flat({'odometry.imu_rotation': text})
 
@@ -290,7 +290,7 @@ def test_live_gives_the_poses_of_the_tracker_to_the_last_bit(
                                            if message.topic in POSES]
 
 
-def test_with_every_an_image_waits_for_as_long_as_samples_come(live: Any, drive: Drive) -> None:
+def test_with_policy_every_an_image_waits_while_samples_come(live: Any, drive: Drive) -> None:
     session, one, graph = live(**IMU, **{'ros.queue_policy': 'every'})
     for i in range(3):
         session.image(drive.image(i))
@@ -318,7 +318,7 @@ def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Driv
     assert monotonic() - start < 3
 
 
-def test_images_that_pile_up_still_have_what_came_with_them(live: Any, drive: Drive) -> None:
+def test_queued_images_still_have_their_samples(live: Any, drive: Drive) -> None:
     session, one, graph = live(**{'odometry.mask': True})
     all_free = np.full(SIZE[::-1], 255, np.uint8)
     for i in range(200):
@@ -348,11 +348,11 @@ def test_masked_pixels_give_no_feature_and_no_surface(drive: Drive) -> None:
     assert orb.view(drive.images[0], K, left_out=left_out).features.points[:, 0].min() > 150
 
 
-def test_beyond_a_mask_nothing_is_left_out() -> None:
+def test_points_outside_of_a_mask_are_not_ignored() -> None:
     points = np.array([[0.0, 0], [3, 2], [3.4, 2.4], [-0.4, -0.4], [3.6, 1], [1, 2.6], [-0.6, 1],
                        [1, -0.6]])
-    assert at(np.ones((3, 4), bool), points).tolist() == [True] * 4 + [False] * 4
-    assert not at(None, points).any()
+    assert masked_at(np.ones((3, 4), bool), points).tolist() == [True] * 4 + [False] * 4
+    assert not masked_at(None, points).any()
 
 
 def test_a_single_pixel_blocks_the_patches_around_it() -> None:
@@ -363,7 +363,7 @@ def test_a_single_pixel_blocks_the_patches_around_it() -> None:
 
 
 @pytest.mark.parametrize('kind', ['file', 'topic'])
-def test_what_is_masked_does_not_matter(drive: Drive, kind: str) -> None:
+def test_masked_pixels_have_no_influence(drive: Drive, kind: str) -> None:
     """
     The lower half sticks to the camera, as its own bonnet would, or is as it was.
 
@@ -382,9 +382,9 @@ def test_what_is_masked_does_not_matter(drive: Drive, kind: str) -> None:
         shown[120:] = stuck
         for one, pixels in ((masked, shown), (clean, gray), (bare, shown)):
             if kind == 'topic' and one is not bare:
-                assert one.lacks(drive.image(i)) == 'mask'
+                assert one.needs(drive.image(i)) == 'mask'
                 one.mask(drive.image(i, mask))
-            assert one.lacks(drive.image(i)) == ''
+            assert one.needs(drive.image(i)) == ''
             one.image(drive.image(i, pixels))
             assert one.last is not None
             if i:
@@ -420,7 +420,7 @@ def test_a_mask_is_of_one_size_also_where_the_camera_is_of_any() -> None:
     assert masks.of(4, (48, 64), camera) is not None
 
 
-def test_masks_join_what_the_lens_does_not_show() -> None:
+def test_masks_are_combined_with_unseen_pixels() -> None:
     camera = Camera(K, np.array([0.4, 0.1, 0, 0, 0]), SIZE)
     still = np.zeros(SIZE[::-1], bool)
     still[100:140, 100:200] = True
@@ -430,7 +430,7 @@ def test_masks_join_what_the_lens_does_not_show() -> None:
     assert both[0, 0] and both[120, 160] and (both >= unseen).all()
 
 
-def test_a_mask_file_is_read_and_one_that_is_none_is_named(tmp_path: Path) -> None:
+def test_a_mask_file_is_read_and_an_invalid_one_is_named(tmp_path: Path) -> None:
     assert still_mask('') is None
     gray = np.full((40, 60), 255, np.uint8)
     gray[20:] = 0
@@ -477,11 +477,11 @@ def test_another_odometry_gives_the_length_through_its_mounting(drive: Drive) ->
     T[:3, 3] = 1.2, 0.1, 0.8
     one = tracker(**{'odometry.scale': 'guess'})
     one.guess(odometry(drive, 0, T))
-    assert one.wanted_mountings('camera') == {'guess': ('base_link', 'camera')}
-    one.mount_beside('guess', T)
+    assert one.missing_mountings('camera') == {'guess': ('base_link', 'camera')}
+    one.mount_sensor('guess', T)
     for i in range(len(drive.images)):
         one.guess(odometry(drive, i, T))
-        assert one.lacks(drive.image(i)) == ''
+        assert one.needs(drive.image(i)) == ''
         one.image(drive.image(i))
         if i:
             assert one.last is not None and one.last.scale_known
@@ -490,7 +490,7 @@ def test_another_odometry_gives_the_length_through_its_mounting(drive: Drive) ->
             assert one.last.scale == pytest.approx(true, rel=0.01)
 
 
-def test_a_guess_finds_what_is_too_far_to_be_sought() -> None:
+def test_a_guess_finds_matches_beyond_the_search_radius() -> None:
     """At 0.35 rad a frame half of the image leaves the view, and the rest moves far."""
     cards = Cards()
     far = Drive(frames=3)
@@ -498,7 +498,7 @@ def test_a_guess_finds_what_is_too_far_to_be_sought() -> None:
     far.images = [cards.gray(one) for one in far.poses]
     one = tracker(**{'odometry.guess': True, 'estimator.search_radius': 0.05})
     one.guess(odometry(far, 0, np.eye(4), 'camera'))
-    one.mount_beside('guess', np.eye(4))
+    one.mount_sensor('guess', np.eye(4))
     for i in range(3):
         one.guess(odometry(far, i, np.eye(4), 'camera'))
         one.image(far.image(i))
@@ -552,7 +552,7 @@ def test_frames_that_move_are_chained_between_their_stamps() -> None:
     assert np.allclose(frames.poses('mast', 'camera', np.array([200])), c)
 
 
-def test_a_circle_of_frames_ends() -> None:
+def test_a_loop_of_frames_terminates() -> None:
     frames = MovingFrames()
     frames.add(moved(0, 'a', 'b', np.eye(4)), static=False)
     frames.add(moved(0, 'b', 'a', np.eye(4)), static=False)
@@ -570,13 +570,13 @@ def test_tf_gives_what_the_topic_gives(drive: Drive) -> None:
     by_tf = tracker(**{'odometry.scale': 'guess', 'odometry.guess_frame': 'wheels'})
     mounted = moved(START, 'base_link', 'camera', T)
     by_topic.guess(odometry(drive, 0, T))
-    by_topic.mount_beside('guess', pose_of(mounted.transforms[0])[1])
-    assert by_tf.lacks(drive.image(0)) == 'guess'
+    by_topic.mount_sensor('guess', pose_of(mounted.transforms[0])[1])
+    assert by_tf.needs(drive.image(0)) == 'guess'
     by_tf.tf_static(mounted)
     for i in range(len(drive.images)):
         by_topic.guess(odometry(drive, i, T))
         by_tf.tf(tf_of(drive, i, T))
-        assert by_tf.lacks(drive.image(i)) == ''
+        assert by_tf.needs(drive.image(i)) == ''
         for one in (by_topic, by_tf):
             one.image(drive.image(i))
         assert by_topic.last is not None and by_tf.last is not None
@@ -584,14 +584,14 @@ def test_tf_gives_what_the_topic_gives(drive: Drive) -> None:
     assert by_tf.last.measured and by_tf.last.status.value == 'OK'
 
 
-def test_a_frame_that_tf_does_not_know_is_said_with_its_names(drive: Drive) -> None:
+def test_a_frame_that_is_missing_on_tf_is_reported_by_name(drive: Drive) -> None:
     one = tracker(**{'odometry.guess': True, 'odometry.guess_frame': 'wheels'})
     for i in range(6):
         one.image(drive.image(i))
     assert "from 'wheels' (odometry.guess_frame) to 'camera'" in said(one)['no guess in time']
 
 
-def test_our_own_echo_is_refused_as_a_guess() -> None:
+def test_our_own_output_is_refused_as_a_guess() -> None:
     with pytest.raises(DjetError, match="^odometry.guess_frame is 'odom'"):
         from_flat({'odometry.guess_frame': 'odom', 'ros.publish_tf': True})
 

@@ -58,7 +58,7 @@ class LiveSession(Protocol):
         """Count images that were sent and did not arrive."""
 
 
-class Face:
+class LiveNode:
     """Base class of the live nodes: connects a session with the middleware."""
 
     # Set by the subclass, before it subscribes.
@@ -117,14 +117,14 @@ class Face:
     def why_silent(self, topic: str) -> str:
         """Return why no messages may be arriving on a topic, and what to do about it."""
         wanted = self._kinds[topic]
-        offers = self._middleware.offers(topic)
+        offers = self._middleware.publishers_of(topic)
         if kinds := {offer.kind for offer in offers} - {wanted}:
             return f'its type is {", ".join(sorted(kinds))}, not {wanted}' + (
                 _transport_remedy(kinds))
         if offers:
             return (f'{len(offers)} publisher{"s" if len(offers) > 1 else ""}, but no messages '
                     f'arrive{self._loss_remedy(topic, offers)}')
-        if _IMAGE in (wanted, *kinds) and self._middleware.offers(f'{topic}/compressed'):
+        if _IMAGE in (wanted, *kinds) and self._middleware.publishers_of(f'{topic}/compressed'):
             return (f'it has no publisher, but {topic}/compressed has; set '
                     'ros.image_transport:=compressed')
         own = {self._middleware.resolve(full_name(output)) for output in self._outputs}
@@ -230,7 +230,7 @@ class Face:
         # Requesting transient_local always would be incompatible with volatile publishers.
         if self._latched:
             return
-        for _, _, offered in self._middleware.offers(self._info_topic):
+        for _, _, offered in self._middleware.publishers_of(self._info_topic):
             if offered.latched:
                 self._latched = True
                 self._middleware.listen(self._info_topic, INFO_TYPE, self.session.camera_info,
@@ -239,7 +239,7 @@ class Face:
 
     def _report_mismatch(self, subscription: Subscription) -> None:
         topic, ours = subscription.topic, subscription.profile
-        for who, _, offered in self._middleware.offers(topic):
+        for who, _, offered in self._middleware.publishers_of(topic):
             if ours.incompatible_with(offered):
                 self.log('error', f'incompatible QoS on {topic}: {who} offers {offered}, '
                          f'{self._middleware.node} requests {ours}; no messages are received from '

@@ -11,7 +11,7 @@ from cards import Cards, K, pose, SIZE
 from djet_ros.config.flat import from_flat, with_values
 from djet_ros.config.sections import Config
 from djet_ros.live.middleware import Profile, PublisherInfo
-from djet_ros.live.odometry_face import OdometryFace
+from djet_ros.live.odometry_node import OdometryNode
 import numpy as np
 import pytest
 from ros_messages import camera_info, image, message_type
@@ -60,7 +60,7 @@ class Graph:
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
                                new_incompatible=lambda: int(topic in self.offered))
 
-    def offers(self, topic: str) -> list[Any]:
+    def publishers_of(self, topic: str) -> list[Any]:
         return ([PublisherInfo('/sender', self.kinds[topic], self.offered[topic])]
                 if topic in self.offered else [])
 
@@ -85,7 +85,7 @@ class Node:
     def __init__(self, **parameters: Any) -> None:
         self.graph = Graph()
         self.config: Config = from_flat({'estimator.max_features': 500, **parameters})
-        self.node = OdometryFace(self.graph, self.config)
+        self.node = OdometryNode(self.graph, self.config)
         self.node.session.start()
         self.graph.callbacks['/camera_info'](camera_info(K, SIZE))
         self._cards, self._sent = Cards(), 0
@@ -123,7 +123,7 @@ def node() -> Iterator[Callable[..., Node]]:
         one.node.session.stop(10)
 
 
-def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node):
+def test_tf_is_subscribed_only_while_a_mounting_is_unknown(node):
     one = node(**{'odometry.base_frame': 'base_link'})
     one.look()
     assert one.graph.hears_tf
@@ -141,11 +141,11 @@ def test_tf_is_heard_until_the_mounting_is_known_and_again_for_another_one(node)
 
 @pytest.mark.parametrize('parameters', [
     {}, {'odometry.imu': True, 'odometry.imu_rotation': '0 0 0 1'}])
-def test_tf_is_not_heard_where_nothing_is_asked_of_it(node, parameters):
+def test_tf_is_not_subscribed_without_need(node, parameters):
     assert not node(**parameters).graph.hears_tf
 
 
-def test_what_is_asked_for_on_the_way_is_heard_once_however_often_parameters_change(node):
+def test_inputs_enabled_at_run_time_are_subscribed_once(node):
     one = node(**{'odometry.imu': True})
     one.change(**{'odometry.scale': 'speed', 'odometry.mask': True, 'odometry.guess': True})
     one.change(**{'odometry.guess_frame': 'wheels'})
@@ -159,7 +159,7 @@ def test_what_is_asked_for_on_the_way_is_heard_once_however_often_parameters_cha
     ('/imu', Profile(reliable=False), 'set ros.queue_policy to latest or overrides of /imu'),
     ('/tf_static', Profile(latched=False),
      'configure the publisher to offer reliable, transient_local')])
-def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic, offered, remedy):
+def test_incompatible_qos_is_logged_with_the_remedy(node, topic, offered, remedy):
     one = node(**{'ros.queue_policy': 'every', 'odometry.imu': True, 'odometry.guess': True,
                   'odometry.guess_frame': 'wheels'})
     one.graph.offered[topic] = offered
@@ -175,7 +175,7 @@ def test_a_sender_that_does_not_fit_is_said_with_what_can_be_mended(node, topic,
     ('best_effort', False, '; large images may be lost with best-effort QoS: '
      'increase the socket buffers of the middleware'),
     ('reliable', True, '')])
-def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
+def test_missing_images_are_logged_with_the_remedy_for_fragment_loss(
         node, asked, offered, remedy):
     one = node(**{'ros.qos_reliability': asked})
     one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
@@ -188,7 +188,7 @@ def test_images_that_never_come_whole_may_be_too_large_for_best_effort(
     ('compressed', '/cam/raw/compressed', '; did you mean /cam/raw/compressed?'),
     ('compressed', '/cam/jpeg',
      '; did you mean /cam/jpeg? remap /image/compressed:=/cam/jpeg')])
-def test_a_hint_at_a_topic_can_be_followed(node, transport, elsewhere, hint):
+def test_suggested_topic_can_be_used(node, transport, elsewhere, hint):
     one = node(**{'ros.image_transport': transport})
     one.graph.elsewhere = [elsewhere]
     topic = '/image' if transport == 'raw' else '/image/compressed'

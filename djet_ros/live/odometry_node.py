@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.config.sections import Config
-from djet_ros.live.face import Face, input_profile
+from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.session import Session
 from djet_ros.live.topics import odometry_outputs, SIDE_INPUT_TYPES, SPEED_TYPES
@@ -22,7 +22,7 @@ _DEPTH, _MASKS_DEPTH = 2000, 100
 _FRAMES_DEPTH = 100
 
 
-class OdometryFace(Face):
+class OdometryNode(LiveNode):
     """
     The live odometry on a middleware.
 

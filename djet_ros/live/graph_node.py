@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.config.sections import Config, NODE_NAME
-from djet_ros.live.face import Face, input_profile
+from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs, SIDE_INPUT_TYPES
@@ -16,7 +16,7 @@ from djet_ros.recordings.mask_files import still_mask
 _DEPTH = 1000
 
 
-class GraphFace(Face):
+class PoseGraphNode(LiveNode):
     """The live pose graph on a middleware."""
 
     def __init__(self, middleware: Middleware, config: Config) -> None:

@@ -105,7 +105,7 @@ class AuxiliaryInputs:
 
     # Needs of an image
 
-    def lacks(self, stamp: int, image_frame: str) -> str:
+    def needs(self, stamp: int, image_frame: str) -> str:
         """Return the name of an input that an image still needs, or an empty string."""
         if isinstance(self.guess, FrameGuess):
             camera, axes = mounted_frame(self._config, image_frame)
@@ -120,10 +120,10 @@ class AuxiliaryInputs:
     def left_out(self, stamp: int, image_frame: str, shape: tuple[int, ...], camera: Camera
                  ) -> NDArray[np.bool_] | None:
         """Return the mask of the image that is processed now; see ``Masks.of``."""
-        self._lacking.append(self.lacks(stamp, image_frame))
+        self._lacking.append(self.needs(stamp, image_frame))
         return self._masks.of(stamp, shape, camera)
 
-    def wanted_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
+    def missing_mountings(self, image_frame: str) -> dict[str, tuple[str, str]]:
         """Return frames (parent, child) with an unknown transform, keyed by 'imu' or 'guess'."""
         camera, _ = mounted_frame(self._config, image_frame)
         wanted = {}
@@ -143,7 +143,7 @@ class AuxiliaryInputs:
         return gyro or guess
 
     def mount(self, what: str, mounting: Array) -> None:
-        """Take a transform (4, 4) of ``wanted_mountings``."""
+        """Take a transform (4, 4) of ``missing_mountings``."""
         # The images' axes in the frame that was looked up.
         _, axes = mounted_frame(self._config, '')
         if what == 'imu' and self.gyro is not None:
@@ -190,7 +190,7 @@ class AuxiliaryInputs:
             'by robot_state_publisher or by tf2_ros '
             f'static_transform_publisher --frame-id {parent} --child-frame-id {child}'
             + (', or set odometry.imu_rotation' if what == 'imu' else '')))
-            for what, (parent, child) in self.wanted_mountings(image_frame).items()
+            for what, (parent, child) in self.missing_mountings(image_frame).items()
             if len(self._lacking) >= _FEW]
 
     def _samples_refused(self) -> Complaint | None:
