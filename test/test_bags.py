@@ -311,7 +311,7 @@ def test_a_full_disk_is_reported_and_leaves_no_bag(small_kitti, tmp_path, storag
 
 
 def test_results_on_a_full_disk_stay_readable(tmp_path, small_disk):
-    with pytest.raises(DjetError, match='what was written before is readable'):
+    with pytest.raises(DjetError, match='the messages written so far are readable'):
         with ResultBag(tmp_path / 'bag') as bag:
             for stamp in range(1, 200):
                 bag.write('/image', image(stamp), stamp)
@@ -560,7 +560,7 @@ def test_an_only_camera_info_serves_an_only_camera(tmp_path):
     path = record(tmp_path / 'two', [('/a/image', image(1), 1), ('/b/image', image(1), 1),
                                      ('/a/camera_info', info(1), 1)])
     said = source_error(path, image_topic='/b/image')
-    assert 'no CameraInfo beside /b/image; if /a/camera_info is meant' in said
+    assert 'no camera_info in the namespace of /b/image; to use /a/camera_info' in said
 
 
 def test_ground_truth_is_found_by_its_name(tmp_path):
@@ -754,7 +754,7 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path):
     ("UPDATE topics SET name = x'00ff'", "table 'topics' holds the row"),
     ("UPDATE topics SET serialization_format = 'json'", "encoding 'json' is neither cdr nor"),
     ("UPDATE topics SET type = 'a/msg/B'; DROP TABLE message_definitions",
-     "type 'a/msg/B' can't be used: ValueError it is unknown"),
+     "type 'a/msg/B' can't be used: ValueError it is not in"),
     ("UPDATE messages SET timestamp = 'now' WHERE id = 7", "holds the stamp 'now'"),
     ("UPDATE messages SET data = 'text' WHERE id = 7", "with the data 'text'"),
     ("UPDATE messages SET data = x'00' WHERE id = 7", 'at 4000000000 ns: it is no sensor_msgs'),
@@ -826,7 +826,7 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
          message], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent, check=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
     honest, liar, absurd, long = run.stdout.splitlines()
-    assert f'at most {LARGEST_PIECE} are unpacked' in honest
+    assert f'at most {LARGEST_PIECE} are decompressed' in honest
     assert 'more than the 1000 bytes declared' in liar
     assert f'declares {2**63} bytes' in absurd
     assert 'a zstd message is truncated or too large' in long
@@ -857,7 +857,7 @@ def test_chunks_that_unpack_to_more_than_memory_holds_are_refused(tmp_path):
                  mcap_of(lambda record: record(5, message + bytes(MOST_HELD // 5)), 6)):
         assert len(data) < 100_000
         (tmp_path / 'bomb').write_bytes(data)
-        with pytest.raises(BrokenFile, match='so far out of order, at byte .* have to be held'):
+        with pytest.raises(BrokenFile, match='so far out of order, at byte .* chunks in memory'):
             next(open_storage(tmp_path / 'bomb').messages({1}))
 
 
@@ -923,7 +923,7 @@ def test_elements_that_take_no_bytes_are_refused():
     ('ros1', 'uint8 x', MOST_ELEMENTS + 1), ('cdr', 'uint8 x', MOST_ELEMENTS + 1),
     ('ros1', 'string x', 4 * MOST_ELEMENTS + 1), ('ros1', 'float64[3] x', 25 * MOST_ELEMENTS)])
 def test_messages_that_may_unfold_to_more_than_memory_holds_are_refused(encoding, element, size):
-    with pytest.raises(BrokenFile, match='may unfold to more than memory holds'):
+    with pytest.raises(BrokenFile, match='could exceed the memory when deserialised'):
         outer(2**20, element, size, encoding)
 
 

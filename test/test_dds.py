@@ -503,7 +503,7 @@ def test_invalid_ros_names_are_refused(rule):
 
 @pytest.mark.parametrize(('words', 'environment', 'reason'), [
     (['-r', 'image=/x'], {}, "'image=/x' is not a remapping"),
-    (['-p', 'ros.queue_size'], {}, 'is no parameter; write it as name:=value'),
+    (['-p', 'ros.queue_size'], {}, 'write it as name:=value'),
     (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
     (['-p', 'ros.queue_size:=many'], {}, 'must be of type int'),
     (['-p', 'odometry.scale:=ground_truth'], {}, 'available offline only'),

@@ -533,7 +533,7 @@ def test_a_damaged_store_is_named(road, tmp_path):
     (['road', '--methods', 'djet,orb'], "there is no method 'orb'; choose from djet, rpe, "),
     (['road', '--methods', 'djet,djet'], "method 'djet' is given twice"),
     (['road', '--presets', 'worst'], "there is no preset 'worst'; choose from best, fast, paper"),
-    (['road', '--workers', '0'], 'workers is 0; at least one is needed'),
+    (['road', '--workers', '0'], '--workers is 0; it must be at least 1'),
     (['road', '--start', '7'], '8 frames, of which --start, --end and --stride select 1'),
     (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),
     (['road', '--workers', '2', '--scheduler', 'tcp://x'], 'not allowed with argument'),
@@ -663,7 +663,7 @@ def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['--parts', 'colour'], "there is no part 'colour'; choose from window, "),
     (['--windows', '4'], 'window is 4; it must be odd'),
-    (['--windows', 'five'], "--windows is 'five'; give odd numbers such as 3,5,7"),
+    (['--windows', 'five'], "--windows is 'five'; write odd integers such as 3,5,7"),
 ])
 def test_a_wrong_ablation_is_one_line_and_exit_code_2(road, tmp_path, arguments, said):
     answer = djet('ablate', road, *arguments, '--output', tmp_path / 'results')

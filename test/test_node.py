@@ -644,7 +644,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-r', '__node:=bad-name'], "Couldn't parse remap rule: '-r __node:=bad-name'"),
     (['--log-level', 'shout'], "Couldn't parse log level: '--log-level shout'"),
     (['--no-such-flag'], '--no-such-flag'),
-    (['--', '-x'], "nobody knows what '-x' is; words for ROS, such as -r image:="),
+    (['--', '-x'], "unrecognized argument '-x'; ROS arguments, such as -r image:="),
     (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
      "/image does not accept qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
     (['-p', 'qos_overrides./image.subscription.depth:=many'],

@@ -353,7 +353,7 @@ def test_export_refuses_to_overwrite_and_warns_of_unknown_scale(
         unscaled, tmp_path):
     out = tmp_path / 'graph.g2o'
     done = djet('export', unscaled, '--output', out)
-    assert f'{FRAMES - 1} of unknown length' in done.stdout
+    assert f'{FRAMES - 1} of unknown scale' in done.stdout
     before = out.read_bytes()
     assert 'exists already' in djet('export', unscaled, '--output', out, expect=2).stderr
     assert out.read_bytes() == before

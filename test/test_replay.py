@@ -592,7 +592,7 @@ def test_unwritable_output_is_one_line_without_results(
 def test_dangling_link_or_empty_output_path_is_reported(folder, tmp_path):
     (tmp_path / 'link').symlink_to(tmp_path / 'gone')
     for place, why in ((tmp_path / 'link', f'is a link to {tmp_path}/gone, which does not exist'),
-                       ('', 'argument --output: it is empty; name a place')):
+                       ('', 'argument --output: the path is empty; name a file or folder')):
         assert why in djet('replay', folder, '--output', place, expect=2).stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ['link']
 
@@ -937,7 +937,7 @@ def with_speeds(late=0):
 def test_a_speed_topic_gives_metres(tmp_path):
     said = djet('replay', record(tmp_path / 'bag', with_speeds()), '--output', tmp_path / 'r',
                 '--scale', 'speed')
-    assert re.search(r'lengths\W+metric', said.stdout)
+    assert re.search(r'scale\W+metric', said.stdout)
     assert said.stderr == ''
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
     # Speeds are fused with the lengths from landmarks.
@@ -958,11 +958,11 @@ def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
         done = djet('replay', source, '--output', tmp_path / words[0], '--scale', *words)
         assert ('djet: warning: no metric length: odometry.scale is '
                 f'{words[0]}, and no length was measured: {why}') in done.stderr
-        assert re.search(r'lengths\W+relative, in units of the first step', done.stdout)
+        assert re.search(r'scale\W+relative, in units of the first step', done.stdout)
 
 
 def test_topics_are_for_bags(folder):
-    with pytest.raises(DjetError, match='for bags'):
+    with pytest.raises(DjetError, match='not a bag'):
         open_recording(folder, image_topic='/camera')
 
 

@@ -63,5 +63,5 @@ def test_a_missing_stamp_is_named(varos):
 def test_images_of_another_camera_are_refused(varos):
     for image in (varos / 'vehicle0' / 'cam0' / 'A').glob('*.png'):
         cv2.imwrite(str(image), np.zeros((60, 80), np.uint8))
-    with pytest.raises(DjetError, match='80x60, the known camera of VAROS is for 1280x720'):
+    with pytest.raises(DjetError, match='80x60, but the calibration of VAROS is for 1280x720'):
         open_sequence(varos)
