@@ -85,8 +85,9 @@ def test_odometry_does_not_wait_for_the_loop_search(live):
 def test_odometry_of_a_base_frame_waits_for_the_mounting_on_tf(live):
     one = live(base_frame='base_link')
     one.drive(WAYS[:3])
-    until(lambda: any("tf does not know where 'camera' is on 'base_link'; until then the "
-                      'odometry is ignored' in line for line in one.graph.lines))
+    until(lambda: any("tf has no transform from 'base_link' (odometry.base_frame) to 'camera'; "
+                      'publish it on /tf_static; until then the odometry is ignored' in line
+                      for line in one.graph.lines))
     assert not one.graph.heard('/tf')
     one.graph.frames['base_link', 'camera'] = MOUNTING
     one.drive(WAYS[3:6])

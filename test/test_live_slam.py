@@ -122,7 +122,7 @@ def test_step_of_a_base_frame_is_the_motion_of_the_camera(convention):
 def test_odometry_of_another_frame_is_refused_with_the_remedy():
     odometry, steps = Odometry('body', 'base_link', MOUNTING), StepMessages('body')
     told(steps, *odometry.start())
-    with pytest.raises(DjetError, match="is of 'base_link', and not of 'camera_body'; give both "
+    with pytest.raises(DjetError, match="odometry is 'base_link', not 'camera_body'; give both "
                        'nodes the same odometry.base_frame'):
         told(steps, *odometry.move(pose(z=1.0)))
 
@@ -416,10 +416,11 @@ def test_map_is_of_the_base_frame_once_tf_has_the_mounting(live, driven):
     drive = Drive(live, from_flat({'estimator.max_features': 800,
                                    'odometry.base_frame': 'base_link'}))
     frames = {('base_link', 'camera'): MOUNTING}
-    assert drive.slam.mount(lambda *_: None).startswith('no image has come')
+    assert drive.slam.mount(lambda *_: None).startswith('no image received yet')
     drive.slam.image(image(np.zeros((9, 9), np.uint8), stamp_ns=START - PERIOD))
     assert drive.slam.mount(lambda *_: None) == (
-        "tf does not know where 'camera' is on 'base_link'")
+        "tf has no transform from 'base_link' (odometry.base_frame) to 'camera'; publish it on "
+        '/tf_static')
     assert drive.slam.state == ('WARN', 'waiting for the mounting of the camera on tf')
     assert drive.slam.mount(lambda *names: frames.get(names)) == ''
     drive.to_and_fro()
