@@ -39,7 +39,7 @@ from djet_ros.lab.integration import estimated_trajectory, true_trajectory
 from djet_ros.lab.lens import examine
 from djet_ros.lab.methods import default_methods, make_methods, Method
 from djet_ros.lab.pairs import evaluate_chunk, has_failed, PairChunk, PairRecord
-from djet_ros.lab.provenance import digest_of_the_code
+from djet_ros.lab.provenance import code_digest
 from djet_ros.lab.provenance import versions as versions_of
 from djet_ros.lab.runner import local_workers
 from djet_ros.lab.scenes import render_sequence, SCENES
@@ -125,7 +125,7 @@ class Outcome:
 def main() -> int:
     args = arguments()
     settings = {'frames': args.frames, 'seeds': list(args.seeds), 'real_frames': args.real_frames,
-                'code': digest_of_the_code([Path(__file__)])}
+                'code': code_digest([Path(__file__)])}
     try:
         results = previous_results(args.output, settings, keep=bool(args.only))
     except DjetError as error:

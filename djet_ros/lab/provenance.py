@@ -11,7 +11,7 @@ from pathlib import Path
 import djet_ros
 
 
-def digest_of_the_code(more: Iterable[Path] = ()) -> str:
+def code_digest(more: Iterable[Path] = ()) -> str:
     """Return a digest of the package's code, and of more files."""
     digest = hashlib.sha256(_package())
     for path in more:

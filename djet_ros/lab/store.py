@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 import cv2
 from djet_ros import __version__
 from djet_ros.errors import DjetError
-from djet_ros.lab.provenance import digest_of_the_code, versions
+from djet_ros.lab.provenance import code_digest, versions
 from djet_ros.recordings.closing import Closing
 import numpy as np
 
@@ -87,7 +87,7 @@ class RecordStore(Closing, Generic[R]):
 
 
 def _with_code(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {'djet_ros': __version__, 'code': digest_of_the_code(),
+    return {'djet_ros': __version__, 'code': code_digest(),
             # OpenCV and NumPy as loaded: several distributions provide OpenCV.
             'libraries': {'opencv': cv2.__version__, 'numpy': np.__version__,
                           **versions(('scipy', 'poselib'))}, **settings}
