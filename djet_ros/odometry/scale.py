@@ -103,6 +103,11 @@ class Length:
     common: Common | None = None
 
     @property
+    def is_zero(self) -> bool:
+        """Return whether it is not distinguishable from a standstill."""
+        return self.value <= self.sigma
+
+    @property
     def own(self) -> Length:
         """Return it with the standard deviation of its own error alone."""
         if not self.metric or self.common is None:
@@ -141,6 +146,12 @@ class ScaleSource(Protocol):
 
     def why_unknown(self, stamp_ns: int) -> str:
         """Return a text on why the length up to a stamp is unknown."""
+        if self.between(stamp_ns - 1, stamp_ns).known:
+            return 'it measures a standstill while the images show motion'
+        return self.why_silent(stamp_ns)
+
+    def why_silent(self, stamp_ns: int) -> str:
+        """Return a text on why there is no measurement up to a stamp."""
         return 'nothing is measured'
 
     @abstractmethod
@@ -204,7 +215,7 @@ class SpeedScale(ScaleSource):
         self._uncertainty = uncertainty
         self.reset()
 
-    def why_unknown(self, stamp_ns: int) -> str:
+    def why_silent(self, stamp_ns: int) -> str:
         """Return how far the stamp of the newest speed is off."""
         if not self._speeds:
             return 'no speed was received'
@@ -299,7 +310,7 @@ class CameraHeightScale(ScaleSource):
         sigma = np.hypot(np.sqrt(P[0, 0]) * seconds, self._uncertainty * metres)
         return Length(metres, max(float(sigma), 1e-3), True)
 
-    def why_unknown(self, stamp_ns: int) -> str:
+    def why_silent(self, stamp_ns: int) -> str:
         """Return that no ground was seen."""
         return 'the images show no level ground at this height below the camera'
 
@@ -367,7 +378,7 @@ class GuessScale(ScaleSource):
         # To be replaced by the one that receives poses.
         self.guess = Guess()
 
-    def why_unknown(self, stamp_ns: int) -> str:
+    def why_silent(self, stamp_ns: int) -> str:
         """Return what is missing: a transform or poses."""
         return ('the camera has no transform to the frame of the guess'
                 if self.guess.mounting is None else 'no guess covers the time of the newest image')
@@ -400,7 +411,7 @@ class GroundTruthScale(ScaleSource):
         self._stamps, self._positions = stamps_ns[known], positions[known]
         self._uncertainty = uncertainty
 
-    def why_unknown(self, stamp_ns: int) -> str:
+    def why_silent(self, stamp_ns: int) -> str:
         """Return that this time is not covered."""
         return 'the ground truth does not cover the time of the newest image'
 

@@ -17,7 +17,7 @@ from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, Status, View
 from djet_ros.core.verdict import as_pure_rotation
 from djet_ros.core.window import Window, WindowStep
-from djet_ros.odometry.scale import Length, ScaleSource
+from djet_ros.odometry.scale import Length, ScaleSource, unknown
 from djet_ros.odometry.scale_filter import ScaleFilter
 import numpy as np
 from scipy.special import bdtr
@@ -119,8 +119,8 @@ class TrackScale:
     @property
     def k1_due(self) -> float | None:
         """Return the k1 that is to be removed from images from now on; None for no change."""
-        lens = self._window.lens
-        return lens.k1 if self._uses_landmarks and lens.needs_update else None
+        due = self._uses_landmarks and self._window.lens.needs_update
+        return self._window.lens.k1 if due else None
 
     def correct_images(self, newest: View) -> None:
         """Continue with images without that k1; newest: the newest frame without it."""
@@ -146,8 +146,12 @@ class TrackScale:
     def expected_length(self, span_ns: tuple[int, int]) -> Length:
         """Return the measured length, or that at the last speed, of a pair without an estimate."""
         measured = self._source.between(*span_ns)
-        if measured.known or not self._uses_landmarks or self._speed is None:
-            return measured
+        return measured if measured.known else self._at_last_speed(span_ns) or measured
+
+    def _at_last_speed(self, span_ns: tuple[int, int]) -> Length | None:
+        """Return the length of a step at the speed of the track; None if that is unknown."""
+        if not self._uses_landmarks or self._speed is None:
+            return None
         usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * self._filter.factor
         return Length(usual, usual, True, self._filter.metric, False)
 
@@ -159,14 +163,16 @@ class TrackScale:
         from a larger baseline determine its translation.
         """
         measured = self._source.between(*span_ns)
+        # Parallax contradicts a standstill: wheels slip, or their odometry is not running.
+        usable = measured.known and not (relative.t.any() and measured.is_zero)
         if not self._uses_landmarks:
             return Step(relative, self._filter.as_measured(measured))
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         guess = 1.0 if self._speed is None else self._speed * seconds
         addition = self._added(current, relative, guess)
         if addition is None:
-            return Step(relative, self._filter.as_measured(measured) if measured.known
-                        else self.expected_length(span_ns))
+            return Step(relative, self._filter.as_measured(measured) if usable
+                        else self._at_last_speed(span_ns) or unknown(measured.value))
         parallax = bool(relative.t.any())
         if not parallax:
             relative, addition = _by_window(relative, addition, guess)
@@ -175,9 +181,9 @@ class TrackScale:
             self._filter.update(measured, addition.length, sigma, seconds,
                                 self._source.correlation_length, self._source.exact)
             # Until the factor is known, a length is as sure as its measurement.
-            if self._source.exact or not self._filter.metric:
+            if usable and (self._source.exact or not self._filter.metric):
                 return self._onward(relative, self._filter.as_measured(measured), addition, True)
-        length = self._filter.scaled(addition.length, sigma, measured.known)
+        length = self._filter.scaled(addition.length, sigma, usable)
         return self._onward(relative, length, addition)
 
     def _onward(self, relative: RelativePose, length: Length, addition: WindowStep,
