@@ -582,7 +582,7 @@ def test_parameter_that_needs_a_missing_module_is_rejected(
     (done, reason), = publisher.ask('configure', node=NODE, values=values)
     assert not done
     assert reason.startswith(f'{asks}, which needs the Python module tf2_ros: '
-                             'apt install ros-$ROS_DISTRO-tf2-ros-py (')
+                             'sudo apt install ros-$ROS_DISTRO-tf2-ros-py (')
     play(publisher, drive[:3])
     subscriber.wait('a pair', paired(2))
     assert one.process.poll() is None

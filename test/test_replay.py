@@ -186,7 +186,7 @@ def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
     assert np.allclose(camera[:, :3, 3], true, atol=0.02)
     without = djet('replay', record(tmp_path / 'none', drive()), '--output', tmp_path / 'no',
                    *words, expect=2)
-    assert 'has no /tf, which odometry.guess_frame asks for' in without.stderr
+    assert 'has no topic /tf, which odometry.guess_frame requires' in without.stderr
 
 
 def test_missing_mounting_in_a_recording_is_one_line(tmp_path, folder):

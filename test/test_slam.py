@@ -681,7 +681,7 @@ def test_slam_command_accepts_results_and_a_moved_recording(
     # Whatever a killed replay of an earlier version may say of its recording.
     (moved / 'summary.json').write_text('{}')
     refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
-    assert 'say it with --source' in refused.stderr
+    assert 'name it with --source' in refused.stderr
     djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
 
 
