@@ -224,11 +224,11 @@ def test_profile_widens_where_matches_become_outliers(share, least, most):
     J = epipolar_residuals(problem, views.R, views.t).jacobian
     # The noise is a tenth of the scale of the loss: the bound is within it, or far beyond.
     claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
-    told, _ = widened_by_profile(claimed, problem, pose, loss)
+    told = widened_by_profile(claimed, problem, pose, loss)
     wider = np.linalg.eigvals(np.linalg.solve(claimed, told)).real
     assert wider.min() > least - 1e-9 and wider.max() < most
     # A sum of squares rises as its curvature predicts, for small differences of the pose.
-    squares, _ = widened_by_profile(claimed, problem, pose, Loss())
+    squares = widened_by_profile(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
 
 
@@ -242,7 +242,7 @@ def test_a_pose_off_its_minimum_is_widened_towards_either_side(way):
     variances, axes = np.linalg.eigh(claimed)
     for variance, axis in zip(variances, axes.T):
         pose = Pose(*retract(views.R, views.t, residuals.tangents, way * np.sqrt(variance) * axis))
-        told, _ = widened_by_profile(claimed, problem, pose, Loss())
+        told = widened_by_profile(claimed, problem, pose, Loss())
         assert axis @ told @ axis > 50 * variance
 
 

@@ -8,7 +8,12 @@ from itertools import pairwise
 from types import SimpleNamespace
 
 from djet_ros.core.basins import lowest_nearby_minimum
-from djet_ros.core.covariance import pose_difference, squared_distance, widened_to_span
+from djet_ros.core.covariance import (
+    lifted_covariance,
+    pose_difference,
+    squared_distance,
+    widened_to_span,
+)
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
@@ -366,7 +371,8 @@ def test_a_covariance_widened_to_span_is_the_expected_squared_error() -> None:
     R = rotation_exp(rng.normal(size=3))
     off = pose_difference(R, t, Pose(rotation_exp(rng.normal(size=3) * 0.3) @ R,
                                      -unit(t + rng.normal(size=3) * 0.3)))
-    five, six = widened_to_span(A @ A.T, t, off, 1 / 9)
+    five = widened_to_span(A @ A.T, off, 1 / 9)
+    six = lifted_covariance(five, t)
     assert squared_distance(five, off) < 9  # a third of it is one standard deviation at least
     assert np.linalg.eigvalsh(five - A @ A.T).min() > -1e-12
     assert np.linalg.norm(six[3:, 3:] @ t) < 1e-12  # t keeps its length
@@ -385,9 +391,9 @@ def test_an_improbable_distant_rival_does_not_widen_the_covariance(
     around, aside = np.cross(seen.t, (0, 0, 1)), np.radians(60)
     rival = Rival(Pose(seen.R, rotation_exp(aside * unit(around)) @ seen.t), preference)
     track = SimpleNamespace(rivals=(rival,), nearby=(), body_ambiguous=two_bodies)
-    own = np.radians(0.2)**2 * np.eye(5), np.zeros((6, 6))
-    _, (covariance, _) = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
-                                              sign_open=False)
+    own = np.radians(0.2)**2 * np.eye(5)
+    _, covariance = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
+                                         sign_open=False)
     claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
     # The squared distance times its probability; otherwise only the covariance of the pose.
     probable = norm.cdf(-preference / 2) if spanned else 0.0

@@ -19,7 +19,13 @@ from djet_ros.core.jet import (
     Solution,
 )
 from djet_ros.core.paraboloid import median, quantile
-from djet_ros.core.rivals import DECIDED, preferences, refined_rivals, Rival, unsigned_distance
+from djet_ros.core.rivals import (
+    preferences,
+    refined_rivals,
+    Rival,
+    SIGNIFICANT_PREFERENCE,
+    unsigned_distance,
+)
 from djet_ros.core.sketch import (
     costs_in_front,
     losses_at,
@@ -85,8 +91,8 @@ class BasinTuning:
     steps_nearby: int = 6
     # squared Mahalanobis distance below which two minima are the same
     same_minimum: float = CHI2_999
-    # standard deviations by which matches have to prefer the first basin to all others for an
-    # early decision: an error of one in three million
+    # preference of the first basin over all others for a decision before they have converged: an
+    # error of one in three million, if errors in different cells are independent
     clear_preference: float = 5.0
 
 
@@ -288,7 +294,7 @@ def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose |
     best = int(losses.sum(1).argmin())
     if prior is None:
         return best
-    undecided = preferences(losses, places, best) < DECIDED
+    undecided = preferences(losses, places, best) < SIGNIFICANT_PREFERENCE
     return min(np.flatnonzero(undecided).tolist(),
                key=lambda number: unsigned_distance(prior, poses[number]))
 

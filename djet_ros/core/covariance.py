@@ -126,31 +126,30 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
 
 
 def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
-                       residuals: Residuals | None = None) -> tuple[Array, Array]:
+                       residuals: Residuals | None = None) -> Array:
     """
     Widen a covariance (5, 5) where the loss rises less than its curvature at the minimum predicts.
 
-    Noise displaces a pose until the loss balances it, so the mean curvature along the way counts.
+    Noise displaces a pose until the loss balances it, so the mean curvature on its path counts.
     A redescending loss flattens where matches become outliers, and few may determine a direction.
     So the loss is evaluated where each axis of the ellipsoid meets the 95 % bound, on both sides:
     if it has risen by a share of what a parabola would have on either side, the standard deviation
     is divided by that share. (Profile likelihoods, as in Bates and Watts, Nonlinear Regression
-    Analysis, chapter 6.) residuals: those at the pose, if known. Returns the covariances (5, 5),
-    and (6, 6) over (rotation vector, t).
+    Analysis, chapter 6.) residuals: those at the pose, if known.
     """
     residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
     J, squared = residuals.jacobian, residuals.r**2
     curved = _loss_curvature((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
     variances, axes = np.linalg.eigh(covariance)
     if curved is None or variances[0] <= 0:
-        return _with_covariance_6(covariance, pose.t)
+        return covariance
     ends = (axes * np.sqrt(_CHI2_95 * variances)).T
     around = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
                                   np.concatenate([ends, -ends])))
     costs = refine_all(problem, [pose, *around], loss, 0).costs
     rises = (costs[1:] - costs[0]).reshape(2, 5).min(0)
     share = np.clip(rises / (ends @ curved * ends).sum(1), _MIN_RISE, 1.0)
-    return _with_covariance_6((axes * variances / share**2) @ axes.T, pose.t)
+    return np.asarray((axes * variances / share**2) @ axes.T)
 
 
 def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals: Residuals,
@@ -269,35 +268,32 @@ def squared_distance(covariance: Array, offset: Array) -> float:
     return float(((axes.T @ offset)**2 / np.maximum(variances, _MIN_VARIANCE)).sum())
 
 
-def widened_to_span(covariance: Array, t: Array, offset: Array, probability: float
-                    ) -> tuple[Array, Array]:
+def widened_to_span(covariance: Array, offset: Array, probability: float) -> Array:
     """
     Widen a covariance (5, 5) by a rival at an offset (5,) that is true with a probability.
 
-    Returns C + p a a^T, the expected squared error of the pose, (5, 5), and (6, 6) over (rotation
-    vector, t).
+    Returns C + p a a^T, the expected squared error of the pose.
     """
-    return _with_covariance_6(covariance + probability * np.outer(offset, offset), t)
+    return np.asarray(covariance + probability * np.outer(offset, offset))
 
 
-def widened(covariance: Array, t: Array, other: Array) -> tuple[Array, Array]:
+def widened(covariance: Array, t: Array, other: Array) -> Array:
     """
     Add to a covariance (5, 5) another one (6, 6) over (rotation vector, t), of independent errors.
 
     Such as that of the calibration; or that of a rival, which may be the true motion, and is as
-    uncertain as its own covariance says. Returns the covariances as ``widened_to_span`` does;
-    unchanged if the other is not determined.
+    uncertain as its own covariance says. Unchanged if the other is not determined.
     """
-    if np.isfinite(other).all():
-        basis = lift(sphere_tangents(t))
-        covariance = covariance + basis.T @ other @ basis
-    return _with_covariance_6(covariance, t)
-
-
-def _with_covariance_6(covariance: Array, t: Array) -> tuple[Array, Array]:
-    """Return a covariance (5, 5) and the same over (rotation vector, t), (6, 6)."""
+    if not np.isfinite(other).all():
+        return covariance
     basis = lift(sphere_tangents(t))
-    return covariance, basis @ covariance @ basis.T
+    return np.asarray(covariance + basis.T @ other @ basis)
+
+
+def lifted_covariance(covariance: Array, t: Array) -> Array:
+    """Return a covariance (5, 5) over (rotation vector, t), (6, 6) of rank 5."""
+    basis = lift(sphere_tangents(t))
+    return np.asarray(basis @ covariance @ basis.T)
 
 
 def lift(tangents: Array) -> Array:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
+from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -34,7 +35,7 @@ from djet_ros.core.surfaces import (
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.tracking import evaluate_at, Track, track_jointly
+from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import Array, Features, of_same_camera, Pose, RelativePose, Status, View
 from djet_ros.core.verdict import verdict
 import numpy as np
@@ -239,11 +240,10 @@ class TwoViewEstimator:
 
     def _track(self, pair: Pair, surface: ResidualSurface, starts: list[Pose]) -> Track | None:
         """Run Algorithm 1 from given starts, or around the predicted motion if there are none."""
-        predicted = None if starts else pair.predicted
         with _timed(pair.timings, 'jet'):
             if self.config.method == 'five_point':
                 return evaluate_at(surface, pair.current.K, pair.y, starts[0])
-            track = track_jointly(pair, surface, starts, self.config, predicted)
+            track = track_jointly(pair, surface, starts, self.config)
         if track is not None and pair.observe is not None:
             for step in track.rounds:
                 pair.observe(step)

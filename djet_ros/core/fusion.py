@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from djet_ros.core.covariance import lift
+from djet_ros.core.covariance import lifted_covariance
 from djet_ros.core.geometry import rotation_exp, rotation_log, sphere_tangents, unit
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
@@ -48,14 +48,14 @@ class MeasuredRotation:
         return float(z @ np.linalg.solve(self.covariance + _SLACK**2 * np.eye(3), z))
 
 
-def agrees(turn: MeasuredRotation, relative: RelativePose) -> bool:
+def agrees(measured: MeasuredRotation, relative: RelativePose) -> bool:
     """Return whether the rotation of a pair is consistent with the measured one."""
-    z = turn.correction(relative.R)
-    S = relative.covariance_6[:3, :3] + turn.covariance + _SLACK**2 * np.eye(3)
+    z = measured.correction(relative.R)
+    S = relative.covariance_6[:3, :3] + measured.covariance + _SLACK**2 * np.eye(3)
     return bool(np.isfinite(S).all() and z @ np.linalg.solve(S, z) < _SURPRISE)
 
 
-def fused(relative: RelativePose, turn: MeasuredRotation) -> RelativePose:
+def fused(relative: RelativePose, measured: MeasuredRotation) -> RelativePose:
     """
     Update the rotation and direction of a pair by a measured rotation.
 
@@ -63,10 +63,10 @@ def fused(relative: RelativePose, turn: MeasuredRotation) -> RelativePose:
     errors of both have to be independent.
     """
     covariance, t = relative.covariance_5, relative.t
-    gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + turn.covariance)
-    step = gain @ turn.correction(relative.R)
+    gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + measured.covariance)
+    step = gain @ measured.correction(relative.R)
     keep = np.eye(5) - gain @ np.eye(3, 5)
-    updated = keep @ covariance @ keep.T + gain @ turn.covariance @ gain.T
+    updated = keep @ covariance @ keep.T + gain @ measured.covariance @ gain.T
     R = rotation_exp(step[:3]) @ relative.R
     if not t.any():
         # The direction is not determined; the basis of its covariance stays unchanged.
@@ -76,9 +76,8 @@ def fused(relative: RelativePose, turn: MeasuredRotation) -> RelativePose:
     change = np.eye(5)
     change[3:, 3:] = sphere_tangents(turned).T @ sphere_tangents(t)
     updated = change @ updated @ change.T
-    basis = lift(sphere_tangents(turned))
     return replace(relative, R=R, t=turned, covariance_5=updated,
-                   covariance_6=basis @ updated @ basis.T)
+                   covariance_6=lifted_covariance(updated, turned))
 
 
 def _with_rotation(covariance: Array, rotation: Array) -> Array:

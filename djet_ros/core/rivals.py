@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-# Standard deviations by which matches have to prefer a pose for a decision: one error in a hundred
-# (one-sided).
-DECIDED = 2.33
+# Preference (a z-score, see `preferences`) above which matches decide between two motions: one
+# error in a hundred (one-sided), if errors in different cells are independent.
+SIGNIFICANT_PREFERENCE = 2.33
 
 # rad; chosen: bound of the change of a camera's motion from one pair to the next.
 _MAX_CHANGE = 0.1

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
+from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
 from djet_ros.core.covariance import (
     calibration_covariance,
     CHI2_999,
+    lifted_covariance,
     pose_covariance,
     pose_difference,
     squared_distance,
+    UNDETERMINED,
     widened,
     widened_by_profile,
     widened_to_span,
@@ -30,12 +34,11 @@ from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.rivals import (
     continues_motion,
-    DECIDED,
     false_alarms,
     pose_distance,
     preferences,
+    SIGNIFICANT_PREFERENCE,
 )
-from djet_ros.core.tracking import Track, TRACK_TUNING
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
 from scipy.special import ndtr
@@ -47,8 +50,13 @@ _RANDOM_BITS = 112
 # Factor by which parallax has to exceed the noise of the matches.
 _PARALLAX_OVER_NOISE = 3.0
 
-# chosen: factor on the z-score of a preference, as neighbouring cells have correlated errors too.
-_PREFERENCE_FACTOR = 0.5
+# chosen: factor by which preferences overstate the evidence, as neighbouring cells have correlated
+# errors too. The probability of a rival takes it into account, the status does not.
+_OVERSTATEMENT = 2.0
+
+# Preference (4.66) above which a rival is too improbable to widen the covariance: one in a
+# hundred.
+_NEGLIGIBLE_PREFERENCE = _OVERSTATEMENT * SIGNIFICANT_PREFERENCE
 
 # rad; limit of the distance of two motions that one covariance can span: the sphere of directions
 # is curved, and up to here chord and arc agree to a twentieth.
@@ -61,54 +69,46 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
 
     track: the result of Algorithm 1 on the matches of the pair.
     """
-    x, K, R = pair.x, pair.current.K, track.pose.R
-    inliers = track.inliers()
-    # Chirality: E = [t]_x R does not determine the sign of t; positive depths do.
-    seen, minima = (places.compress(inliers, axis=0) for places in (x, track.minima))
-    rays_x, rays_y = rays(K, seen), rays(K, minima)
-    sign, sign_open = _sign(track.pose, rays_x, rays_y, seen, pair.prior)
-    t = sign * track.pose.t
+    K, inliers = pair.current.K, track.inliers()
+    x, y = (places.compress(inliers, axis=0) for places in (pair.x, track.minima))
+    rays_x, rays_y = rays(K, x), rays(K, y)
+    sign, sign_open = _sign(track.pose, rays_x, rays_y, x, pair.prior)
+    pose = Pose(track.pose.R, sign * track.pose.t)
 
-    voting = x.compress(track.voting, axis=0)
-    covariances = pose_covariance(track.residuals, track.loss, voting, t, sign < 0)
-    if np.isfinite(covariances[0]).all():
-        covariances = widened_by_profile(covariances[0], track.problem, Pose(R, t), track.loss,
-                                         track.residuals if sign > 0 else None)
-    hamming = match_distances(pair.previous.smoothed, x, pair.current.smoothed, track.y_opt,
+    covariance = _covariance(track, pose, pair.x, flipped=sign < 0)
+    hamming = match_distances(pair.previous.smoothed, pair.x, pair.current.smoothed, track.y_opt,
                               None if pair.bits is None else (pair.y, pair.bits))
-    status = Status.OK
-    if (inliers.sum() < config.min_matches or not np.isfinite(covariances[0]).all()
+
+    status, R, t, count = Status.OK, pose.R, pose.t, int(inliers.sum())
+    if (count < config.min_matches or not np.isfinite(covariance).all()
             or _random_descriptors(hamming[inliers])):
         status, t = Status.DEGENERATE, np.zeros(3)
-    elif _false_alarm(pair, track, int(inliers.sum()), config):
+    elif _false_alarm(pair, track, count, config):
         status = Status.TOO_FEW_INLIERS
+    elif (alone := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
+        # t is not determined.
+        status, R, t = Status.NO_PARALLAX, alone.R, np.zeros(3)
+        if alone.is_biased:
+            covariance = _widened_by_rotation(covariance, pose.R, R)
     else:
-        # If a rotation alone explains the matches, t is not determined.
-        R_alone, noise = fit_rotation(rays_x, rays_y), _PARALLAX_OVER_NOISE * track.scale
-        parallax = _parallax(K, R_alone, rays_x, minima)
-        if parallax < max(config.min_parallax, noise):
-            if parallax >= noise:
-                # The parallax above the noise is real, and the pure rotation is biased to
-                # compensate for it.
-                covariances = _widened_by_rotation(covariances[0], Pose(R, t), R_alone)
-            status, R, t = Status.NO_PARALLAX, R_alone, np.zeros(3)
-        else:
-            status, covariances = _compare_with_rivals(Pose(R, t), covariances, track, voting,
-                                                       pair.prior, sign_open)
-    if config.calibration_sigma and np.isfinite(covariances[0]).all():
-        covariances = widened(covariances[0], sign * track.pose.t, calibration_covariance(
+        status, covariance = _compare_with_rivals(pose, covariance, track, pair.x, pair.prior,
+                                                  sign_open)
+    determined = bool(np.isfinite(covariance).all())
+    if config.calibration_sigma and determined:
+        covariance = widened(covariance, pose.t, calibration_covariance(
             track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma))
-    lines = epipolar_lines(fundamental(K, R, track.pose.t), x)
+    covariance_6 = lifted_covariance(covariance, pose.t) if determined else UNDETERMINED[1]
+
+    lines = epipolar_lines(fundamental(K, R, track.pose.t), pair.x)
+    opposite = [Pose(R, -t)] if sign_open and t.any() else []
     return RelativePose(
-        status, R, t, *covariances, x=x, y=pair.y, placed=track.placed.places,
+        status, R, t, covariance, covariance_6, x=pair.x, y=pair.y, placed=track.placed.places,
         placed_covariances=track.placed.covariances,
         y_opt=track.y_opt, inliers=inliers, voting=track.voting,
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
-        sought=pair.sought,
-        rivals=(*(rival.pose for rival in track.rivals),
-                *([Pose(R, -t)] if sign_open and t.any() else [])))
+        sought=pair.sought, rivals=(*(rival.pose for rival in track.rivals), *opposite))
 
 
 def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
@@ -119,34 +119,34 @@ def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
     """
     agree = relative.inliers
     R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
-    covariances = _widened_by_rotation(relative.covariance_5, Pose(relative.R, relative.t), R)
+    covariance = _widened_by_rotation(relative.covariance_5, relative.R, R)
     return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
-                   covariance_5=covariances[0], covariance_6=covariances[1])
+                   covariance_5=covariance,
+                   covariance_6=lifted_covariance(covariance, relative.t))
 
 
-def _widened_by_rotation(covariance: Array, pose: Pose, R: Array) -> tuple[Array, Array]:
-    """Widen the covariance (5, 5) of a pose by its difference from a pure rotation R (3, 3)."""
-    offset = np.append(rotation_log(R @ pose.R.T), [0.0, 0.0])
-    return widened_to_span(covariance, pose.t, offset, 1.0)
+def _widened_by_rotation(covariance: Array, R: Array, rotation: Array) -> Array:
+    """Widen a covariance (5, 5) by the difference of a rotation R from a pure rotation (3, 3)."""
+    return widened_to_span(covariance, np.append(rotation_log(rotation @ R.T), [0.0, 0.0]), 1.0)
 
 
-def _sign(pose: Pose, rays_x: Array, rays_y: Array, places: Array,
+def _sign(pose: Pose, rays_x: Array, rays_y: Array, x: Array,
           prior: Pose | None) -> tuple[float, bool]:
     """
     Return the sign of t, and whether the opposite sign remains possible.
 
-    rays_x, rays_y: (N, 3) of the inliers; places: (N, 2) their pixels in the previous image. False
+    rays_x, rays_y: (N, 3) of the inliers; x: (N, 2) their pixels in the previous image. False
     matches along epipolar lines, as on edges in the direction of motion, are as often behind the
     cameras as in front. If the depth signs do not decide by the test of ``preferences``, the
     previous motion does.
     """
     votes = chirality_signs(pose.R, pose.t, rays_x, rays_y)
     sign = 1.0 if votes.sum() >= 0 else -1.0
-    if preferences(np.stack([-votes, votes]) * sign, places, 0)[1] >= DECIDED:
+    if preferences(np.stack([-votes, votes]) * sign, x, 0)[1] >= SIGNIFICANT_PREFERENCE:
         return sign, False
-    poses = {one: Pose(pose.R, one * pose.t) for one in (sign, -sign)}
+    poses = {each: Pose(pose.R, each * pose.t) for each in (sign, -sign)}
     if prior is not None:
-        sign = min(poses, key=lambda one: pose_distance(prior, poses[one]))
+        sign = min(poses, key=lambda each: pose_distance(prior, poses[each]))
     return sign, prior is None or not continues_motion(prior, poses[sign], poses[-sign])
 
 
@@ -159,53 +159,68 @@ def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfi
     count as tested too.
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
-    chance = 4 * TRACK_TUNING.inlier * track.scale / (np.pi * radius)
+    chance = 4 * ALGORITHM_TUNING.inlier * track.scale / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting) + pair.outliers, chance) > 0
 
 
-def _compare_with_rivals(pose: Pose, covariances: tuple[Array, Array], track: Track,
-                         places: Array, prior: Pose | None, sign_open: bool
-                         ) -> tuple[Status, tuple[Array, Array]]:
+def _covariance(track: Track, pose: Pose, x: Array, flipped: bool) -> Array:
     """
-    Compare a pose with its rivals: return its status, and its covariances widened to span them.
+    Return the covariance (5, 5) of a pose, NaN if the matches do not determine it.
 
-    places: (M, 2) pixels of the voting matches in the previous image; sign_open: whether -t
-    remains possible, which is a rival too. Rivals within the covariance are covered already. Any
-    other is the true motion with the probability that the preference is due to noise. Below one in
-    a hundred (the level of ``DECIDED``) it is ignored, unless two bodies move: with a motion 60
-    degrees away, a probability of six in a thousand turns a standard deviation of a fifth of a
-    degree into one of five degrees.
+    x: (N, 2) pixels of the matches in the previous image; flipped: whether the pose has the
+    opposite t to that of the track.
+    """
+    voting = x.compress(track.voting, axis=0)
+    covariance, _ = pose_covariance(track.residuals, track.loss, voting, pose.t, flipped)
+    if not np.isfinite(covariance).all():
+        return covariance
+    return widened_by_profile(covariance, track.problem, pose, track.loss,
+                              None if flipped else track.residuals)
+
+
+def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
+                         prior: Pose | None, sign_open: bool) -> tuple[Status, Array]:
+    """
+    Compare a pose with its rivals: return its status, and its covariance (5, 5) that spans them.
+
+    x: (N, 2) pixels of the matches in the previous image; sign_open: whether -t remains possible,
+    which is a rival too. Rivals within the covariance are covered already. Any other is the true
+    motion with the probability that the preference is due to noise. If that is negligible, the
+    rival is ignored, unless two bodies move: with a motion 60 degrees away, a probability of six
+    in a thousand turns a standard deviation of a fifth of a degree into one of five degrees.
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
-    undecided_rivals: list[Array] = []
+    undecided_covariances: list[Array] = []
     for rival in (*track.rivals, *track.nearby):
-        off = pose_difference(pose.R, pose.t, rival.pose)
-        if squared_distance(covariances[0], off) < CHI2_999:
+        offset = pose_difference(pose.R, pose.t, rival.pose)
+        if squared_distance(covariance, offset) < CHI2_999:
             continue
-        undecided = rival.preference < DECIDED and not _prior_decides(prior, pose, rival.pose)
-        if undecided and np.linalg.norm(off) > _MAX_SPANNED and not track.body_ambiguous:
+        undecided = (rival.preference < SIGNIFICANT_PREFERENCE
+                     and not _prior_decides(prior, pose, rival.pose))
+        if undecided and np.linalg.norm(offset) > _MAX_SPANNED and not track.body_ambiguous:
             status = Status.AMBIGUOUS
-        probability = float(ndtr(-_PREFERENCE_FACTOR * rival.preference))
-        if track.body_ambiguous or probability > ndtr(-DECIDED):
-            covariances = widened_to_span(covariances[0], pose.t, off, probability)
+        if track.body_ambiguous or rival.preference < _NEGLIGIBLE_PREFERENCE:
+            probability = float(ndtr(-rival.preference / _OVERSTATEMENT))
+            covariance = widened_to_span(covariance, offset, probability)
         if undecided:
-            undecided_rivals.append(_covariance_of(rival.pose, track, places))
+            undecided_covariances.append(_covariance_of(rival.pose, track, x))
     # Only after all rivals were compared: the uncertainty of one rival must not make another one
     # look covered.
-    for own in undecided_rivals:
-        covariances = widened(covariances[0], pose.t, own)
+    for other in undecided_covariances:
+        covariance = widened(covariance, pose.t, other)
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
         # -t is at chord 2, in no particular tangent direction.
-        for off in np.sqrt(2) * np.eye(5)[3:]:
-            covariances = widened_to_span(covariances[0], pose.t, off, 0.5)
-    return status, covariances
+        for offset in np.sqrt(2) * np.eye(5)[3:]:
+            covariance = widened_to_span(covariance, offset, 0.5)
+    return status, covariance
 
 
-def _covariance_of(pose: Pose, track: Track, places: Array) -> Array:
-    """Covariance (6, 6) of a rival, from the residuals at the rival on the same surfaces."""
+def _covariance_of(pose: Pose, track: Track, x: Array) -> Array:
+    """Return the covariance (6, 6) of a rival, from its residuals on the track's surfaces."""
     residuals = epipolar_residuals(track.problem, pose.R, pose.t)
-    return pose_covariance(residuals, track.loss, places, pose.t, flipped=False)[1]
+    return pose_covariance(residuals, track.loss, x.compress(track.voting, axis=0), pose.t,
+                           flipped=False)[1]
 
 
 def _prior_decides(prior: Pose | None, pose: Pose, rival: Pose) -> bool:
@@ -220,7 +235,24 @@ def _random_descriptors(hamming: Array) -> bool:
     return bool(known.size and median(known) > _RANDOM_BITS)
 
 
-def _parallax(K: Array, R: Array, rays_x: Array, y: Array) -> float:
-    """Upper quartile of the distances in pixels of y from the places of x under rotation alone."""
+class _PureRotation(NamedTuple):
+    """A rotation (3, 3), and whether a translation biases it by more than the noise."""
+
+    R: Array
+    is_biased: bool
+
+
+def _rotation_alone(K: Array, rays_x: Array, rays_y: Array, y: Array, noise: float,
+                    config: EstimatorConfig) -> _PureRotation | None:
+    """
+    Return the rotation that alone explains the inliers; None if their parallax is too large.
+
+    rays_x, rays_y: (N, 3); y: (N, 2) pixels of the latter; noise: standard deviation in pixels.
+    Parallax above the noise is real, and the rotation is biased to compensate for it.
+    """
+    R, noise = fit_rotation(rays_x, rays_y), _PARALLAX_OVER_NOISE * noise
     rotated = rays_x @ (K @ R).T
-    return quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
+    # The upper quartile.
+    parallax = quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
+    explained = parallax < max(config.min_parallax, noise)
+    return _PureRotation(R, parallax >= noise) if explained else None
