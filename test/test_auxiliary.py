@@ -168,7 +168,7 @@ def test_an_image_lacks_the_gyro_until_there_is_a_sample_at_its_stamp(drive: Dri
     ('none', 'no imu in time', "requires 'imu', and no sample was received; publish it"),
     ('late', 'no imu in time', 'images were processed without it'),
     ('nan', 'gyro samples of no use', '241 of 241 samples|of .* samples: not a rate'),
-    ('unmounted', 'no mounting of imu', "where 'imu' is on 'camera'"),
+    ('unmounted', 'no mounting of imu', "no transform from 'camera' to 'imu'"),
 ])
 def test_problems_of_a_gyro_are_reported_and_block_nothing(
         drive: Drive, what: str, name: str, text: str) -> None:

@@ -716,7 +716,7 @@ def test_odometry_is_of_the_base_frame_and_the_camera_keeps_its_tf_parent(
     listener.ask('published', topic='/tf')
     play(publisher, drive[:3])
     subscriber.wait('pairs', paired(2))
-    wait_for_log(one, "tf does not know where 'camera' is on 'base_link'")
+    wait_for_log(one, "tf has no transform from 'base_link' to 'camera'")
     assert not subscriber.heard[f'{NODE}/odometry']
     publisher.advertise('/tf_static', TF_TYPE, durability='transient_local', depth=1)
     publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', AHEAD))

@@ -34,7 +34,7 @@ from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.pair_errors import pair_errors, statistics
-from djet_ros.replay.replay import with_next_image
+from djet_ros.replay.lookahead import with_next_image
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE

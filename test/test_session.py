@@ -225,7 +225,7 @@ def test_endless_publisher_is_limited_in_memory_and_reported(live, drive, policy
         sent - MAX_QUEUE_BYTES / len(message.data), abs=3)
     one.session.pause()
     assert 'images dropped under load' in one.graph.heard('/diagnostics')[-1].status[0].message
-    assert 'lower their rate (that of a player, too)' in one.graph.said()[
+    assert 'lower the rate (that of a bag player, too)' in one.graph.said()[
         'to mend: images dropped under load']
     assert any('MB of images are queued' in line for line in one.graph.lines)
     assert 'to mend: images pile up' not in one.graph.said()

@@ -12,7 +12,7 @@ from djet_ros.core.masks import masked_at
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.debug_image import debug_image
-from djet_ros.odometry.diagnostics import Counts, diagnose, LEVELS, StampRate, State
+from djet_ros.odometry.diagnostics import Counts, diagnose, StampRate
 from djet_ros.odometry.messages import (
     frame_status,
     FrameStatus,
@@ -22,6 +22,7 @@ from djet_ros.odometry.messages import (
     stamp_ns,
 )
 from djet_ros.odometry.scale import Scale
+from djet_ros.odometry.state import LEVELS, State
 from djet_ros.odometry.tracker import Tracker
 from hypothesis import given, settings, strategies as st
 import numpy as np

@@ -13,7 +13,7 @@ from time import monotonic, time_ns
 from typing import Any, NamedTuple
 
 from djet_ros.live.frame_queue import FrameQueue
-from djet_ros.live.session import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
+from djet_ros.live.reporting import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.live_slam import LiveSlam
 import numpy as np

@@ -6,35 +6,26 @@ It is independent of the middleware, which live nodes add.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from threading import Event, Lock, Thread
+from threading import Lock, Thread
 from time import monotonic, time_ns
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
-from djet_ros.core.types import Array
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.rate_limit import RateLimit
-from djet_ros.odometry.diagnostics import LEVELS, State
-from djet_ros.odometry.health import Complaint
+from djet_ros.live.reporting import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
+from djet_ros.live.side_inputs import SideInputs
+from djet_ros.odometry.health import Complaint, REDUCE_LOAD
 from djet_ros.odometry.messages import frame_of, stamp_ns
+from djet_ros.odometry.state import LEVELS, State
 from djet_ros.odometry.tracker import Outgoing, Tracker
 import numpy as np
 
-# Seconds without an image after which the camera is reported as silent.
-SILENCE_TIMEOUT = 2.0
-
-# Seconds before the same warning is logged again.
-_LOG_PERIOD = 5.0
-
 # Seconds after which diagnostics are published even if no image triggers them.
 _DIAGNOSTICS_PERIOD = 1.0
-
-# Queued messages of side inputs (IMU, guess, mask, speed, tf): minutes of a fast IMU.
-_MAX_SIDE_INPUTS = 100_000
 
 # Limit in bytes for the queued images, and for the queued side inputs: a thousand small images are
 # a short delay, and a thousand large ones more memory than a robot has.
@@ -52,29 +43,8 @@ _MAX_SIDE_INPUT_TIMEOUT = 2.0
 # Seconds for which an image after a gap waits for the next one, which shows a wrong stamp.
 _NEXT_IMAGE_TIMEOUT = 1.0
 
-_LATENCIES = 100
-
 # States that a user requested, or that are logged with topic names by ``_log_missing_inputs``.
 _LOGGED_ELSEWHERE = (State.PAUSED, State.WAITING_FOR_IMAGE, State.WAITING_FOR_CAMERA_INFO)
-
-
-class Wiring(Protocol):
-    """What a session needs from its node; all but ``publish`` is called from any thread."""
-
-    def publish(self, outgoing: Sequence[Outgoing]) -> None:
-        """Send messages, from the session's thread or from the one that calls it."""
-
-    def log(self, level: str, text: str) -> None:
-        """Log a line; level is 'info' or 'warning'."""
-
-    def why_silent(self, topic: str) -> str:
-        """Return why no messages may be arriving on a topic."""
-
-    def wants(self, topic: str) -> bool:
-        """Return whether an output that is made on demand has subscribers."""
-
-    def transform(self, parent: str, child: str) -> Array | None:
-        """Return the pose (4, 4) of frame child in parent, or None if tf does not have it yet."""
 
 
 class _Received(NamedTuple):
@@ -83,59 +53,6 @@ class _Received(NamedTuple):
     image: Any
     info: Any
     at: float
-
-
-class _SideInput(NamedTuple):
-    """A message other than an image, the tracker's method for it, and its time of arrival."""
-
-    what: str
-    message: Any
-    at: float
-
-
-class Throttle:
-    """A throttled log; for one thread at a time."""
-
-    def __init__(self, wiring: Wiring) -> None:
-        self._wiring = wiring
-        self._logged: dict[str, float] = {}
-
-    def warn(self, key: str, text: str) -> None:
-        """Log a warning, unless one with the same key was logged within _LOG_PERIOD."""
-        now = monotonic()
-        if now - self._logged.get(key, -np.inf) >= _LOG_PERIOD:
-            self._logged[key] = now
-            self._wiring.log('warning', text)
-
-    def warn_missing(self, what: str, topic: str) -> None:
-        """Warn that no messages arrive on a topic."""
-        self.warn(what, f'waiting for {what} on {topic}: {self._wiring.why_silent(topic)}')
-
-    def clear(self) -> None:
-        """Forget all earlier warnings."""
-        self._logged.clear()
-
-
-class Latencies:
-    """Latencies of the newest messages, from receipt to publication."""
-
-    def __init__(self) -> None:
-        self._seconds: deque[float] = deque(maxlen=_LATENCIES)
-
-    def add(self, since: float) -> None:
-        """Add the latency of a message received at a time (monotonic seconds) and done now."""
-        self._seconds.append(monotonic() - since)
-
-    def clear(self) -> None:
-        """Remove all latencies."""
-        self._seconds.clear()
-
-    def values(self) -> dict[str, str]:
-        """Return the values for the diagnostics; empty if there are none yet."""
-        if not self._seconds:
-            return {}
-        median, high = np.percentile(self._seconds, (50, 95)) * 1e3
-        return {'latency, median (ms)': f'{median:.1f}', 'latency, 95 % (ms)': f'{high:.1f}'}
 
 
 class Session:
@@ -161,10 +78,7 @@ class Session:
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        self._side_inputs: FrameQueue[_SideInput] = FrameQueue(
-            'latest', _MAX_SIDE_INPUTS, MAX_QUEUE_BYTES)
-        self._side_input_arrived = Event()
-        self._last_side_input = -np.inf
+        self._side_inputs = SideInputs(MAX_QUEUE_BYTES)
         self._counted_drops = self._lost = self._counted_lost = self._skipped = 0
         self._drops_logged = False
         self._latencies = Latencies()
@@ -186,7 +100,7 @@ class Session:
         If its messages are being published already, all of them are.
         """
         self._stopping = True
-        self._side_input_arrived.set()
+        self._side_inputs.wake()
         self._queue.close()
         self._queue.clear()
         if self._worker.is_alive():
@@ -246,9 +160,7 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._last_side_input = monotonic()
-        self._side_inputs.put(_SideInput(what, message, self._last_side_input), _bytes(message))
-        self._side_input_arrived.set()
+        self._side_inputs.put(what, message, _bytes(message))
 
     def count_lost(self, number: int) -> None:
         """Count images that were sent and did not arrive."""
@@ -334,7 +246,7 @@ class Session:
         try:
             silent = monotonic() - self._last_image > SILENCE_TIMEOUT
             if not len(self._queue):
-                self._feed_side_inputs(np.inf)
+                self._side_inputs.feed(self._tracker, np.inf)
             if silent:
                 # No image is queued that arrived before this CameraInfo.
                 self._take_info(self._newest_info)
@@ -373,7 +285,7 @@ class Session:
         self._count_drops()
         self._update_node_diagnostics()
         self._take_info(received.info)
-        self._feed_side_inputs(self._side_input_cutoff(received))
+        self._side_inputs.feed(tracker, self._side_input_cutoff(received))
         frame = frame_of(received.image.header)
         if not tracker.mounted:
             self._mount(frame)
@@ -392,21 +304,22 @@ class Session:
 
     def _wait_for_side_inputs(self, received: _Received) -> None:
         """Wait briefly for the side inputs of an image that have not arrived yet."""
+        inputs = self._side_inputs
         # With 'every' on a slow machine, side inputs arrive late, but keep arriving.
         patient = self._tracker.config.ros.queue_policy == 'every'
         latest = monotonic() + _MAX_SIDE_INPUT_TIMEOUT
         while not self._stopping and received.at > self._forgotten:
-            self._side_input_arrived.clear()
+            inputs.expect()
             with self._lock:
-                self._feed_side_inputs(self._side_input_cutoff(received))
-                while (lacking := self._tracker.needs(received.image)) and \
-                        self._feed_next_side_input(received.at + _MAX_SIDE_INPUT_TIMEOUT):
+                inputs.feed(self._tracker, self._side_input_cutoff(received))
+                while (lacking := self._tracker.needs(received.image)) and inputs.feed_next(
+                        self._tracker, received.at + _MAX_SIDE_INPUT_TIMEOUT):
                     pass
-            since = max(received.at, self._last_side_input) if patient else received.at
+            since = max(received.at, inputs.newest) if patient else received.at
             left = min(since + _SIDE_INPUT_TIMEOUT, latest) - monotonic()
             if not lacking or left <= 0:
                 return
-            self._side_input_arrived.wait(left)
+            inputs.wait(left)
 
     def _wait_for_next_if_ahead(self, received: _Received) -> None:
         with self._lock:
@@ -417,20 +330,6 @@ class Session:
     def _side_input_cutoff(self, received: _Received) -> float:
         """Return the arrival time up to which side inputs are used: later ones are for others."""
         return received.at if len(self._queue) else np.inf
-
-    def _feed_side_inputs(self, until: float) -> None:
-        """Pass the side inputs that arrived until a time to the tracker, which keeps a few."""
-        while self._feed_next_side_input(until):
-            pass
-
-    def _feed_next_side_input(self, until: float) -> bool:
-        waiting = self._side_inputs.peek()
-        if waiting is None or waiting.at > until:
-            return False
-        if (one := self._side_inputs.get(timeout=0)) is None:
-            return False
-        getattr(self._tracker, one.what)(one.message)
-        return True
 
     def _mount_side_inputs(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.missing_mountings(image_frame).items():
@@ -455,8 +354,7 @@ class Session:
                 self._drops_logged = True
                 self._wiring.log('warning', f'{counts.dropped["queue_full"]} of {counts.received} '
                                  'images dropped: they arrive faster than they are processed; '
-                                 'lower the rate, the image size or estimator.max_features; '
-                                 'further drops are counted in the diagnostics')
+                                 f'{REDUCE_LOAD}; further drops are counted in the diagnostics')
 
     def _take_info(self, info: Any) -> None:
         if info is not self._taken_info:
@@ -472,8 +370,7 @@ class Session:
             'images pile up', 'WARN', (
                 f'{waiting * 1e-6:.0f} MB of images are queued; from '
                 f'{MAX_QUEUE_BYTES * 1e-6:.0f} MB on images are dropped, unless their publisher '
-                'can wait; lower the rate (that of a bag player, too), the image size or '
-                'estimator.max_features'))]
+                f'can wait; {REDUCE_LOAD}'))]
 
     def _node_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),

@@ -10,7 +10,7 @@ from djet_ros.core.types import Array
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.frame_guess import FrameGuess
 from djet_ros.odometry.guess import Guess
-from djet_ros.odometry.health import Complaint
+from djet_ros.odometry.health import Complaint, no_transform, publish_transform
 from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import frame_of, mounted_frame, pose_of, stamp_ns
@@ -186,9 +186,8 @@ class AuxiliaryInputs:
 
     def _mountings(self, image_frame: str) -> list[Complaint]:
         return [Complaint(f'no mounting of {what}', 'WARN', (
-            f"tf does not know where '{child}' is on '{parent}', which '{what}' needs; publish it "
-            'by robot_state_publisher or by tf2_ros '
-            f'static_transform_publisher --frame-id {parent} --child-frame-id {child}'
+            f"{no_transform(parent, child)}, which '{what}' needs; "
+            + publish_transform(parent, child)
             + (', or set odometry.imu_rotation' if what == 'imu' else '')))
             for what, (parent, child) in self.missing_mountings(image_frame).items()
             if len(self._lacking) >= _FEW]

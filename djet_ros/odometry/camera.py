@@ -152,13 +152,13 @@ class Camera:
         """
         model, D = self.distortion
         points = np.column_stack([places, np.ones(len(places))])[:, None]
-        project, by_way = ((cv2.fisheye.projectPoints, 11) if model == 'equidistant'
+        project, first = ((cv2.fisheye.projectPoints, 11) if model == 'equidistant'
                            else (cv2.projectPoints, 3))
         pixels, slopes = project(points, np.zeros(3), np.zeros(3), self.raw_K,
                                  np.append(k1, D[1:]))
         # At a depth of one the Jacobian by the camera's translation is that by the point.
         return (np.asarray(pixels, float).reshape(-1, 2),
-                np.asarray(slopes[:, by_way:by_way + 2], float).reshape(-1, 2, 2))
+                np.asarray(slopes[:, first:first + 2], float).reshape(-1, 2, 2))
 
     def _undistortion(self, shape: tuple[int, ...]) -> _Undistortion:
         """Return the undistortion of images (H, W); cached, as sizes rarely change."""

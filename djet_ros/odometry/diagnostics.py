@@ -5,35 +5,12 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum, unique
 
 from djet_ros.core.types import RelativePose
 from djet_ros.odometry.health import Complaint
 from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.state import LEVELS, State
 import numpy as np
-
-
-@unique
-class State(StrEnum):
-    """State of the odometry."""
-
-    WAITING_FOR_CAMERA_INFO = 'waiting for camera_info'
-    WAITING_FOR_IMAGE = 'waiting for an image'
-    STARTED = 'started'
-    RESTARTED = 'restarted'
-    TRACKING = 'tracking'
-    STATIONARY = 'standing still'
-    BAD_PAIR = 'bad pair'
-    LOST = 'lost'
-    REJECTING = 'message rejected'
-    PAUSED = 'paused'
-
-
-LEVELS = {
-    State.WAITING_FOR_CAMERA_INFO: 'WARN', State.WAITING_FOR_IMAGE: 'WARN', State.STARTED: 'OK',
-    State.RESTARTED: 'WARN', State.TRACKING: 'OK', State.STATIONARY: 'OK', State.BAD_PAIR: 'WARN',
-    State.LOST: 'ERROR', State.REJECTING: 'ERROR', State.PAUSED: 'WARN',
-}
 
 
 _RANKING = ('OK', 'WARN', 'ERROR')

@@ -35,6 +35,10 @@ _REMEDIES_RECORDED = {
     'speed': 'give speeds that are stamped by the clock of the images, or choose another '
              'odometry.scale'}
 
+# Remedy for more images than can be processed.
+REDUCE_LOAD = ('lower the rate (that of a bag player, too), the image size or '
+               'estimator.max_features')
+
 
 class Complaint(NamedTuple):
     """A problem: its short name, its level WARN or ERROR, and a text with the remedy."""
@@ -70,12 +74,12 @@ class Health:
         """Count images dropped for a reason; image_frame: the frame_id of one of them."""
         self._fates.extend([reason] * min(number, _WINDOW))
         if image_frame is not None:
-            self._saw(image_frame)
+            self._note_frame(image_frame)
         self._equal = self._equal + number if reason == 'equal_stamp' else self._equal
         if self._equal > self._most_equal and self._last is not None:
             self._most_equal, self._stood_ns = self._equal, self._last.stamp_ns
 
-    def _saw(self, image_frame: str) -> None:
+    def _note_frame(self, image_frame: str) -> None:
         self._changes.append(self._image_frame not in (None, image_frame))
         self._image_frame = image_frame
 
@@ -87,7 +91,7 @@ class Health:
     def processed(self, result: OdometryResult) -> None:
         """Take the result of an image."""
         self._fates.append('')
-        self._saw(result.frame_id)
+        self._note_frame(result.frame_id)
         self._equal, self._last = 0, result
         self._translated = self._translated or result.status is Status.OK
         measured = result.scale_kind is Scale.METRIC and result.measured
@@ -132,7 +136,7 @@ class Health:
             return Complaint('no frame_id', 'WARN', (
                 'the images have no frame_id, so the poses have no child frame and none goes to '
                 'tf; set it in the camera driver, or odometry.camera_frame here'))
-        if _like_odom(self._config, self._last.frame_id):
+        if _named_as_odom(self._config, self._last.frame_id):
             return Complaint('frame_id is odom_frame', 'ERROR', (
                 f"the camera's frame is called '{odom}' like odometry.odom_frame, and no pose "
                 'goes to tf; set odometry.camera_frame or odometry.odom_frame'))
@@ -144,9 +148,8 @@ class Health:
         base, (camera, _) = self._config.base_frame, mounted_frame(
             self._config, self._last.frame_id)
         return Complaint('no mounting on tf', 'WARN', (
-            f"tf does not know where '{camera}' is on '{base}', which the odometry needs; publish "
-            'it by robot_state_publisher or by tf2_ros static_transform_publisher '
-            f'--frame-id {base} --child-frame-id {camera}'))
+            f'{no_transform(base, camera)}, which the odometry needs; '
+            f'{publish_transform(base, camera)}'))
 
     @property
     def _asks_for_metres(self) -> bool:
@@ -179,9 +182,8 @@ class Health:
         if (share := self._share('queue_full')) < _SHARE:
             return None
         return Complaint('images dropped under load', 'WARN', (
-            f'{share:.0%} of the newest {len(self._fates)} images were dropped: they come faster '
-            'than they are processed; lower their rate (that of a player, too), their size or '
-            'estimator.max_features'))
+            f'{share:.0%} of the newest {len(self._fates)} images were dropped: they arrive '
+            f'faster than they are processed; {REDUCE_LOAD}'))
 
     def _way(self) -> Complaint | None:
         if (share := self._share('lost')) < _SHARE:
@@ -206,6 +208,17 @@ class Health:
             f'{changes} of the newest {images} images had another frame_id than the one before '
             f"them, the newest of all '{self._image_frame}'; two cameras publish on one topic, "
             'and the poses mix both'))
+
+
+def no_transform(parent: str, child: str) -> str:
+    """Return a text on a transform that is missing on tf."""
+    return f"tf has no transform from '{parent}' to '{child}'"
+
+
+def publish_transform(parent: str, child: str) -> str:
+    """Return the remedy for a static transform that is missing on tf."""
+    return ('publish it by robot_state_publisher or by tf2_ros static_transform_publisher '
+            f'--frame-id {parent} --child-frame-id {child}')
 
 
 def frame_mismatch(info_frame: str, image_frame: str) -> Complaint | None:
@@ -241,10 +254,10 @@ def has_frame(config: OdometryConfig, image_frame: str) -> bool:
     """Return whether the frame of the poses has a name that can be published on tf."""
     if config.base_frame:
         return config.base_frame != config.odom_frame
-    return bool(config.camera_frame or image_frame) and not _like_odom(config, image_frame)
+    return bool(config.camera_frame or image_frame) and not _named_as_odom(config, image_frame)
 
 
-def _like_odom(config: OdometryConfig, image_frame: str) -> bool:
+def _named_as_odom(config: OdometryConfig, image_frame: str) -> bool:
     """Return whether the frame of the images or of the poses is named as the odom frame."""
     return config.odom_frame in (config.camera_frame or image_frame,
                                  camera_frame(config, image_frame))

@@ -1,4 +1,4 @@
-"""Stamps that go back: of a late image, or because time restarted."""
+"""Order of images by their stamps: late ones, wrong stamps, and time that restarts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ LATE_IN_A_ROW = 10
 
 class Order:
     """
-    The newest stamps of one camera, to classify an older one.
+    The newest stamps of one camera, by which the next image is judged.
 
     max_backwards: seconds by which a late stamp may be older than the newest one; max_gap: largest
     seconds between two consecutive images.
@@ -24,6 +24,7 @@ class Order:
     def configure(self, max_backwards: float, max_gap: float) -> None:
         """Change the limits, in seconds; the stamps are kept."""
         self._backwards, self._gap = round(max_backwards * 1e9), round(max_gap * 1e9)
+        self._max_gap = max_gap
 
     def take(self, stamp_ns: int) -> None:
         """Set the newest stamp, also if time went back to it."""
@@ -31,6 +32,32 @@ class Order:
         self._before = self.newest if together else None
         self.newest = stamp_ns
         self._late_in_a_row = 0
+
+    def follows_gap(self, stamp_ns: int) -> bool:
+        """
+        Return whether an image comes after a gap of more than max_gap, or has a wrong stamp.
+
+        The image after it decides which.
+        """
+        return self.newest is not None and stamp_ns - self.newest > self._max_gap * 1e9
+
+    def misplaced(self, stamp_ns: int, following_ns: int | None) -> str:
+        """
+        Return why an image cannot follow the newest one, or an empty string.
+
+        'ahead': only its stamp leaps, but not that of the image after it, following_ns (None if
+        unknown); 'equal_stamp' or 'late': it is not newer, and time did not go back to it.
+        """
+        if self.newest is None:
+            return ''
+        if (self.follows_gap(stamp_ns) and following_ns is not None
+                and following_ns > self.newest and not self.follows_gap(following_ns)):
+            return 'ahead'
+        if stamp_ns > self.newest:
+            return ''
+        if stamp_ns == self.newest:
+            return 'equal_stamp'
+        return '' if self.goes_back(stamp_ns) else 'late'
 
     def goes_back(self, stamp_ns: int) -> bool:
         """Return whether time went back to a stamp; False if it is newer, or just late."""

@@ -327,7 +327,7 @@ class CameraHeightScale(ScaleSource):
         return self._ground[2]
 
     def _predicted(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
-        """Return the state (3,) with its covariance: speed at the end, lean at the start."""
+        """Return (speed at the end, pitch and roll at the start) and their covariance."""
         gaps = np.zeros(3)
         if self._seen_ns is not None:
             gaps[0] = max(end_ns - self._seen_ns, 0)
@@ -344,7 +344,7 @@ class CameraHeightScale(ScaleSource):
         """Update a prediction x, P by a measurement z, R; return whether it is no outlier."""
         off, S = z - x, P + R
         if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _OUTLIER:
-            # No ground leans like this.
+            # No road is tilted against the camera by that much.
             return False
         if off[0]**2 > _OUTLIER * S[0, 0]:
             # The measurement overrules the model of how speed changes.
@@ -363,11 +363,11 @@ class CameraHeightScale(ScaleSource):
         if not np.isfinite(covariance).all():
             self._P = self._P + np.diag([0.0, *_WANDERING[1:]**2 * seconds])
             return
-        lean, by_lean, by_turn = rotate_tilt(self._x[1:], relative.R, covariance)
-        way = max(float(self._x[0]), 0.0) * seconds
-        J = block_diag(1.0, by_lean)
-        self._x = np.array([self._x[0], *lean])
-        self._P = J @ self._P @ J.T + block_diag(0.0, by_turn + _BENDING**2 * way * np.eye(2))
+        tilt, by_tilt, by_turn = rotate_tilt(self._x[1:], relative.R, covariance)
+        metres = max(float(self._x[0]), 0.0) * seconds
+        J = block_diag(1.0, by_tilt)
+        self._x = np.array([self._x[0], *tilt])
+        self._P = J @ self._P @ J.T + block_diag(0.0, by_turn + _BENDING**2 * metres * np.eye(2))
 
 
 class GuessScale(ScaleSource):

@@ -7,7 +7,6 @@ same order give the same poses everywhere.
 
 from __future__ import annotations
 
-from collections import deque
 import math
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from djet_ros.core.types import Array, STARTED, TRACKED, View
 from djet_ros.odometry.auxiliary import AuxiliaryInputs
 from djet_ros.odometry.camera import Camera, is_rectified, same_camera
 from djet_ros.odometry.debug_image import debug_image
-from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate, State
+from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import (
     Complaint,
@@ -36,9 +35,11 @@ from djet_ros.odometry.messages import (
     stamp_ns,
 )
 from djet_ros.odometry.order import Order
+from djet_ros.odometry.path import Path
 from djet_ros.odometry.preprocessing import Preprocessor, Settings
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import same_scale, scale_source, ScaleSource
+from djet_ros.odometry.state import State, StateMachine
 from djet_ros.odometry.static_frames import Transform
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
@@ -90,8 +91,7 @@ class Tracker:
         self._info_frame = ''
         self._camera: Camera | None = None
         self._masked = still_mask is not None
-        self._paused = False
-        self._enter(State.WAITING_FOR_CAMERA_INFO)
+        self._states = StateMachine()
         self._forget()
 
     def reset(self) -> None:
@@ -121,12 +121,12 @@ class Tracker:
         self._health = Health(self.config.odometry, self._speed_topics)
         odometry = self.config.odometry
         self._order = Order(odometry.max_backwards, odometry.max_gap)
-        self._path: deque[Any] = deque(maxlen=self.config.ros.path_length)
-        self._path_stamp: int | None = None
+        self._path = Path(self.config.ros.path_length, self.config.ros.path_period)
         self._rate = StampRate()
-        self._bad_pairs = 0
-        self._await()
-        self._said: tuple[tuple[str, ...], int] | None = None
+        self._states.reset()
+        self._enter_waiting()
+        # The last diagnostics: state, detail and names of the complaints, and the stamp.
+        self._reported: tuple[tuple[str, ...], int] | None = None
 
     def configure(self, config: Config) -> None:
         """
@@ -144,9 +144,10 @@ class Tracker:
         self._messages = Messages(self._message_type, after, self._node, self._mounting)
         self._health.configure(after)
         self._order.configure(after.max_backwards, after.max_gap)
+        self._path.configure(config.ros.path_length, config.ros.path_period)
         # A path has poses of one frame only.
-        self._path = deque(self._path if _frames(before) == _frames(after) else (),
-                           maxlen=config.ros.path_length)
+        if _frames(before) != _frames(after):
+            self._path.discard_poses()
         if self._info is not None and (before.rectified, before.residual_k1) != (
                 after.rectified, after.residual_k1):
             info, self._info = self._info, None
@@ -170,7 +171,7 @@ class Tracker:
         self._odometry.recalibrated()
         self.problem = None
         if self.last is None:
-            self._await()
+            self._enter_waiting()
         return []
 
     @property
@@ -184,7 +185,7 @@ class Tracker:
 
         This is optional, does not change the results, and the image need not be processed.
         """
-        if self._camera is not None and not self._paused:
+        if self._camera is not None and not self._states.paused:
             # A mask of the image may not be known yet.
             masked = self._masked or bool(self.config.odometry.mask)
             self._preprocessor.start(message, self._settings(self._camera), not masked)
@@ -198,9 +199,7 @@ class Tracker:
 
         The image after it decides which; a front end should wait for that one.
         """
-        newest = self._frame
-        return newest is not None and not self._paused and (
-            stamp_ns(image.header) - newest.stamp_ns > self.config.odometry.max_gap * 1e9)
+        return not self._states.paused and self._order.follows_gap(stamp_ns(image.header))
 
     def image(self, message: Any, following: Any = None) -> list[Outgoing]:
         """
@@ -210,14 +209,13 @@ class Tracker:
         """
         self.counts.received += 1
         stamp = stamp_ns(message.header)
-        if self._paused:
+        if self._states.paused:
             self._drop('paused')
             return self._diagnostics_if_due(stamp)
         if self._camera is None:
             return self._without_camera(stamp)
-        if self._frame is not None and (
-                reason := self._astray(message, following, self._frame)
-                or self._out_of_order(stamp, self._frame)):
+        following_ns = None if following is None else stamp_ns(following.header)
+        if self._frame is not None and (reason := self._order.misplaced(stamp, following_ns)):
             self._drop(reason, frame_of(message.header))
             return self._diagnostics_if_due(self._frame.stamp_ns)
         try:
@@ -257,27 +255,27 @@ class Tracker:
 
     def pause(self) -> None:
         """Drop all images until ``resume``; the state is kept."""
-        self._paused = True
+        self._states.paused = True
 
     def resume(self) -> None:
         """Process images again; after more than max_gap the odometry restarts."""
-        self._paused = False
-        self._await()
+        self._states.paused = False
+        self._enter_waiting()
 
     def images_stopped(self) -> None:
         """Note that no image has come for a while; for front ends, which have a clock."""
-        self._await()
+        self._enter_waiting()
         self._rate = StampRate()
 
     @property
     def state(self) -> State:
         """Return the state of the odometry."""
-        return State.PAUSED if self._paused else self._state
+        return self._states.state
 
     @property
     def detail(self) -> str:
         """Return the detail of the state, such as a status or a reason."""
-        return '' if self._paused else self._detail
+        return self._states.detail
 
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed, for odometry.scale 'speed'."""
@@ -418,22 +416,8 @@ class Tracker:
     def _without_camera(self, stamp: int) -> list[Outgoing]:
         """Drop an image without a camera; an unusable CameraInfo stays the state."""
         self._drop('waiting_for_camera_info')
-        self._await()
+        self._enter_waiting()
         return self._diagnostics_if_due(stamp)
-
-    def _astray(self, image: Any, following: Any, newest: Frame) -> str:
-        """Return 'ahead' if only this image leaps, but not the one after it; otherwise ''."""
-        continues = (following is not None and stamp_ns(following.header) > newest.stamp_ns
-                     and not self.follows_gap(following))
-        return 'ahead' if continues and self.follows_gap(image) else ''
-
-    def _out_of_order(self, stamp: int, newest: Frame) -> str:
-        """Return why an image cannot follow the newest one: 'equal_stamp', 'late' or ''."""
-        if stamp > newest.stamp_ns:
-            return ''
-        if stamp == newest.stamp_ns:
-            return 'equal_stamp'
-        return '' if self._order.goes_back(stamp) else 'late'
 
     def _drop(self, reason: str, image_frame: str | None = None) -> None:
         self.counts.dropped[reason] += 1
@@ -442,14 +426,13 @@ class Tracker:
 
     def _reject(self, problem: BadMessage, stamp: int) -> list[Outgoing]:
         self.problem = problem
-        self._enter(State.REJECTING, problem.reason)
+        self._states.enter(State.REJECTING, problem.reason)
         return self._diagnostics_if_due(stamp)
 
     def _process(self, frame: Frame, view: View | None) -> list[Outgoing]:
         self.went_back = self._frame is not None and frame.stamp_ns < self._frame.stamp_ns
         if self.went_back:
-            self._path.clear()
-            self._path_stamp = None
+            self._path.reset()
         result = self._odometry.process(frame, view)
         self.remark = restart_reason(result, self._frame.stamp_ns if self._frame else None,
                                      self.config.odometry)
@@ -460,21 +443,9 @@ class Tracker:
         self.verdict = result.status.value
         self.counts.status[self.verdict] += 1
         self._rate.add(frame.stamp_ns)
-        self._enter(*self._judge(result))
+        self._states.processed(result, first=self.counts.processed == 1,
+                               max_lost=self.config.odometry.max_lost)
         return [*self._poses(result), *self._diagnostics_if_due(frame.stamp_ns)]
-
-    def _judge(self, result: OdometryResult) -> tuple[State, str]:
-        """Return the state after a result, with its detail."""
-        status = result.status
-        if status in TRACKED or status in STARTED:
-            self._bad_pairs = 0
-            if status in TRACKED:
-                return (State.STATIONARY if result.stationary else State.TRACKING), ''
-            first = self.counts.processed == 1
-            return (State.STARTED, '') if first else (State.RESTARTED, status.value)
-        self._bad_pairs += 1
-        lost = self._bad_pairs >= self.config.odometry.max_lost
-        return (State.LOST if lost else State.BAD_PAIR), status.value
 
     def _poses(self, result: OdometryResult) -> list[Outgoing]:
         make = self._messages
@@ -489,35 +460,25 @@ class Tracker:
         if result.status in TRACKED or result.status in STARTED:
             if self.config.ros.publish_tf and has_frame(self.config.odometry, result.frame_id):
                 outgoing.append(Outgoing('/tf', make.transform(result)))
-            if self.config.ros.publish_path:
-                outgoing += self._path_if_due(result)
+            if self.config.ros.publish_path and (
+                    poses := self._path.add(make.pose_stamped(result), result.stamp_ns)):
+                outgoing.append(Outgoing('path', make.path(poses)))
         return outgoing
 
-    def _path_if_due(self, result: OdometryResult) -> list[Outgoing]:
-        self._path.append(self._messages.pose_stamped(result))
-        period = self.config.ros.path_period * 1e9
-        if self._path_stamp is not None and result.stamp_ns - self._path_stamp < period:
-            return []
-        self._path_stamp = result.stamp_ns
-        return [Outgoing('path', self._messages.path(self._path))]
-
-    def _await(self) -> None:
+    def _enter_waiting(self) -> None:
         """Enter the state of waiting for what is missing; an unusable CameraInfo stays it."""
         if self._camera is not None:
-            self._enter(State.WAITING_FOR_IMAGE)
+            self._states.enter(State.WAITING_FOR_IMAGE)
         elif self._info is None:
-            self._enter(State.WAITING_FOR_CAMERA_INFO)
-
-    def _enter(self, state: State, detail: str = '') -> None:
-        self._state, self._detail = state, detail
+            self._states.enter(State.WAITING_FOR_CAMERA_INFO)
 
     def _diagnostics_if_due(self, stamp: int) -> list[Outgoing]:
-        what = self.state.value, self._detail, *(one.name for one in self.complaints)
-        if self._said is not None:
-            before, said = self._said
-            if before == what and 0 <= stamp - said < _DIAGNOSTICS_PERIOD_NS:
+        what = *self._states.key, *(one.name for one in self.complaints)
+        if self._reported is not None:
+            before, reported = self._reported
+            if before == what and 0 <= stamp - reported < _DIAGNOSTICS_PERIOD_NS:
                 return []
-        self._said = what, stamp
+        self._reported = what, stamp
         return [self.diagnostics(stamp)]
 
 

@@ -26,7 +26,7 @@ class Trajectory:
         """Return the trajectory after a motion (4, 4) with an independent error (6, 6)."""
         return Trajectory(self.pose @ motion, self.path.moved(self.pose, motion, covariance))
 
-    def align(self, step: Step) -> Trajectory:
+    def moved_by_step(self, step: Step) -> Trajectory:
         """Return the trajectory after an estimated step."""
         covariance, common = motion_covariance(step.relative, step.length.own), step.length.common
         if step.onward is not None:

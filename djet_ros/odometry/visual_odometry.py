@@ -254,7 +254,7 @@ class VisualOdometry:
         waits = self._waits_for_parallax(pair)
         step = (Step(pair, self._scale.expected_length(span)) if waits
                 else self._scale.of_step(span, view, pair))
-        trajectory = self._trajectory.align(step)
+        trajectory = self._trajectory.moved_by_step(step)
         result = self._result(
             frame, pair, step.length, camera_motion(step.relative, step.length.value),
             motion_covariance(step.relative, step.length), trajectory,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -14,7 +12,7 @@ from typing import Any, NamedTuple
 import cv2
 from djet_ros import __version__, compiled
 from djet_ros.config.sections import Config
-from djet_ros.core.types import Array, Status
+from djet_ros.core.types import Status
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.diagnostics import Counts
 from djet_ros.odometry.messages import (
@@ -24,27 +22,24 @@ from djet_ros.odometry.messages import (
     seconds_text,
     stamp_ns,
 )
-from djet_ros.odometry.scale import Scale, scale_source, ScaleSource
+from djet_ros.odometry.scale import scale_source, ScaleSource
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
-from djet_ros.posegraph.steps import scale_of, Step
+from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.datasets import LONGEST_GAP_NS
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import still_mask
 from djet_ros.recordings.recording import Recording
-from djet_ros.replay.alignment import aligned, position_rmse
-from djet_ros.replay.drift import drift, path_scale, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
-from djet_ros.replay.pair_errors import pair_errors, statistics
-from djet_ros.replay.results import PLOT, plot_trajectory, ResultsFolder, UNFINISHED
+from djet_ros.replay.lookahead import with_next_image
+from djet_ros.replay.pair_errors import statistics
+from djet_ros.replay.results import PLOT, ResultsFolder, UNFINISHED
+from djet_ros.replay.step_log import StepLog
 import numpy as np
 
 # Time of the recording, in ns, for which an image waits for its side inputs (gyro, guess, mask).
 _SIDE_INPUT_TIMEOUT_NS = 10**9
-
-# Messages read ahead at most to find the next image: those of a fast IMU with a slow camera.
-_MAX_PIECE = 1000
 
 
 class Outcome(NamedTuple):
@@ -58,47 +53,6 @@ class Outcome(NamedTuple):
     summary: dict[str, Any]
     problem: str | None
     advice: tuple[str, ...] = ()
-
-
-def with_next_image(recording: Recording) -> Iterator[tuple[BagMessage, BagMessage | None]]:
-    """
-    Yield all messages of a recording, each with the second image from it on (lookahead).
-
-    The image is None if it is far ahead or at the end. An error of the recording is raised after
-    the messages before it.
-    """
-    pieces, problem = _pieces(recording), None
-    piece = next(pieces, [])
-    while piece:
-        following: list[BagMessage] = []
-        try:
-            following = next(pieces, [])
-        except DjetError as error:
-            problem = error
-        image = following[-1] if following and following[-1].topic == recording.image_topic \
-            else None
-        for message in piece:
-            yield message, image
-        piece = following
-    if problem is not None:
-        raise problem
-
-
-def _pieces(recording: Recording) -> Iterator[list[BagMessage]]:
-    """Split the messages after each image, or after _MAX_PIECE messages without one."""
-    piece: list[BagMessage] = []
-    try:
-        for message in recording.messages():
-            piece.append(message)
-            if message.topic == recording.image_topic or len(piece) == _MAX_PIECE:
-                yield piece
-                piece = []
-    except DjetError:
-        if piece:
-            yield piece
-        raise
-    if piece:
-        yield piece
 
 
 class Replay:
@@ -127,7 +81,8 @@ class Replay:
         self._truth = GroundTruth()
         # Recording time of the first image and of the first CameraInfo, by topic.
         self._first_ns: dict[str, int] = {}
-        self._log = _Log()
+        self._log = StepLog()
+        self._first_problem: str | None = None
         if not self._tracker.mounted and (frame := _frame_of_images(recording)) is not None:
             self._mount(frame)
 
@@ -206,10 +161,10 @@ class Replay:
         rejected = tracker.counts.rejected_infos.total()
         self._publish(tracker.camera_info(message.message), message.stamp_ns)
         if tracker.counts.rejected_infos.total() > rejected:
-            self._log.first_problem = self._log.first_problem or str(tracker.problem)
+            self._first_problem = self._first_problem or str(tracker.problem)
 
     def _image(self, message: BagMessage, following: Any) -> None:
-        tracker, log = self._tracker, self._log
+        tracker = self._tracker
         number, processed = tracker.counts.received, tracker.counts.processed
         rejected = tracker.counts.rejected.total()
         frame = frame_of(message.message.header)
@@ -225,17 +180,17 @@ class Replay:
         seconds = perf_counter() - started
         if tracker.counts.processed > processed and tracker.last is not None:
             result = tracker.last
-            log.steps.append(Step(result.stamp_ns, result.status, result.pose,
-                                  result.previous_stamp_ns, result.motion,
-                                  result.motion_covariance, result.scale_known,
-                                  metric=result.metric, keyframe=result.keyframe))
+            self._log.steps.append(Step(result.stamp_ns, result.status, result.pose,
+                                        result.previous_stamp_ns, result.motion,
+                                        result.motion_covariance, result.scale_known,
+                                        metric=result.metric, keyframe=result.keyframe))
             self._folder.add_frame(number, result, seconds)
             self._folder.add_landmarks(tracker.settled())
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
         self._publish(outgoing, message.stamp_ns)
         if tracker.counts.rejected.total() > rejected:
-            log.first_problem = log.first_problem or f'image {number}: {tracker.problem}'
+            self._first_problem = self._first_problem or f'image {number}: {tracker.problem}'
 
     def _mount(self, image_frame: str) -> None:
         """Look up the camera on base_frame; DjetError if the recording does not have it."""
@@ -253,22 +208,22 @@ class Replay:
 
     def _complaint(self) -> str:
         """Return what is wrong with a recording that was read to its end, or ''."""
-        counts, log = self._tracker.counts, self._log
-        if not counts.processed and log.first_problem:
+        counts, first_problem = self._tracker.counts, self._first_problem
+        if not counts.processed and first_problem:
             return (f'{self._name}: none of {counts.received} images could be used; '
-                    f'{log.first_problem}')
+                    f'{first_problem}')
         if not counts.processed:
             recorded = self._time_of_first_info()
             return (f'{self._name}: none of {counts.received} images has an earlier CameraInfo on '
                     f'{self._recording.info_topic}{f" ({recorded})" if recorded else ""}; record '
                     'it before the images, or choose another topic with --info-topic')
         found = []
-        if log.first_problem:
-            found.append(f'{_unusable(counts)} could not be used; {log.first_problem}')
+        if first_problem:
+            found.append(f'{_unusable(counts)} could not be used; {first_problem}')
         if changes := counts.status[Status.SIZE_CHANGED.value]:
             found.append(f'the image size or the camera changes {_times(changes)}; the motion is '
                          'unknown there, which leaves a gap in the trajectory')
-        if back := [after for before, after in log.jumps() if after < before]:
+        if back := [after for before, after in self._log.jumps() if after < before]:
             found.append(f'the stamps go back {_times(len(back))}; the poses restart at the '
                          f'origin at stamp {", ".join(map(seconds_text, back[:3]))}')
         return f'{self._name}: {"; ".join(found)}' if found else ''
@@ -293,7 +248,7 @@ class Replay:
 
     def _of_truth(self) -> list[str]:
         """Return a warning if there is ground truth, but at none of the images."""
-        images = np.array([step.stamp_ns for step in self._log.steps], np.int64)
+        images = self._log.stamps_ns
         if not len(self._truth) or not images.size \
                 or np.isfinite(self._truth.at(images)).any():
             return []
@@ -331,13 +286,10 @@ class Replay:
 
     def _evaluate(self, summary: dict[str, Any]) -> None:
         """Add errors against ground truth to the summary, and draw the trajectory."""
-        log = self._log
-        pairs = log.pairs()
-        truth = self._truth.at(np.array([step.stamp_ns for step in log.steps], np.int64))
+        log, config = self._log, self._config
+        pairs, truth = log.pairs(), self._truth.at(log.stamps_ns)
         if len(self._truth) and pairs:
-            at: dict[int | None, int] = {step.stamp_ns: i for i, step in enumerate(log.steps)}
-            ends = np.array([(at[p.previous_stamp_ns], at[p.stamp_ns]) for p in pairs])
-            errors = pair_errors(pairs, truth[ends[:, 0]], truth[ends[:, 1]])
+            errors = log.errors(truth)
             summary.update(
                 compared_pairs=errors.compared, failures=errors.failures,
                 translation_failures=errors.translation_failures,
@@ -347,152 +299,9 @@ class Replay:
             summary['positions'] = log.positions(truth)
             self._folder.add_errors(pairs, errors)
         if any(step.tracked for step in log.steps):
-            self._plot(truth)
-
-    def _plot(self, truth: Array) -> None:
-        """Plot the trajectory; an unknown scale is taken from the ground truth."""
-        log, unit = self._log, 'm'
-        name = one_line(Path(self._name).name)
-        title = f'{name}: {self._config.estimator.method}, {self._config.preset}'
-        estimate = np.array([step.pose for step in log.steps])
-        known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
-        if log.scale is Scale.UNKNOWN and known.size:
-            estimate = log.with_lengths_of(truth)
-            title += '\n(step lengths from ground truth)'
-        elif log.scale is Scale.UNKNOWN:
-            unit = 'steps of unit length'
-        elif log.scale is Scale.RELATIVE and known.size:
-            estimate[:, :3, 3] *= path_scale(estimate[known, :3, 3], truth[known, :3, 3])
-            title += '\n(common scale from ground truth)'
-        elif log.scale is Scale.RELATIVE:
-            unit = 'lengths of the first step'
-        # The two coincide at the first pose of the ground truth.
-        positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
-            if known.size else None
-        plot_trajectory(self._folder.path / PLOT, estimate[:, :3, 3], positions, title, unit)
-
-
-# Advice if no pair was tracked, by the most frequent status: too few matches, or another.
-_FEW_MATCHES_ADVICE = (
-    'the images are dark, without texture or blurred, or do not overlap; check the exposure, for '
-    '16-bit images odometry.gray_range, and the frame rate')
-_NO_MOTION_ADVICE = (
-    'no single motion explains the matches; check that the calibration belongs to the images '
-    '(--info-topic, odometry.rectified), and mask moving objects (odometry.mask_file)')
-
-# Minimum number of positions for an alignment: fewer fit any others.
-_MIN_POSITIONS = 4
-
-
-@dataclass
-class _Log:
-    """The steps of a run, and its first error."""
-
-    steps: list[Step] = field(default_factory=list)
-    first_problem: str | None = None
-
-    @property
-    def scale(self) -> Scale:
-        """Return the kind of scale of all lengths."""
-        return scale_of(self.steps)
-
-    def pairs(self) -> list[Step]:
-        return [step for step in self.steps if step.previous_stamp_ns is not None]
-
-    def jumps(self) -> list[tuple[int, int]]:
-        """Return the pairs of stamps at time jumps, backwards or over a gap."""
-        return [(before.stamp_ns, after.stamp_ns) for before, after in pairwise(self.steps)
-                if after.status is Status.TIME_JUMP]
-
-    def advice(self) -> list[str]:
-        """Return warnings on gaps and on pairs that were not tracked."""
-        return [*self._of_gaps(), *self._of_pairs()]
-
-    def _of_gaps(self) -> list[str]:
-        """Return a warning if gaps between images exceed odometry.max_gap."""
-        gaps = [(after - before, after) for before, after in self.jumps() if after > before]
-        if not gaps or not self.pairs():
-            return []
-        longest, after = max(gaps)
-        return [f'{len(gaps)} gaps between images exceed odometry.max_gap; the longest, '
-                f'{longest * 1e-9:.3f} s, ends at stamp {seconds_text(after)}; the trajectory '
-                'continues at the last pose, without the motion in the gap']
-
-    def _of_pairs(self) -> list[str]:
-        """Return a warning if no pair was tracked, or none has a translation."""
-        pairs = self.pairs()
-        statuses = Counter(step.status for step in pairs)
-        if not pairs:
-            return [] if len(self.steps) < 2 else [
-                f'none of {len(self.steps)} images could be paired with the one before: the time '
-                'between them exceeds odometry.max_gap; set it to a larger value']
-        if statuses[Status.NO_PARALLAX] == len(pairs):
-            return [f'all {len(pairs)} pairs have no parallax (NO_PARALLAX): the camera was '
-                    'stationary or only rotated, so there are rotations and no translations']
-        if any(step.tracked for step in pairs):
-            return []
-        most = statuses.most_common(1)[0][0]
-        advice = (_FEW_MATCHES_ADVICE if most is Status.TOO_FEW_MATCHES
-                  else _NO_MOTION_ADVICE)
-        return [f'none of {len(pairs)} pairs could be tracked (mostly {most.value}): {advice}']
-
-    def drift(self, truth: Array) -> dict[str, float | None] | None:
-        """
-        Return the drift over the frames with a true pose (N, 4, 4), or None for a short path.
-
-        With an unknown scale only the drift of the rotation is given. A relative scale is
-        multiplied by the factor that fits the whole path best.
-        """
-        known = np.isfinite(truth).all(axis=(1, 2))
-        if not known.any():
-            return None
-        poses = np.array([step.pose for step in self.steps])[known]
-        if self.scale is Scale.RELATIVE:
-            poses[:, :3, 3] *= path_scale(poses[:, :3, 3], truth[known][:, :3, 3])
-        found = drift(truth[known], poses)
-        if found is None or not any(step.tracked for step in self.steps):
-            return None
-        if self.scale is Scale.UNKNOWN:
-            return {**asdict(found), 'translation_percent': None}
-        return asdict(found)
-
-    def positions(self, truth: Array) -> dict[str, float | None] | None:
-        """
-        Return the position RMSE and the length of the true path in metres, and the scale change.
-
-        The RMSE is after alignment with the true poses (N, 4, 4), including the scale unless it is
-        metric. The scale change is that at the end over that at the start, or None if it cannot be
-        determined. None if the scale is unknown or nothing was tracked.
-        """
-        known = np.isfinite(truth).all(axis=(1, 2))
-        if not any(step.tracked for step in self.steps):
-            return None
-        if self.scale is Scale.UNKNOWN or known.sum() < _MIN_POSITIONS:
-            return None
-        way = truth[known, :3, 3]
-        places = np.array([step.pose[:3, 3] for step in self.steps])[known]
-        change = scale_change(places, way)
-        return {'rmse_m': position_rmse(aligned(places, way, self.scale is Scale.METRIC), way),
-                'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
-                'scale_change': change if np.isfinite(change) else None}
-
-    def with_lengths_of(self, truth: Array) -> Array:
-        """Return the estimated poses (N, 4, 4) with the true length of each step, if known."""
-        poses: list[Array] = []
-        at: dict[int | None, int] = {}
-        for i, step in enumerate(self.steps):
-            pose = poses[-1] if poses else np.eye(4)
-            if step.tracked:
-                previous = at[step.previous_stamp_ns]
-                true = float(np.linalg.norm(truth[i, :3, 3] - truth[previous, :3, 3]))
-                length = float(np.linalg.norm(step.motion[:3, 3]))
-                motion = step.motion.copy()
-                if length > 0 and np.isfinite(true):
-                    motion[:3, 3] *= true / length
-                pose = poses[previous] @ motion
-            poses.append(pose)
-            at[step.stamp_ns] = i
-        return np.array(poses)
+            log.plot(self._folder.path / PLOT, truth,
+                     f'{one_line(Path(self._name).name)}: {config.estimator.method}, '
+                     f'{config.preset}')
 
 
 def _unusable(counts: Counts) -> str:

@@ -1,0 +1,77 @@
+"""Queue of a session's messages other than images, until the tracker takes them."""
+
+from __future__ import annotations
+
+from threading import Event
+from time import monotonic
+from typing import Any, NamedTuple
+
+from djet_ros.live.frame_queue import FrameQueue
+from djet_ros.odometry.tracker import Tracker
+import numpy as np
+
+# Queued messages of side inputs (IMU, guess, mask, speed, tf): minutes of a fast IMU.
+_MAX_SIDE_INPUTS = 100_000
+
+
+class _SideInput(NamedTuple):
+    """A message other than an image, the tracker's method for it, and its time of arrival."""
+
+    what: str
+    message: Any
+    at: float
+
+
+class SideInputs:
+    """
+    Side inputs in the order of arrival; put by one thread, passed to the tracker by another.
+
+    newest: arrival time (monotonic seconds) of the last one; max_bytes: limit of the queue, beyond
+    which the oldest are dropped.
+    """
+
+    def __init__(self, max_bytes: float) -> None:
+        self._queue: FrameQueue[_SideInput] = FrameQueue('latest', _MAX_SIDE_INPUTS, max_bytes)
+        self._arrived = Event()
+        self.newest = -np.inf
+
+    def put(self, what: str, message: Any, size: int) -> None:
+        """Queue a message of some bytes for the tracker's method ``what``."""
+        self.newest = monotonic()
+        self._queue.put(_SideInput(what, message, self.newest), size)
+        self._arrived.set()
+
+    def feed(self, tracker: Tracker, until: float) -> None:
+        """Pass the messages that arrived until a time to the tracker, which keeps a few."""
+        while self.feed_next(tracker, until):
+            pass
+
+    def feed_next(self, tracker: Tracker, until: float) -> bool:
+        """Pass the oldest message to the tracker if it arrived until a time; return whether."""
+        waiting = self._queue.peek()
+        if waiting is None or waiting.at > until:
+            return False
+        if (one := self._queue.get(timeout=0)) is None:
+            return False
+        getattr(tracker, one.what)(one.message)
+        return True
+
+    def expect(self) -> None:
+        """Let the next ``wait`` return only for what arrives from now on."""
+        self._arrived.clear()
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a message arrives, or for some seconds."""
+        self._arrived.wait(seconds)
+
+    def wake(self) -> None:
+        """End a ``wait``."""
+        self._arrived.set()
+
+    def clear(self) -> None:
+        """Discard all messages."""
+        self._queue.clear()
+
+    def close(self) -> None:
+        """Accept no more messages."""
+        self._queue.close()
