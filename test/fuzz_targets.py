@@ -35,7 +35,7 @@ from djet_ros.recordings.decoding import decoder, jazzy, message_type
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
 from djet_ros.recordings.kitti_raw import kitti_raw
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
@@ -546,9 +546,9 @@ def mask_of(data: bytes) -> None:
     with folder() as place:
         (place / 'mask.png').write_bytes(data)
         with only_our_errors():
-            mask = still_mask(str(place / 'mask.png'))
+            mask = static_mask(str(place / 'mask.png'))
             assert mask is not None and mask.dtype == bool and mask.ndim == 2
-            one = Tracker(Config(), message_type, still_mask=mask)
+            one = Tracker(Config(), message_type, static_mask=mask)
             one.camera_info(camera_info(K, SIZE))
             one.image(image(PICTURE, stamp_ns=SECOND))
             assert one.counts.received == 1

@@ -25,7 +25,7 @@ from djet_ros.odometry.messages import MessageFactory, pose_of
 from djet_ros.odometry.moving_frames import MovingFrames
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Tracker
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, serialised
@@ -39,7 +39,7 @@ POSES = ('relative_pose', 'relative_pose_cov', 'relative_pose_status', 'odometry
 def tracker(**values: Any) -> Tracker:
     mask = values.pop('still', None)
     one = Tracker(from_flat({'estimator.max_features': 500, **values}), message_type,
-                  image_topic='/camera/image_rect', still_mask=mask)
+                  image_topic='/camera/image_rect', static_mask=mask)
     one.camera_info(camera_info(K, SIZE))
     return one
 
@@ -431,14 +431,14 @@ def test_masks_are_combined_with_unseen_pixels() -> None:
 
 
 def test_a_mask_file_is_read_and_an_invalid_one_is_named(tmp_path: Path) -> None:
-    assert still_mask('') is None
+    assert static_mask('') is None
     gray = np.full((40, 60), 255, np.uint8)
     gray[20:] = 0
     cv2.imwrite(str(tmp_path / 'mask.png'), gray)
-    mask = still_mask(str(tmp_path / 'mask.png'))
+    mask = static_mask(str(tmp_path / 'mask.png'))
     assert mask is not None and mask[20:].all() and not mask[:20].any()
     with pytest.raises(DjetError, match='could not be read'):
-        still_mask(str(tmp_path / 'nowhere.png'))
+        static_mask(str(tmp_path / 'nowhere.png'))
 
 
 def test_masks_are_undistorted_with_their_images() -> None:

@@ -97,19 +97,19 @@ def test_what_the_imu_felt_is_turned_to_the_camera(asl: Path) -> None:
 
 
 def test_samples_come_before_the_image_up_to_the_first_one_after_it(asl: Path) -> None:
-    with open_recording(asl, beside={'imu': None}) as recording:
+    with open_recording(asl, auxiliary={'imu': None}) as recording:
         said = list(recording.messages())
     images = [i for i, one in enumerate(said) if one.topic == recording.image_topic]
     for number, place in enumerate(images):
         felt = [stamp_ns(one.message.header) for one in said[:place]
-                if one.topic == recording.beside['imu']]
+                if one.topic == recording.auxiliary['imu']]
         assert felt[-2] < STAMPS[number] <= felt[-1]
-    assert said[0].topic == recording.beside['frames']
+    assert said[0].topic == recording.auxiliary['frames']
 
 
 def test_nothing_of_the_imu_comes_unless_it_is_wanted(asl: Path) -> None:
     with open_recording(asl) as recording:
-        assert recording.beside == {}
+        assert recording.auxiliary == {}
         assert {one.message.__msgtype__ for one in recording.messages()} == {
             'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'}
 
@@ -117,14 +117,14 @@ def test_nothing_of_the_imu_comes_unless_it_is_wanted(asl: Path) -> None:
 def test_a_folder_without_an_imu_says_so(asl: Path) -> None:
     shutil.rmtree(asl / 'mav0' / 'imu0')
     with pytest.raises(DjetError, match='holds no IMU data'):
-        open_recording(asl, beside={'imu': None})
+        open_recording(asl, auxiliary={'imu': None})
 
 
 def test_a_bag_of_a_folder_holds_its_imu_and_how_it_is_mounted(asl: Path) -> None:
     write_kitti_bag(euroc(asl), asl / 'bag')
-    with open_recording(asl / 'bag', beside={'imu': None}) as recording:
-        assert recording.beside == {'imu': '/imu/data_raw', 'frames': '/tf_static'}
-    with open_recording(asl, beside={'imu': None}) as folder, Bag(asl / 'bag') as bag:
+    with open_recording(asl / 'bag', auxiliary={'imu': None}) as recording:
+        assert recording.auxiliary == {'imu': '/imu/data_raw', 'frames': '/tf_static'}
+    with open_recording(asl, auxiliary={'imu': None}) as folder, Bag(asl / 'bag') as bag:
         rates = [[one.message.angular_velocity.x, stamp_ns(one.message.header)]
                  for one in folder.messages() if one.topic == '/imu/data_raw']
         assert rates == [[one.message.angular_velocity.x, stamp_ns(one.message.header)]

@@ -348,7 +348,7 @@ def test_live_keyframes_have_the_masks_of_their_images(live):
     """One for all images, and one by its stamp."""
     still = np.zeros(SIZE[::-1], bool)
     still[200:] = True
-    slam = live(replace(FEW_FEATURES, slam=QUICK), message_type, 'image_rect', still_mask=still)
+    slam = live(replace(FEW_FEATURES, slam=QUICK), message_type, 'image_rect', static_mask=still)
     slam.camera_info(camera_info(K, SIZE))
     moving = np.full(SIZE[::-1], 255, np.uint8)
     moving[:, :50] = 0

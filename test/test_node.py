@@ -181,7 +181,7 @@ def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         expected = {topic: [serialised(m.message) for m in bag.messages({topic})]
                     for topic in poses}
 
-    with BagRecording(tmp_path / 'bag', beside={'imu': None} if imu else {}) as source:
+    with BagRecording(tmp_path / 'bag', auxiliary={'imu': None} if imu else {}) as source:
         # Published before the node starts, as on a robot: its reception cannot be observed.
         publisher.advertise('/tf_static', TF_TYPE, 0, durability='transient_local')
         for frames in source.static_frames():

@@ -48,7 +48,7 @@ class Drive:
     ground_truth_topic = None
 
     def __init__(self, black=(), gaps=(), step=STEP):
-        self.beside = {}
+        self.auxiliary = {}
         self._black, self._gaps, self._step = black, gaps, step
 
     def __len__(self):

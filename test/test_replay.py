@@ -121,7 +121,7 @@ def test_keyframe_images_have_the_masks_of_the_odometry(tmp_path):
 
     config = from_flat({'odometry.mask': True})
     with open_recording(record(tmp_path / 'bag', messages()), IMAGE_TOPIC,
-                        beside={'mask': None}) as recording:
+                        auxiliary={'mask': None}) as recording:
         frame_at = frame_finder(recording, config)
         for i in (0, 1, 3, 5):
             left_out = frame_at(SECOND + i * SECOND // 10).left_out
@@ -1025,7 +1025,7 @@ def test_documented_command_is_valid():
         assert flag in parsed
 
 
-def test_unused_side_inputs_give_a_warning(tmp_path):
+def test_unused_auxiliary_inputs_give_a_warning(tmp_path):
     folder = render_sequence('road', tmp_path, 8, size=(480, 160))
     for told in (False, True):
         if told:

@@ -22,9 +22,10 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.scale import Length
 from djet_ros.odometry.uncertainty import compose, inflated_for_chain, UNKNOWN_MOTION
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
-from djet_ros.posegraph.loops import EdgeFinder, transferred_length
+from djet_ros.posegraph.loops import EdgeFinder
 from djet_ros.posegraph.places import PlaceIndex
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
+from djet_ros.posegraph.shared_points import transferred_length
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.alignment import aligned, position_rmse

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.player import Player
     names = Names('player', args.remap)
     source = open_recording(args.source, args.image_topic, args.info_topic,
-                            beside=dict.fromkeys(AUXILIARY), strict=False)
+                            auxiliary=dict.fromkeys(AUXILIARY), strict=False)
     try:
         with Graph() as graph:
             player = Player(graph, source, names, args.rate, args.clock)

@@ -104,7 +104,7 @@ def opened_replay(args: argparse.Namespace, config: Config, recording: Path, fol
     wanted = _auxiliary_inputs(config.odometry)
     check_topics(args, wanted)
     with open_recording(recording, args.image_topic, args.info_topic, args.poses,
-                        beside={what: getattr(args, f'{what}_topic', None)
+                        auxiliary={what: getattr(args, f'{what}_topic', None)
                                 for what in wanted}, damaged=True) as source:
         replay = Replay(source, config, str(recording))
         with ResultsFolder(folder, config, args.overwrite) as results, \

@@ -96,16 +96,16 @@ def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Re
     if name is None:
         raise DjetError(f'{results / REPLAY_SUMMARY} does not name the replayed recording; '
                         'name it with --source')
-    beside = {'mask': args.mask_topic} if config.odometry.mask else {}
+    auxiliary = {'mask': args.mask_topic} if config.odometry.mask else {}
     if results == args.input:
-        check_topics(args, beside)
+        check_topics(args, auxiliary)
     path = args.source or Path(name)
     if not path.exists():
         raise DjetError(f'{path}, the recording that {results} was replayed from, does not exist; '
                         'name its new path with --source')
     if not is_bag(path) or not isinstance(topic, str):
         topic = None
-    return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, beside,
+    return (open_recording(path, args.image_topic or topic, args.info_topic, args.poses, auxiliary,
                            damaged=True), name)
 
 

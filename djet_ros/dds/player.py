@@ -54,14 +54,14 @@ class Player:
         """Advertise all topics before the first message, so that none is lost."""
         recording = self._recording
         missing = {recording.image_topic, recording.info_topic,
-                   recording.ground_truth_topic, *recording.beside.values()} - {None}
+                   recording.ground_truth_topic, *recording.auxiliary.values()} - {None}
         for one in recording.messages():
             if one.topic in missing:
                 missing.discard(one.topic)
                 self._publishers[one.topic] = self._graph.advertise(
                     self._names.resolve(one.topic), one.message.__msgtype__,
                     _LATCHED if one.topic == recording.info_topic
-                    else _FRAMES if one.topic == recording.beside.get('frames') else _STREAM)
+                    else _FRAMES if one.topic == recording.auxiliary.get('frames') else _STREAM)
             if not missing:
                 return
 

@@ -77,17 +77,7 @@ def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Arr
                         f'rad/s do not determine an offset; record at least {_LEAST_PAIRS}, and '
                         'rotate the camera back and forth about all axes')
     gyro = _orientations(stamps_ns, rates)
-    tried = np.arange(-widest, widest + _COARSE / 2, _COARSE)
-    offset = float(tried[np.argmin([_misfit(rotations, seen, gyro, one) for one in tried])])
-    measured, known = _gyro_rates(rotations, gyro, offset)
-    if known.sum() < _LEAST_PAIRS:
-        raise DjetError(f'the IMU covers {known.sum()} of {len(seen)} pairs, at least '
-                        f'{_LEAST_PAIRS} are needed; check that images and IMU are stamped by '
-                        'synchronised clocks, or raise --widest')
-    R, _ = Rotation.align_vectors(seen[known] - np.median(seen[known], axis=0),
-                                  measured[known] - np.median(measured[known], axis=0))
-    bias = np.median(measured[known] - R.inv().apply(seen[known]), axis=0)
-
+    R, bias, offset, known = _initial_fit(rotations, seen, gyro, widest)
     at_first = np.array([0, 0, 0, *bias, offset])
 
     def residuals(z: Array) -> Array:
@@ -109,6 +99,22 @@ def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Arr
     spread = sigma * float(np.sqrt(np.linalg.inv(information)[6, 6])) * _UNITS[6]
     return ImuFit(float(x[6]), spread, (Rotation.from_rotvec(x[:3]) * R).as_matrix(), x[3:6],
                   sigma, int(known.sum()))
+
+
+def _initial_fit(rotations: VisualRotations, seen: Array, gyro: Slerp, widest: float
+                 ) -> tuple[Rotation, Array, float, NDArray[np.bool_]]:
+    """Return rotation, bias, offset, and which pairs (N,) the IMU covers at that offset."""
+    tried = np.arange(-widest, widest + _COARSE / 2, _COARSE)
+    offset = float(tried[np.argmin([_misfit(rotations, seen, gyro, one) for one in tried])])
+    measured, known = _gyro_rates(rotations, gyro, offset)
+    if known.sum() < _LEAST_PAIRS:
+        raise DjetError(f'the IMU covers {known.sum()} of {len(seen)} pairs, at least '
+                        f'{_LEAST_PAIRS} are needed; check that images and IMU are stamped by '
+                        'synchronised clocks, or raise --widest')
+    R, _ = Rotation.align_vectors(seen[known] - np.median(seen[known], axis=0),
+                                  measured[known] - np.median(measured[known], axis=0))
+    bias = np.median(measured[known] - R.inv().apply(seen[known]), axis=0)
+    return R, bias, offset, known
 
 
 def _orientations(stamps_ns: NDArray[np.int64], rates: Array) -> Slerp:

@@ -22,7 +22,7 @@ from djet_ros.lab.style import COLOURS, figure
 from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import Recording
 import numpy as np
 import yaml
@@ -160,7 +160,7 @@ def _tracker(recording: Recording, config: Config) -> Tracker:
     config = replace(config, odometry=replace(config.odometry, scale='none', imu=False,
                                               guess=False))
     return Tracker(config, message_type, image_topic=recording.image_topic,
-                   still_mask=still_mask(config.odometry.mask_file))
+                   static_mask=static_mask(config.odometry.mask_file))
 
 
 def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:

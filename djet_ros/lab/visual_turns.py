@@ -24,7 +24,7 @@ def rotations_and_rates(recording: Recording, config: Config, advance: Callable[
     for topic, _, message in recording.messages():
         if topic == recording.info_topic:
             tracker.camera_info(message)
-        elif topic == recording.beside['imu']:
+        elif topic == recording.auxiliary['imu']:
             rate = message.angular_velocity
             stamps.append(stamp_ns(message.header))
             rates.append((rate.x, rate.y, rate.z))

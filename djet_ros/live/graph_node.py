@@ -8,9 +8,9 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs, SIDE_INPUT_TYPES
+from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs, AUXILIARY_TYPES
 from djet_ros.posegraph.live_slam import LiveSlam
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 
 # History depth of the odometry's topics, for long optimisations.
 _DEPTH = 1000
@@ -25,7 +25,7 @@ class PoseGraphNode(LiveNode):
         topics = {name: middleware.resolve(f'{NODE_NAME}/{name}') for name in GRAPH_INPUTS}
         self.session: GraphSession = GraphSession(
             LiveSlam(config, middleware.message_type, image, middleware.node.strip('/'),
-                     still_mask(config.odometry.mask_file)), self,
+                     static_mask(config.odometry.mask_file)), self,
             {**topics, 'image': image, 'camera_info': info})
         self.update_tf_subscription()
         self.advertise(graph_outputs(tf=config.slam.publish_tf))
@@ -35,7 +35,7 @@ class PoseGraphNode(LiveNode):
             self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH),
                         as_configured=False)
         if config.odometry.mask:
-            self.listen(middleware.resolve('mask'), SIDE_INPUT_TYPES['mask'], self.session.mask,
+            self.listen(middleware.resolve('mask'), AUXILIARY_TYPES['mask'], self.session.mask,
                         replace(input_profile(config.ros), depth=config.slam.image_buffer))
         self.listen_to_camera(image, info, config.ros.image_transport,
                               replace(input_profile(config.ros), depth=config.slam.image_buffer))

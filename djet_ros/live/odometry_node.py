@@ -8,11 +8,11 @@ from djet_ros.config.sections import Config
 from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.session import Session
-from djet_ros.live.topics import odometry_outputs, SIDE_INPUT_TYPES, SPEED_TYPES
+from djet_ros.live.topics import odometry_outputs, AUXILIARY_TYPES, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
 from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 
 # History depths for the time in which Python does not get to run: of imu, guess and tf (seconds of
 # the fastest IMU), and of masks, which are as large and as frequent as images.
@@ -36,10 +36,10 @@ class OdometryNode(LiveNode):
             Tracker(config, middleware.message_type, image_topic=image,
                     node=middleware.node.strip('/'),
                     speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES)),
-                    still_mask=still_mask(config.odometry.mask_file)), self,
+                    static_mask=static_mask(config.odometry.mask_file)), self,
             {'image': image, 'camera_info': info})
         self._speed_subscribed = self._guess_tf_subscribed = False
-        self._side_input_topics: set[str] = set()
+        self._auxiliary_topics: set[str] = set()
         self.connect(config)
         self.update_tf_subscription()
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
@@ -59,12 +59,12 @@ class OdometryNode(LiveNode):
         enabled = {'imu': odometry.imu, 'mask': odometry.mask,
                    'guess': odometry.guess_by_topic}
         for topic in enabled:
-            if enabled[topic] and topic not in self._side_input_topics:
-                self.listen(self._middleware.resolve(topic), SIDE_INPUT_TYPES[topic],
+            if enabled[topic] and topic not in self._auxiliary_topics:
+                self.listen(self._middleware.resolve(topic), AUXILIARY_TYPES[topic],
                             getattr(self.session, topic),
                             replace(input_profile(config.ros),
                                     depth=_MASKS_DEPTH if topic == 'mask' else _DEPTH))
-                self._side_input_topics.add(topic)
+                self._auxiliary_topics.add(topic)
         if odometry.guess_by_tf and not self._guess_tf_subscribed:
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))

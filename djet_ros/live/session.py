@@ -17,7 +17,7 @@ from djet_ros.config.sections import Config
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.rate_limit import RateLimit
 from djet_ros.live.reporting import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
-from djet_ros.live.side_inputs import SideInputs
+from djet_ros.live.auxiliary_queue import AuxiliaryQueue
 from djet_ros.odometry.health import Complaint, REDUCE_LOAD
 from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.odometry.state import LEVELS, State
@@ -27,18 +27,18 @@ import numpy as np
 # Seconds after which diagnostics are published even if no image triggers them.
 _DIAGNOSTICS_PERIOD = 1.0
 
-# Limit in bytes for the queued images, and for the queued side inputs: a thousand small images are
-# a short delay, and a thousand large ones more memory than a robot has.
+# Limit in bytes for the queued images, and for the queued auxiliary inputs: a thousand small
+# images are a short delay, and a thousand large ones more memory than a robot has.
 MAX_QUEUE_BYTES = 500_000_000
 
 # Approximate size of a message in bytes without its pixels.
 _MESSAGE_OVERHEAD = 4_000
 
-# Seconds for which an image waits for its side inputs, such as gyro rates and mask.
-_SIDE_INPUT_TIMEOUT = 0.1
+# Seconds for which an image waits for its auxiliary inputs, such as gyro rates and mask.
+_AUXILIARY_TIMEOUT = 0.1
 
-# With queue_policy 'every' that wait restarts with each side input, up to this in total.
-_MAX_SIDE_INPUT_TIMEOUT = 2.0
+# With queue_policy 'every' that wait restarts with each auxiliary input, up to this in total.
+_MAX_AUXILIARY_TIMEOUT = 2.0
 
 # Seconds for which an image after a gap waits for the next one, which shows a wrong stamp.
 _NEXT_IMAGE_TIMEOUT = 1.0
@@ -78,7 +78,7 @@ class Session:
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        self._side_inputs = SideInputs(MAX_QUEUE_BYTES)
+        self._auxiliary = AuxiliaryQueue(MAX_QUEUE_BYTES)
         self._counted_drops = self._lost = self._counted_lost = self._skipped = 0
         self._drops_logged = False
         self._latencies = Latencies()
@@ -100,7 +100,7 @@ class Session:
         If its messages are being published already, all of them are.
         """
         self._stopping = True
-        self._side_inputs.wake()
+        self._auxiliary.wake()
         self._queue.close()
         self._queue.clear()
         if self._worker.is_alive():
@@ -160,7 +160,7 @@ class Session:
         self._take('mask', message)
 
     def _take(self, what: str, message: Any) -> None:
-        self._side_inputs.put(what, message, _bytes(message))
+        self._auxiliary.put(what, message, _bytes(message))
 
     def count_lost(self, number: int) -> None:
         """Count images that were sent and did not arrive."""
@@ -175,7 +175,7 @@ class Session:
             # An image that has left the queue may be waiting for the lock.
             self._forgotten = monotonic()
             self._queue.clear()
-            self._side_inputs.clear()
+            self._auxiliary.clear()
             self._latencies.clear()
             self._log.clear()
             self._counted_drops = self._queue.dropped
@@ -246,7 +246,7 @@ class Session:
         try:
             silent = monotonic() - self._last_image > SILENCE_TIMEOUT
             if not len(self._queue):
-                self._side_inputs.feed(self._tracker, np.inf)
+                self._auxiliary.feed(self._tracker, np.inf)
             if silent:
                 # No image is queued that arrived before this CameraInfo.
                 self._take_info(self._newest_info)
@@ -268,7 +268,7 @@ class Session:
     def _work(self) -> None:
         try:
             while (received := self._queue.get()) is not None:
-                self._wait_for_side_inputs(received)
+                self._wait_for_auxiliary(received)
                 self._wait_for_next_if_ahead(received)
                 with self._turnstile:
                     pass
@@ -278,18 +278,18 @@ class Session:
         finally:
             # Nothing processes what arrives from now on.
             self._queue.close()
-            self._side_inputs.close()
+            self._auxiliary.close()
 
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
         self._update_node_diagnostics()
         self._take_info(received.info)
-        self._side_inputs.feed(tracker, self._side_input_cutoff(received))
+        self._auxiliary.feed(tracker, self._auxiliary_cutoff(received))
         frame = frame_of(received.image.header)
         if not tracker.mounted:
             self._mount(frame)
-        self._mount_side_inputs(frame)
+        self._mount_auxiliary(frame)
         waiting = self._queue.peek()
         following = None if waiting is None else waiting.image
         if following is not None:
@@ -302,21 +302,21 @@ class Session:
             if self._wiring.wants(topic) and (made := make()):
                 self._publish([made])
 
-    def _wait_for_side_inputs(self, received: _Received) -> None:
-        """Wait briefly for the side inputs of an image that have not arrived yet."""
-        inputs = self._side_inputs
-        # With 'every' on a slow machine, side inputs arrive late, but keep arriving.
+    def _wait_for_auxiliary(self, received: _Received) -> None:
+        """Wait briefly for the auxiliary inputs of an image that have not arrived yet."""
+        inputs = self._auxiliary
+        # With 'every' on a slow machine, auxiliary inputs arrive late, but keep arriving.
         patient = self._tracker.config.ros.queue_policy == 'every'
-        latest = monotonic() + _MAX_SIDE_INPUT_TIMEOUT
+        latest = monotonic() + _MAX_AUXILIARY_TIMEOUT
         while not self._stopping and received.at > self._forgotten:
             inputs.expect()
             with self._lock:
-                inputs.feed(self._tracker, self._side_input_cutoff(received))
+                inputs.feed(self._tracker, self._auxiliary_cutoff(received))
                 while (lacking := self._tracker.needs(received.image)) and inputs.feed_next(
-                        self._tracker, received.at + _MAX_SIDE_INPUT_TIMEOUT):
+                        self._tracker, received.at + _MAX_AUXILIARY_TIMEOUT):
                     pass
             since = max(received.at, inputs.newest) if patient else received.at
-            left = min(since + _SIDE_INPUT_TIMEOUT, latest) - monotonic()
+            left = min(since + _AUXILIARY_TIMEOUT, latest) - monotonic()
             if not lacking or left <= 0:
                 return
             inputs.wait(left)
@@ -327,11 +327,11 @@ class Session:
         if leaps and received.at > self._forgotten:
             self._queue.peek(timeout=_NEXT_IMAGE_TIMEOUT)
 
-    def _side_input_cutoff(self, received: _Received) -> float:
-        """Return the arrival time up to which side inputs are used: later ones are for others."""
+    def _auxiliary_cutoff(self, received: _Received) -> float:
+        """Return the arrival time after which auxiliary inputs are for later images."""
         return received.at if len(self._queue) else np.inf
 
-    def _mount_side_inputs(self, image_frame: str) -> None:
+    def _mount_auxiliary(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.missing_mountings(image_frame).items():
             if (mounting := self._wiring.transform(parent, child)) is not None:
                 self._tracker.mount_sensor(what, mounting)

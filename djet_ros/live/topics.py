@@ -16,7 +16,7 @@ SPEED_TYPES = {
 }
 
 # Inputs of the odometry with the parameter odometry.<topic>.
-SIDE_INPUT_TYPES = {
+AUXILIARY_TYPES = {
     'imu': 'sensor_msgs/msg/Imu',
     'guess': 'nav_msgs/msg/Odometry',
     'mask': IMAGE_TYPES['raw'],

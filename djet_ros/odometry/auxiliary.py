@@ -37,10 +37,10 @@ class AuxiliaryInputs:
     """
 
     def __init__(self, config: OdometryConfig, scale: ScaleSource,
-                 still_mask: NDArray[np.bool_] | None = None) -> None:
+                 static_mask: NDArray[np.bool_] | None = None) -> None:
         self.gyro: Gyro | None = None
         self.guess: Guess | None = None
-        self._masks = Masks(still_mask)
+        self._masks = Masks(static_mask)
         self._frames: dict[str, str] = {}
         self.configure(config, scale)
         self.reset()
@@ -58,10 +58,10 @@ class AuxiliaryInputs:
             self.gyro.configure(noise, offset)
         if self.gyro is not None and (quaternion := config.imu_quaternion()) is not None:
             self.gyro.mount(Rotation.from_quat(quaternion).as_matrix())
-        still = self.guess.still if isinstance(self.guess, FrameGuess) else ''
+        fixed = self.guess.fixed if isinstance(self.guess, FrameGuess) else ''
         if not (config.guess or isinstance(scale, GuessScale)):
             self.guess = None
-        elif self.guess is None or still != config.guess_frame:
+        elif self.guess is None or fixed != config.guess_frame:
             self.guess = FrameGuess(config.guess_frame) if config.guess_frame else Guess()
         if isinstance(scale, GuessScale) and self.guess is not None:
             scale.guess = self.guess
@@ -179,7 +179,7 @@ class AuxiliaryInputs:
             'processed without it')
         if what == 'guess' and isinstance(self.guess, FrameGuess):
             return Complaint(f'no {what} in time', 'WARN', (
-                f"tf has the transform from '{self.guess.still}' (odometry.guess_frame) to "
+                f"tf has the transform from '{self.guess.fixed}' (odometry.guess_frame) to "
                 f"'{self.guess.camera}' too late or not at all; publish it, {_CLOCKS}"))
         return Complaint(f'no {what} in time', 'WARN', (
             f"the configuration requires '{what}', and {seen}; publish it, {_CLOCKS}"))

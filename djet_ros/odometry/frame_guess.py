@@ -13,14 +13,14 @@ import numpy as np
 class FrameGuess(Guess):
     """Poses of the camera's frame in a fixed frame, through the chain of frames between them."""
 
-    def __init__(self, still: str) -> None:
+    def __init__(self, fixed: str) -> None:
         super().__init__()
-        self._still, self.camera, self._frames = still, '', MovingFrames()
+        self._fixed, self.camera, self._frames = fixed, '', MovingFrames()
 
     @property
-    def still(self) -> str:
+    def fixed(self) -> str:
         """Return the name of the fixed frame."""
-        return self._still
+        return self._fixed
 
     def look_for(self, camera: str) -> None:
         """Set the name of the camera's frame; ``mount`` takes the images' axes in it."""
@@ -41,11 +41,11 @@ class FrameGuess(Guess):
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether all moving frames between the two have a pose at a stamp or after it."""
-        return self._frames.covers(self._still, self.camera, stamp_ns)
+        return self._frames.covers(self._fixed, self.camera, stamp_ns)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop poses that are not needed after the stamp of an image."""
         self._frames.forget_before(stamp_ns)
 
     def _at(self, start_ns: int, end_ns: int) -> Array:
-        return self._frames.poses(self._still, self.camera, np.array([start_ns, end_ns]))
+        return self._frames.poses(self._fixed, self.camera, np.array([start_ns, end_ns]))

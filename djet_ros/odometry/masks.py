@@ -27,8 +27,8 @@ def left_out(gray: NDArray[np.uint8]) -> NDArray[np.bool_]:
 class Masks:
     """Masks by stamp, and a static mask (H, W) bool or None; all before undistortion."""
 
-    def __init__(self, still: NDArray[np.bool_] | None = None) -> None:
-        self._still = still
+    def __init__(self, static: NDArray[np.bool_] | None = None) -> None:
+        self._static = static
         self._undistorted: tuple[Camera, tuple[int, ...], NDArray[np.bool_]] | None = None
         self.reset()
 
@@ -61,11 +61,11 @@ class Masks:
 
     def _of_camera(self, shape: tuple[int, ...], camera: Camera) -> NDArray[np.bool_] | None:
         """Return the undistorted static mask; cached, as the camera rarely changes."""
-        if self._still is None:
+        if self._static is None:
             return None
         if self._undistorted is None or self._undistorted[0] is not camera \
                 or self._undistorted[1] != shape:
-            self._undistorted = camera, shape, _undistorted(self._still, shape, camera,
+            self._undistorted = camera, shape, _undistorted(self._static, shape, camera,
                                                             'odometry.mask_file')
         return self._undistorted[2]
 

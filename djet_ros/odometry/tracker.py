@@ -61,7 +61,7 @@ class Tracker:
 
     message_type: returns the class for a type name such as 'sensor_msgs/msg/Image'; image_topic:
     resolved name of the image topic, by which odometry.rectified 'auto' decides; speed_topics:
-    topics of speeds, for texts; still_mask: (H, W) bool, pixels of all images that
+    topics of speeds, for texts; static_mask: (H, W) bool, pixels of all images that
     odometry.mask_file excludes; node: name of the node in diagnostics.
 
     Outgoing topics: relative_pose, relative_pose_cov (for pairs whose motion was estimated),
@@ -72,7 +72,7 @@ class Tracker:
     def __init__(self, config: Config, message_type: MessageType,
                  scale: ScaleSource | None = None, image_topic: str = '',
                  speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME,
-                 still_mask: NDArray[np.bool_] | None = None) -> None:
+                 static_mask: NDArray[np.bool_] | None = None) -> None:
         self.config = config
         # What a front end adds to each diagnostics message, such as its latency.
         self.node_values: dict[str, str] = {}
@@ -81,7 +81,7 @@ class Tracker:
         self._image_topic = image_topic
         self._speed_topics = speed_topics
         self._scale = scale or scale_source(config.odometry)
-        self._inputs = AuxiliaryInputs(config.odometry, self._scale, still_mask)
+        self._inputs = AuxiliaryInputs(config.odometry, self._scale, static_mask)
         self._odometry = VisualOdometry(config.estimator, config.odometry, self._scale,
                                         self._inputs.gyro, self._inputs.guess)
         self._node = node
@@ -90,7 +90,7 @@ class Tracker:
         self._info: Any = None
         self._info_frame = ''
         self._camera: Camera | None = None
-        self._masked = still_mask is not None
+        self._masked = static_mask is not None
         self._states = StateMachine()
         self._forget()
 

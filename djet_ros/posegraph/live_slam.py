@@ -40,7 +40,7 @@ class LiveSlam:
     Closes loops on a running odometry.
 
     config: sections slam and estimator, and the parameters shared with the odometry, listed in
-    live/parameters.py; still_mask: (H, W) bool, pixels that odometry.mask_file excludes from
+    live/parameters.py; static_mask: (H, W) bool, pixels that odometry.mask_file excludes from
     all images; message_type: function from a type name to its class; image_topic: resolved image
     topic, for odometry.rectified 'auto'; node: node name in the diagnostics.
 
@@ -50,7 +50,7 @@ class LiveSlam:
 
     def __init__(self, config: Config, message_type: MessageType, image_topic: str = '',
                  node: str = 'pose_graph_node',
-                 still_mask: NDArray[np.bool_] | None = None) -> None:
+                 static_mask: NDArray[np.bool_] | None = None) -> None:
         self.config, self.slam = config, config.slam
         # Values that the live node adds to each diagnostics message.
         self.node_values: dict[str, str] = {}
@@ -66,7 +66,7 @@ class LiveSlam:
         self._camera: Camera | None = None
         # Images with their cameras by stamp; None before the first CameraInfo.
         self._images: OrderedDict[int, tuple[Any, Camera | None]] = OrderedDict()
-        self._masks = Masks(still_mask)
+        self._masks = Masks(static_mask)
         self.reset()
 
     def reset(self) -> None:

@@ -13,7 +13,7 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import frame_of, stamp_ns
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import Recording
 
 # Time of the recording, in ns, for which an image waits for its mask, as in a replay.
@@ -26,7 +26,7 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
 
     It raises DjetError if the recording has no image with a stamp, or not in this order.
     """
-    masks = Masks(still_mask(config.odometry.mask_file))
+    masks = Masks(static_mask(config.odometry.mask_file))
     images = _images(recording, config, masks)
 
     def frame_at(stamp: int) -> Frame:
@@ -44,7 +44,7 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
     """Yield the images of a recording with their cameras, once masks has their masks."""
     rectified = is_rectified(config.odometry.rectified, recording.image_topic)
     camera: Camera | None = None
-    mask_topic = recording.beside.get('mask', '') if config.odometry.mask else ''
+    mask_topic = recording.auxiliary.get('mask', '') if config.odometry.mask else ''
     waiting: deque[tuple[int, Camera, Any]] = deque()
     for topic, recorded, message in recording.messages(
             {recording.image_topic, recording.info_topic, mask_topic}):

@@ -8,6 +8,7 @@ A step combines three messages of one stamp: the Odometry (pose of the camera), 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from djet_ros.core.types import Array, STARTED, TRACKED
@@ -114,20 +115,28 @@ class StepMessages:
         A failed pair adds none, as the next pair may bridge it. If the next pair instead starts
         from its frame, that frame's step is added first.
         """
-        _, pose = pose_of(parts.odometry)
-        frame = parts.odometry.header.frame_id
-        here, rotation_covariance = _of_camera(pose, self._mounting), None
-        if not self._base_frame:
-            rotation_covariance = rotation_covariance_of(parts.odometry, self._axes[:3, :3])
+        step = self._without_motion(status, parts.odometry)
+        if status.status in STARTED:
+            self._bad.clear()
+            return [step]
         if status.status not in TRACKED:
-            alone = Step(status.stamp_ns, status.status, here, odom_frame=frame,
-                         keyframe=status.keyframe, k1=status.k1,
-                         rotation_covariance=rotation_covariance)
-            if status.status in STARTED:
-                self._bad.clear()
-                return [alone]
-            self._bad.append(alone)
+            self._bad.append(step)
             return []
+        step = self._with_motion(step, status, parts)
+        reference = [bad for bad in self._bad if bad.stamp_ns == step.previous_stamp_ns]
+        self._bad.clear()
+        return [*reference, step]
+
+    def _without_motion(self, status: FrameStatus, odometry: Any) -> Step:
+        """Return the step of a frame by its Odometry and status alone."""
+        _, pose = pose_of(odometry)
+        return Step(status.stamp_ns, status.status, _of_camera(pose, self._mounting),
+                    odom_frame=odometry.header.frame_id, keyframe=status.keyframe, k1=status.k1,
+                    rotation_covariance=None if self._base_frame else rotation_covariance_of(
+                        odometry, self._axes[:3, :3]))
+
+    def _with_motion(self, step: Step, status: FrameStatus, parts: _Parts) -> Step:
+        """Return a step with the relative pose; DjetError if it contradicts the Odometry."""
         expected = self._base_frame or parts.relative.header.frame_id
         if parts.odometry.child_frame_id != expected:
             raise DjetError(
@@ -139,15 +148,14 @@ class StepMessages:
             raise DjetError(f'the relative pose with stamp {status.stamp_ns} ns is not finite; '
                             'check the publisher of the odometry')
         covariance = np.asarray(parts.relative.pose.covariance, np.float64).reshape(6, 6)
-        step = Step(status.stamp_ns, status.status, here, status.reference_ns,
-                    _of_camera(motion, self._axes), rotated(self._axes[:3, :3].T, covariance),
-                    status.scale is not Scale.UNKNOWN, frame, status.scale is Scale.METRIC,
-                    status.keyframe, status.k1, rotation_covariance)
+        step = replace(step, previous_stamp_ns=status.reference_ns,
+                       motion=_of_camera(motion, self._axes),
+                       covariance=rotated(self._axes[:3, :3].T, covariance),
+                       scale_known=status.scale is not Scale.UNKNOWN,
+                       metric=status.scale is Scale.METRIC)
         if step.tracked:
             step.check(f'odometry edge to {status.stamp_ns} ns')
-        reference = [bad for bad in self._bad if bad.stamp_ns == step.previous_stamp_ns]
-        self._bad.clear()
-        return [*reference, step]
+        return step
 
 
 def rotation_covariance_of(odometry: Any, axes: Array) -> Array | None:

@@ -158,8 +158,8 @@ def _stamps(path: Path, count: int) -> NDArray[np.int64]:
 
 
 def _poses_beside(folder: Path) -> Path | None:
-    beside = folder.parent.parent / 'poses' / f'{folder.name}.txt'
-    return beside if beside.exists() else None
+    published = folder.parent.parent / 'poses' / f'{folder.name}.txt'
+    return published if published.exists() else None
 
 
 def _poses(path: Path, count: int) -> Array:

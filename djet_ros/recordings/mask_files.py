@@ -10,6 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def still_mask(path: str) -> NDArray[np.bool_] | None:
+def static_mask(path: str) -> NDArray[np.bool_] | None:
     """Return the excluded pixels (H, W) of a mask file, None for no file. Raises DjetError."""
     return left_out(ImageFiles([Path(path)]).gray(0)) if path else None

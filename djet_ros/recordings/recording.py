@@ -63,7 +63,7 @@ class Recording(Closing):
 
     ``len()`` is the number of images, as far as it is known in advance. ground_truth_topic: None
     if there is no ground truth; ground_truth_file: the file that replaces the recording's own, or
-    None; beside: topics of the auxiliary inputs by their names in AUXILIARY, and under 'frames'
+    None; auxiliary: topics of the auxiliary inputs by their names in AUXILIARY, and under 'frames'
     the topic of the static frames, which hold the mounting of an IMU.
     """
 
@@ -71,7 +71,7 @@ class Recording(Closing):
     info_topic: str
     ground_truth_topic: str | None
     ground_truth_file: Path | None = None
-    beside: dict[str, str]
+    auxiliary: dict[str, str]
 
     @abstractmethod
     def __len__(self) -> int:
@@ -113,7 +113,7 @@ class SequenceRecording(Recording):
         self.info_topic = INFO_TOPIC
         known = self._poses is not None or self._stamped is not None
         self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
-        self.beside = {} if self._imu is None else {'imu': IMU_TOPIC,
+        self.auxiliary = {} if self._imu is None else {'imu': IMU_TOPIC,
                                                     'frames': STATIC_FRAMES_TOPIC}
 
     def __len__(self) -> int:
@@ -131,7 +131,7 @@ class SequenceRecording(Recording):
         yield from _stamped_poses(self._stamped)
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
             if self._imu is not None and (
-                    topics is None or not set(topics).isdisjoint(self.beside.values())):
+                    topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
                 if index == 0:
                     yield _imu_frame(stamp, self._imu)
                 for sample in self._imu.until(next_sample, stamp):
@@ -171,7 +171,7 @@ class BagRecording(Recording):
     """
 
     def __init__(self, path: Path, image_topic: str | None = None, info_topic: str | None = None,
-                 poses: Path | None = None, beside: Mapping[str, str | None] | None = None,
+                 poses: Path | None = None, auxiliary: Mapping[str, str | None] | None = None,
                  strict: bool = True) -> None:
         """Open the bag and choose the topics; see ``open_recording``."""
         self.bag = Bag(path)
@@ -186,7 +186,7 @@ class BagRecording(Recording):
             self.info_topic = self._info_topic(info_topic)
             self.ground_truth_topic = (self._ground_truth_topic() if poses is None
                                        else GROUND_TRUTH_TOPIC)
-            self.beside = dict(self._auxiliary_topics(beside or {}, strict))
+            self.auxiliary = dict(self._auxiliary_topics(auxiliary or {}, strict))
             self._require_one_type()
             self.ground_truth_file = poses
             self._poses = None if poses is None else _read_truth(poses, self._count)
@@ -201,7 +201,7 @@ class BagRecording(Recording):
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Yield the messages in recorded order, with the poses of a ground-truth file."""
         wanted = {topic for topic in (self.image_topic, self.info_topic, self.ground_truth_topic,
-                                      *self.beside.values())
+                                      *self.auxiliary.values())
                   if topic and (topics is None or topic in topics)}
         if self._poses is None:
             yield from self.bag.messages(wanted)
@@ -260,7 +260,7 @@ class BagRecording(Recording):
     def _require_one_type(self) -> None:
         """Raise DjetError if a chosen topic was recorded with several types."""
         for name in (self.image_topic, self.info_topic, self.ground_truth_topic,
-                     *self.beside.values()):
+                     *self.auxiliary.values()):
             types = sorted(topic.msgtype for topic in self._topics if topic.name == name)
             if len(types) > 1:
                 raise DjetError(one_line(
@@ -310,30 +310,31 @@ class BagRecording(Recording):
 
 
 def open_recording(path: Path, image_topic: str | None = None, info_topic: str | None = None,
-                   poses: Path | None = None, beside: Mapping[str, str | None] | None = None,
+                   poses: Path | None = None, auxiliary: Mapping[str, str | None] | None = None,
                    strict: bool = True, damaged: bool = False) -> Recording:
     """
     Open a bag, or a folder of image files in one of the layouts of ``open_sequence``.
 
     poses: ground truth in place of the recording's own, a KITTI (one row per image) or TUM
-    (stamped) file; beside: the auxiliary inputs to read, by their names in AUXILIARY, each with
+    (stamped) file; auxiliary: the auxiliary inputs to read, by their names in AUXILIARY, each with
     its topic, or None to find it; strict: whether a missing input is an error; damaged: whether
     image files that can't be decoded are passed on, as CompressedImage, as those of a bag are.
     Raises DjetError.
     """
-    beside = beside or {}
+    auxiliary = auxiliary or {}
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise DjetError(f'{path} is neither a file nor a folder; name a bag or a folder of images')
     if is_bag(path) or not path.exists():
-        return BagRecording(path, image_topic, info_topic, poses, beside, strict)
-    if strict and (image_topic or info_topic or beside.keys() - {'imu'} or any(beside.values())):
+        return BagRecording(path, image_topic, info_topic, poses, auxiliary, strict)
+    if strict and (image_topic or info_topic or auxiliary.keys() - {'imu'}
+                   or any(auxiliary.values())):
         raise DjetError(f'{path} is a folder of images, not a bag: it has no topics, and no '
                         'recorded speeds, guesses, masks or tf; omit these options')
     sequence = open_sequence(path, own_poses=poses is None)
-    if strict and 'imu' in beside and sequence.imu is None:
+    if strict and 'imu' in auxiliary and sequence.imu is None:
         raise DjetError(f'{path} holds no IMU data; set odometry.imu to false, or name a '
                         'recording with an IMU')
-    return SequenceRecording(sequence, 'imu' in beside, poses, damaged)
+    return SequenceRecording(sequence, 'imu' in auxiliary, poses, damaged)
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:

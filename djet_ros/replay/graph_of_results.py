@@ -50,29 +50,13 @@ def read_steps(folder: Path, warn: Warn | None = None) -> list[Step]:
     if [row.stamp_ns for row in rows] != stamps[:len(rows)].tolist():
         raise DjetError(f'{folder}: frames.csv and trajectory_tum.txt are not of the same run; '
                         'replay the recording again')
-    # After a step back in time stamps may repeat, in this order.
-    motions: defaultdict[int, deque[_Estimate]] = defaultdict(deque)
-    rotation_covariances: defaultdict[int, deque[Array | None]] = defaultdict(deque)
-    problem = None
-    try:
-        for stamp, motion, covariance in _motions(folder / BAG,
-                                                  load_yaml(folder / 'config.yaml')):
-            if motion is None:
-                rotation_covariances[stamp].append(covariance)
-            else:
-                motions[stamp].append(motion)
-    except DjetError as error:
-        if warn is None or not motions:
-            raise
-        problem = error
-    estimates = [motions[row.stamp_ns].popleft()
-                 if row.status in TRACKED and motions[row.stamp_ns] else None for row in rows]
-    if problem is not None and warn is not None:
+    estimates, covariances, problem = _estimates(folder, rows)
+    if problem is not None:
+        if warn is None:
+            raise problem
         whole = _whole(rows, estimates)
         warn(f'{problem}; only the first {len(whole)} of {len(rows)} frames are used')
         rows = whole
-    covariances = [rotation_covariances[row.stamp_ns].popleft()
-                   if rotation_covariances[row.stamp_ns] else None for row in rows]
     steps = list(_steps(rows, poses, estimates, covariances, folder))
     if len(steps) < 2:
         raise DjetError(f'{folder}: no motion was estimated between any two frames, so there is '
@@ -111,6 +95,35 @@ def _rows(path: Path) -> list[_Row]:
         except (KeyError, TypeError, ValueError) as error:
             raise DjetError(f'{path} line {number} is not a row of a replay: {error}') from error
     return rows
+
+
+def _estimates(folder: Path, rows: list[_Row]
+               ) -> tuple[list[_Estimate | None], list[Array | None], DjetError | None]:
+    """
+    Return the motion and the rotation covariance of each row, as far as the bag has them.
+
+    Also returns why the bag could not be read to its end, or None; raises DjetError if it has no
+    motion at all.
+    """
+    # After a step back in time stamps may repeat, in this order.
+    motions: defaultdict[int, deque[_Estimate]] = defaultdict(deque)
+    covariances: defaultdict[int, deque[Array | None]] = defaultdict(deque)
+    problem = None
+    try:
+        for stamp, motion, covariance in _motions(folder / BAG,
+                                                  load_yaml(folder / 'config.yaml')):
+            if motion is None:
+                covariances[stamp].append(covariance)
+            else:
+                motions[stamp].append(motion)
+    except DjetError as error:
+        if not motions:
+            raise
+        problem = error
+    return ([motions[row.stamp_ns].popleft()
+             if row.status in TRACKED and motions[row.stamp_ns] else None for row in rows],
+            [covariances[row.stamp_ns].popleft() if covariances[row.stamp_ns] else None
+             for row in rows], problem)
 
 
 def _motions(bag: Path, config: Config

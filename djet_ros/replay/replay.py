@@ -29,7 +29,7 @@ from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.datasets import LONGEST_GAP_NS
 from djet_ros.recordings.decoding import message_type
-from djet_ros.recordings.mask_files import still_mask
+from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import Recording
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.lookahead import with_next_image
@@ -38,8 +38,9 @@ from djet_ros.replay.results import PLOT, ResultsFolder, UNFINISHED
 from djet_ros.replay.step_log import StepLog
 import numpy as np
 
-# Time of the recording, in ns, for which an image waits for its side inputs (gyro, guess, mask).
-_SIDE_INPUT_TIMEOUT_NS = 10**9
+# Time of the recording, in ns, for which an image waits for its auxiliary inputs: gyro rates,
+# guess and mask.
+_AUXILIARY_TIMEOUT_NS = 10**9
 
 
 class Outcome(NamedTuple):
@@ -47,7 +48,7 @@ class Outcome(NamedTuple):
     The result of a run.
 
     summary: as written to summary.json; problem: error message in one line, or None; advice:
-    warnings, one line each, on images and side inputs that could not be used.
+    warnings, one line each, on images and auxiliary inputs that could not be used.
     """
 
     summary: dict[str, Any]
@@ -72,10 +73,10 @@ class Replay:
         self._frames = _static_frames(recording) if config.odometry.base_frame else StaticFrames()
         self._tracker = Tracker(config, message_type, _scale(recording, config),
                                 recording.image_topic,
-                                still_mask=still_mask(config.odometry.mask_file))
-        self._names = {topic: what for what, topic in recording.beside.items()}
-        # Images waiting for side inputs, which may be recorded later, and the CameraInfo between
-        # them.
+                                static_mask=static_mask(config.odometry.mask_file))
+        self._names = {topic: what for what, topic in recording.auxiliary.items()}
+        # Images waiting for auxiliary inputs, which may be recorded later, and the CameraInfo
+        # between them.
         self._waiting: deque[BagMessage] = deque()
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
@@ -133,7 +134,7 @@ class Replay:
         return self._work_off(message.stamp_ns)
 
     def _work_off(self, now_ns: int | None) -> int:
-        """Process the images that have all side inputs or timed out; return their number."""
+        """Process the images that have all auxiliary inputs or timed out; return their number."""
         done = 0
         while self._waiting:
             first = self._waiting[0]
@@ -143,7 +144,7 @@ class Replay:
             following = self._after_the_first
             if now_ns is not None and (
                     (following is None and self._tracker.follows_gap(first.message))
-                    or (now_ns - first.stamp_ns < _SIDE_INPUT_TIMEOUT_NS
+                    or (now_ns - first.stamp_ns < _AUXILIARY_TIMEOUT_NS
                         and self._tracker.needs(first.message))):
                 break
             self._image(self._waiting.popleft(), following)

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.widest <= 10:
         raise DjetError(f'--widest is {args.widest:g}; it must be between 0 and 10 s')
     with open_recording(args.source, args.image_topic, args.info_topic,
-                        beside={'imu': args.imu_topic}) as recording, \
+                        auxiliary={'imu': args.imu_topic}) as recording, \
             progress_bar('imu-offset', len(recording)) as advance:
         rotations, stamps, rates = rotations_and_rates(recording, Config(), advance)
     fit = fit_imu(rotations, stamps, rates, args.widest)

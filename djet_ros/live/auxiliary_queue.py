@@ -1,4 +1,4 @@
-"""Queue of a session's messages other than images, until the tracker takes them."""
+"""Queue of auxiliary inputs (IMU, guess, mask, speed, tf) until the tracker takes them."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.odometry.tracker import Tracker
 import numpy as np
 
-# Queued messages of side inputs (IMU, guess, mask, speed, tf): minutes of a fast IMU.
-_MAX_SIDE_INPUTS = 100_000
+# Messages in the queue: minutes of a fast IMU.
+_MAX_MESSAGES = 100_000
 
 
-class _SideInput(NamedTuple):
-    """A message other than an image, the tracker's method for it, and its time of arrival."""
+class _Queued(NamedTuple):
+    """A message, the tracker's method for it, and its time of arrival."""
 
     what: str
     message: Any
     at: float
 
 
-class SideInputs:
+class AuxiliaryQueue:
     """
-    Side inputs in the order of arrival; put by one thread, passed to the tracker by another.
+    Messages in the order of arrival; put by one thread, passed to the tracker by another.
 
     newest: arrival time (monotonic seconds) of the last one; max_bytes: limit of the queue, beyond
     which the oldest are dropped.
     """
 
     def __init__(self, max_bytes: float) -> None:
-        self._queue: FrameQueue[_SideInput] = FrameQueue('latest', _MAX_SIDE_INPUTS, max_bytes)
+        self._queue: FrameQueue[_Queued] = FrameQueue('latest', _MAX_MESSAGES, max_bytes)
         self._arrived = Event()
         self.newest = -np.inf
 
     def put(self, what: str, message: Any, size: int) -> None:
         """Queue a message of some bytes for the tracker's method ``what``."""
         self.newest = monotonic()
-        self._queue.put(_SideInput(what, message, self.newest), size)
+        self._queue.put(_Queued(what, message, self.newest), size)
         self._arrived.set()
 
     def feed(self, tracker: Tracker, until: float) -> None:
