@@ -1,5 +1,5 @@
 """
-Ask pip-audit for known vulnerabilities in what is installed beside it.
+Ask pip-audit for known vulnerabilities in the packages that it is installed with.
 
 Exit code 0: all packages were audited and none has any; 1: some have; 3: not all could be audited,
 which is no good news. pip-audit itself takes a package that its service does not know for clean.

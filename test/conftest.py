@@ -27,7 +27,7 @@ def kitti() -> Path:
 
 @pytest.fixture
 def small_kitti(tmp_path: Path) -> Callable[..., Path]:
-    """Give a function that writes a sequence of noise images, and returns its folder."""
+    """Return a function that writes a sequence of noise images, and returns its folder."""
     return lambda **sizes: write_small_kitti(tmp_path / 'dataset', **sizes)
 
 

@@ -17,10 +17,10 @@ def check_messages(result: OdometryResult) -> None:
     """Check all covariances of what is published of a frame: no zero, nothing infinite."""
     make = Messages(message_type, OdometryConfig())
     odometry = make.odometry(result)
-    told = {'pose': odometry.pose, 'twist': odometry.twist}
+    estimates = {'pose': odometry.pose, 'twist': odometry.twist}
     if result.status in TRACKED:
-        told['relative pose'] = make.relative_pose_cov(result).pose
-    for name, one in told.items():
+        estimates['relative pose'] = make.relative_pose_cov(result).pose
+    for name, one in estimates.items():
         covariance = np.reshape(one.covariance, (6, 6))
         where = f'{name} of a frame that is {result.status.value}'
         assert np.isfinite(covariance).all(), where

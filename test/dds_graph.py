@@ -47,13 +47,13 @@ class Peer:
     def __init__(self) -> None:
         from djet_ros.dds.graph import Graph
         self.graph = Graph(ENVIRONMENT)
-        self.heard: dict[str, list[Any]] = defaultdict(list)
+        self.received: dict[str, list[Any]] = defaultdict(list)
         for topic, kind in TYPES.items():
             self.listen(topic, kind)
 
     def listen(self, topic: str, kind: str) -> None:
         """Collect in ``heard`` what is published."""
-        self.graph.listen(topic, kind, self.heard[topic].append, DEEP)
+        self.graph.listen(topic, kind, self.received[topic].append, DEEP)
 
     def advertise(self, topic: str, kind: str, profile: Profile = DEEP,
                   listeners: int = 1) -> Any:
@@ -66,7 +66,7 @@ class Peer:
         """Take messages until a condition holds, and give its value."""
         end = monotonic() + seconds
         while not (value := condition()):
-            counts = {topic: len(messages) for topic, messages in self.heard.items()}
+            counts = {topic: len(messages) for topic, messages in self.received.items()}
             assert monotonic() < end, f'{what} did not come; heard {counts}'
             self.graph.spin(0.05)
         return value
@@ -77,9 +77,9 @@ class Peer:
         while monotonic() < end:
             self.graph.spin(0.05)
 
-    def said(self, **wanted: str) -> dict[str, str] | None:
+    def diagnostics(self, **wanted: str) -> dict[str, str] | None:
         """Return the last diagnostics that have these values; underscores stand for blanks."""
-        for message in reversed(self.heard['/diagnostics']):
+        for message in reversed(self.received['/diagnostics']):
             values = {pair.key: pair.value for pair in message.status[0].values}
             values['message'] = message.status[0].message
             if all(values.get(key.replace('_', ' ')) == value for key, value in wanted.items()):
@@ -90,12 +90,12 @@ class Peer:
 class Command:
     """A djet command in a process of its own; before: what its Python is to do first."""
 
-    def __init__(self, log: Path, *words: str | Path, before: str = '') -> None:
+    def __init__(self, log: Path, *arguments: str | Path, before: str = '') -> None:
         self.path = log
         with log.open('w') as file:
             self.process = subprocess.Popen(
                 [sys.executable, '-c', f'{before}from djet_ros.cli.main import main; '
-                 'raise SystemExit(main())', *map(str, words)],
+                 'raise SystemExit(main())', *map(str, arguments)],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 
     @property

@@ -54,9 +54,9 @@ def run(name: str, seconds: int) -> bool:
     with log.open('w') as output:
         code = subprocess.run([sys.executable, __file__, '--inside', '--seconds', str(seconds),
                                name], stdout=output, stderr=output, check=False).returncode
-    said = log.read_text(errors='replace')
-    inputs = re.findall(r'^#(\d+)', said, re.MULTILINE)
-    broke = re.findall(r'Test unit written to (\S+)', said)
+    text = log.read_text(errors='replace')
+    inputs = re.findall(r'^#(\d+)', text, re.MULTILINE)
+    broke = re.findall(r'Test unit written to (\S+)', text)
     print(f'{name:18} {inputs[-1] if inputs else 0:>9} inputs  '
           f'{"held" if code == 0 else f"BROKE (exit code {code}): {log}"}', flush=True)
     for path in broke:

@@ -87,7 +87,7 @@ def only_our_errors() -> Iterator[None]:
 
 @contextmanager
 def folder() -> Iterator[Path]:
-    """Give a new folder, in memory where there is such a place, and remove it."""
+    """Return a new folder, in memory where there is such a place, and remove it."""
     memory = Path('/dev/shm')
     with tempfile.TemporaryDirectory(prefix='djet-fuzz-',
                                      dir=memory if memory.is_dir() else None) as name:
@@ -144,10 +144,10 @@ def camera_of(data: bytes) -> None:
             assert np.isfinite(camera.K).all()
             assert camera.undistort(PICTURE).shape == PICTURE.shape
     one = tracker()
-    said = one.camera_info(info)
+    outgoing = one.camera_info(info)
     for i in range(3):
-        said += one.image(image(np.roll(PICTURE, 2 * i, axis=1), stamp_ns=i * SECOND // 10))
-    for _, message in said:
+        outgoing += one.image(image(np.roll(PICTURE, 2 * i, axis=1), stamp_ns=i * SECOND // 10))
+    for _, message in outgoing:
         assert serialised(message)
 
 

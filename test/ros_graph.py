@@ -45,7 +45,7 @@ class Peer:
         self._changed = Condition()
         self._answers: list[dict[str, Any]] = []
         self._ended = False
-        self.heard: dict[str, list[Any]] = defaultdict(list)
+        self.received: dict[str, list[Any]] = defaultdict(list)
         self._types: dict[str, str] = {}
         Thread(target=self._read, daemon=True).start()
 
@@ -55,7 +55,7 @@ class Peer:
             with self._changed:
                 if 'topic' in said:
                     kind = self._types[said['topic']]
-                    self.heard[said['topic']].append(
+                    self.received[said['topic']].append(
                         STORE.deserialize_cdr(b64decode(said['data']), kind))
                 else:
                     self._answers.append(said)
@@ -94,9 +94,9 @@ class Peer:
              seconds: float = PATIENCE) -> Any:
         """Wait until a condition holds of what was heard, and give its value."""
         with self._changed:
-            value = self._changed.wait_for(lambda: condition(self.heard), seconds)
-            counts = {topic: len(messages) for topic, messages in self.heard.items()}
-            said = self.heard.get('/diagnostics', [])[-1:]
+            value = self._changed.wait_for(lambda: condition(self.received), seconds)
+            counts = {topic: len(messages) for topic, messages in self.received.items()}
+            said = self.received.get('/diagnostics', [])[-1:]
             assert value, f'{what} did not come; heard {counts}, last {said}'
         return value
 
@@ -124,7 +124,7 @@ class Peer:
 class NodeProcess:
     """The node under test in a process of its own, with its log."""
 
-    def __init__(self, log: Path, words: Sequence[str], parameters: Mapping[str, Any],
+    def __init__(self, log: Path, ros_arguments: Sequence[str], parameters: Mapping[str, Any],
                  name: str = 'vo_node', before: str = '') -> None:
         """Start it with words for ROS, such as remappings, and with parameters by name."""
         self.path = log
@@ -132,7 +132,7 @@ class NodeProcess:
                   for word in ('-p', f'{name}:={json.dumps(value)}')]
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [*command(name, before), '--ros-args', *words, *values],
+                [*command(name, before), '--ros-args', *ros_arguments, *values],
                 env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT)
 
     @property
@@ -163,11 +163,11 @@ def nodes(folder: Path, image: str) -> Iterator[Callable[..., NodeProcess]]:
     """Return a function that starts a node on images, and end all of them with clean logs."""
     started: list[NodeProcess] = []
 
-    def start(*words: str, name: str = 'vo_node', before: str = '',
+    def start(*ros_arguments: str, name: str = 'vo_node', before: str = '',
               **parameters: Any) -> NodeProcess:
         log = folder / f'{name}_{len(started)}.log'
-        started.append(NodeProcess(log, [*words, '-r', f'image:={image}'], parameters, name,
-                                   before))
+        started.append(NodeProcess(log, [*ros_arguments, '-r', f'image:={image}'], parameters,
+                                   name, before))
         return started[-1]
 
     yield start

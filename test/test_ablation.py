@@ -61,7 +61,7 @@ def test_reprojection_error_stands_beside_on_the_places_by_gray_levels(road):
 
 def variant(change: str, rotation: list[float], direction: list[float],
             method: str = 'djet') -> dict[str, object]:
-    """Give a row of results.json."""
+    """Return a row of results.json."""
     errors = dict.fromkeys(('mean', 'median'), 0.1)
     return {'method': method, 'change': change, 'pairs': 6, 'failed': 0, 'rotation': errors,
             'direction': errors, 'ratio': {
@@ -80,8 +80,8 @@ def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
         variant(ON_PLACES, [1.2, 0.9, 1.5], [1.1, 0.8, 1.4], 'rpe'),
         variant(WEIGHED, [1.1, 0.9, 1.3], [1.1, 0.8, 1.4], 'rpe'),
         variant('', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0], 'rpe')]}
-    said = page.verdict(part)
-    assert said == (
+    verdict_text = page.verdict(part)
+    assert verdict_text == (
         'By means. Worse in both: squares. Worse in one, and not told apart in the other: alone. '
         'Better in one, and not told apart in the other: slow. Not told from `best`, whose '
         'intervals hold 1: wide.')

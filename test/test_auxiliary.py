@@ -54,8 +54,8 @@ class Drive:
             self.poses.append(here)
             self.images.append(cards.gray(here, noise=i + 100))
             if i >= 0:
-                way = 1 if i // 11 % 2 == 0 else -1
-                here = here @ pose(x=0.25 * way, z=0.15 * way, yaw=0.01 * np.sin(i))
+                sign = 1 if i // 11 % 2 == 0 else -1
+                here = here @ pose(x=0.25 * sign, z=0.15 * sign, yaw=0.01 * np.sin(i))
         self.felt: FeltMotion = feel(np.array(self.poses), 0.1, Mems(), 0)
 
     def imu(self) -> list[Any]:
@@ -96,7 +96,7 @@ def played(one: Tracker, drive: Drive, imu: list[Any], black: tuple[int, ...] = 
     return outgoing
 
 
-def said(one: Tracker) -> dict[str, str]:
+def diagnostics(one: Tracker) -> dict[str, str]:
     return {complaint.name: complaint.text for complaint in one.complaints}
 
 
@@ -184,8 +184,8 @@ def test_problems_of_a_gyro_are_reported_and_block_nothing(
                 one.imu(message)
         one.image(drive.image(i))
     assert one.counts.status['OK'] == len(drive.images) - 1
-    assert name in said(one)
-    assert re.search(text, said(one)[name])
+    assert name in diagnostics(one)
+    assert re.search(text, diagnostics(one)[name])
     assert one.diagnosis().level == 'WARN'
 
 
@@ -198,7 +198,7 @@ def test_a_gyro_with_a_wrong_mounting_is_reported_and_not_used() -> None:
         one.imu(message)
     for i in range(len(long.images)):
         one.image(long.image(i))
-    assert 'gyro does not fit' in said(one)
+    assert 'gyro does not fit' in diagnostics(one)
     assert one.last is not None and one.last.status.value == 'OK'
 
 
@@ -327,10 +327,10 @@ def test_queued_images_still_have_their_samples(live: Any, drive: Drive) -> None
     wait_for(one, 200)
     session.configure(one.config)  # let in when the last image is done with
     assert one.counts.processed == 200
-    said = [status.message for topic, message in graph.published if topic == '/diagnostics'
+    diagnostics = [status.message for topic, message in graph.published if topic == '/diagnostics'
             for status in message.status]
-    assert said
-    assert not any('no mask in time' in line for line in said)
+    assert diagnostics
+    assert not any('no mask in time' in line for line in diagnostics)
 
 
 # Masks
@@ -588,7 +588,8 @@ def test_a_frame_that_is_missing_on_tf_is_reported_by_name(drive: Drive) -> None
     one = tracker(**{'odometry.guess': True, 'odometry.guess_frame': 'wheels'})
     for i in range(6):
         one.image(drive.image(i))
-    assert "from 'wheels' (odometry.guess_frame) to 'camera'" in said(one)['no guess in time']
+    assert "from 'wheels' (odometry.guess_frame) to 'camera'" in diagnostics(one)[
+        'no guess in time']
 
 
 def test_our_own_output_is_refused_as_a_guess() -> None:

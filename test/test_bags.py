@@ -350,20 +350,20 @@ def test_results_of_a_killed_process_are_readable(tmp_path):
     rest, _ = process.communicate()
     printed = int(rest.split('\n')[-2]) if '\n' in rest else 300
     assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
-    delivered, said = read_until_broken(tmp_path / 'bag')
-    assert 'everything before that was read' in said
+    delivered, problem = read_until_broken(tmp_path / 'bag')
+    assert 'everything before that was read' in problem
     assert len(delivered) >= 2 * (printed - 1)
     assert [m.stamp_ns for m in delivered] == [i // 2 + 1 for i in range(len(delivered))]
 
 
 def test_the_command_converts(small_kitti, tmp_path, capsys):
-    words = ['kitti-to-bag', str(small_kitti(frames=6)), str(tmp_path / 'out'), '--storage',
+    arguments = ['kitti-to-bag', str(small_kitti(frames=6)), str(tmp_path / 'out'), '--storage',
              'sqlite3', '--start', '1', '--end', '4']
-    assert main(words) == 0
+    assert main(arguments) == 0
     assert capsys.readouterr().out == (
         f'{tmp_path / "out"}: 3 frames of 64x48, 0.2 s, with ground truth\n')
     assert (tmp_path / 'out' / 'out.db3').exists()
-    assert main(words) == 2
+    assert main(arguments) == 2
     assert 'pass --overwrite' in capsys.readouterr().err
 
 
@@ -377,8 +377,8 @@ def test_compressed_bags_are_read(tmp_path, storage, mode):
     if (storage, mode) == ('sqlite3', CompressionMode.STORAGE):
         pytest.skip('sqlite3 has no compression of its own')
     path = record(tmp_path / 'bag', camera_messages(5), storage, mode)
-    delivered, said = read_until_broken(path)
-    assert said is None
+    delivered, problem = read_until_broken(path)
+    assert problem is None
     expected, _ = read_until_broken(record(tmp_path / 'plain', camera_messages(5)))
     assert keys(delivered) == keys(expected)
 
@@ -399,8 +399,8 @@ def test_ros1_bags_give_the_messages_of_jazzy(tmp_path, compression):
 @pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
 def test_a_single_file_is_a_bag_whatever_its_name(whole, tmp_path, suffix):
     path = shutil.copy(whole[suffix], tmp_path / 'run #1?.data')
-    delivered, said = read_until_broken(path)
-    assert said is None
+    delivered, problem = read_until_broken(path)
+    assert problem is None
     assert len(delivered) == 60
     assert Counter(m.topic for m in delivered) == {'/cam/camera_info': 30, '/cam/image_raw': 30}
 
@@ -419,8 +419,8 @@ def test_split_bags_are_read_in_order_with_and_without_metadata(tmp_path):
             (bag / 'metadata.yaml').write_text(
                 f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}'
                 if metadata else '')
-        delivered, said = read_until_broken(bag)
-        assert said is None
+        delivered, problem = read_until_broken(bag)
+        assert problem is None
         assert [m.stamp_ns for m in delivered] == list(range(1, 34))
 
 
@@ -435,8 +435,8 @@ def test_messages_come_in_the_order_of_time_not_of_writing(tmp_path, storage):
 def test_an_mcap_without_chunks_or_index_is_read(whole, tmp_path):
     loose = tmp_path / 'loose.mcap'
     loose.write_bytes(without_chunks(whole['mcap'].read_bytes()))
-    delivered, said = read_until_broken(loose)
-    assert said is None
+    delivered, problem = read_until_broken(loose)
+    assert problem is None
     assert keys(delivered) == keys(read_until_broken(whole['mcap'])[0])
 
 
@@ -475,8 +475,8 @@ def test_bags_older_than_iron_have_no_definitions(whole, tmp_path):
     with sqlite3.connect(path) as database:
         database.execute('DROP TABLE message_definitions')
         database.execute('DROP TABLE schema')
-    delivered, said = read_until_broken(path)
-    assert said is None
+    delivered, problem = read_until_broken(path)
+    assert problem is None
     assert keys(delivered) == keys(read_until_broken(whole['db3'])[0])
 
 
@@ -512,10 +512,10 @@ def test_a_type_that_differs_is_read_by_the_recorded_definition(tmp_path, storag
 def test_a_type_that_lacks_what_jazzy_has_is_refused(tmp_path, old, new, value):
     store = changed_types(lambda text: text.replace(old, new))
     message = changed_image(store, **{new.split()[1]: value})
-    delivered, said = read_until_broken(
+    delivered, problem = read_until_broken(
         record(tmp_path / 'bag', [('/image', message, 5)], store=store))
     assert delivered == []
-    assert "recorded without a field 'height'" in said
+    assert "recorded without a field 'height'" in problem
 
 
 # Which topics are the camera
@@ -533,8 +533,8 @@ def test_two_cameras_are_listed_with_their_counts(tmp_path):
                 for name, make in (('camera_info', info), ('image_raw', image))
                 for stamp in range(1, 4)]
     path = record(tmp_path / 'bag', [*messages, ('/left/image_raw', image(9), 9)])
-    said = source_error(path)
-    assert '/left/image_raw (4), /right/image_raw (3); choose one with --image-topic' in said
+    problem = source_error(path)
+    assert '/left/image_raw (4), /right/image_raw (3); choose one with --image-topic' in problem
     with BagRecording(path, image_topic='/right/image_raw') as source:
         assert (source.info_topic, len(source)) == ('/right/camera_info', 3)
         assert {m.topic for m in source.messages()} == {'/right/camera_info', '/right/image_raw'}
@@ -559,8 +559,8 @@ def test_an_only_camera_info_serves_an_only_camera(tmp_path):
         assert source.info_topic == '/calibration'
     path = record(tmp_path / 'two', [('/a/image', image(1), 1), ('/b/image', image(1), 1),
                                      ('/a/camera_info', info(1), 1)])
-    said = source_error(path, image_topic='/b/image')
-    assert 'no camera_info in the namespace of /b/image; to use /a/camera_info' in said
+    problem = source_error(path, image_topic='/b/image')
+    assert 'no camera_info in the namespace of /b/image; to use /a/camera_info' in problem
 
 
 def test_ground_truth_is_found_by_its_name(tmp_path):
@@ -599,8 +599,8 @@ def test_a_topic_of_two_types_is_refused_by_name(tmp_path):
         *camera_messages(2), ('/other/info', info(1), 1), ('/other/info', pose(1), 2)])
     with BagRecording(path) as source:
         assert len(list(source.messages())) == 4
-    said = source_error(path, info_topic='/other/info')
-    assert "several types on '/other/info': geometry_msgs/msg/PoseStamped, sensor_msgs" in said
+    problem = source_error(path, info_topic='/other/info')
+    assert "several types on '/other/info': geometry_msgs/msg/PoseStamped, sensor_msgs" in problem
 
 
 def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):
@@ -608,14 +608,14 @@ def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):
     assert 'has 2 image topics: /image ?[2J1 (1), /image2 (1)' in source_error(path)
 
 
-@pytest.mark.parametrize(('messages', 'said'), [
+@pytest.mark.parametrize(('messages', 'problem'), [
     ([], 'holds no messages'),
     ([('/pose', pose(1), 1)], 'has no image topic, only /pose (geometry_msgs/msg/PoseStamped)'),
     ([('/image', image(1), 1)], 'has no CameraInfo topic, only /image (sensor_msgs/msg/Image)'),
 ])
 @pytest.mark.parametrize('storage', STORAGES)
-def test_a_bag_without_a_camera_is_refused(tmp_path, storage, messages, said):
-    assert said in source_error(record(tmp_path / 'bag', messages, storage))
+def test_a_bag_without_a_camera_is_refused(tmp_path, storage, messages, problem):
+    assert problem in source_error(record(tmp_path / 'bag', messages, storage))
 
 
 # What is broken
@@ -629,8 +629,8 @@ def test_a_bag_cut_short_is_read_up_to_the_cut(whole, tmp_path, suffix):
     counts = []
     for part in (0.01, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8):
         path.write_bytes(data[:int(len(data) * part)])
-        delivered, said = read_until_broken(path)
-        assert str(path) in said
+        delivered, problem = read_until_broken(path)
+        assert str(path) in problem
         if suffix == 'db3':
             # The index by stamps may be cut too; then they come as recorded.
             assert set(keys(delivered)) <= set(expected)
@@ -645,8 +645,8 @@ def test_a_bag_cut_short_is_read_up_to_the_cut(whole, tmp_path, suffix):
 def test_a_bag_that_lost_only_its_index_has_lost_nothing(whole, tmp_path, suffix):
     path = tmp_path / f'cut.{suffix}'
     path.write_bytes(whole[suffix].read_bytes()[:-50])
-    delivered, said = read_until_broken(path)
-    assert said is None
+    delivered, problem = read_until_broken(path)
+    assert problem is None
     assert keys(delivered) == keys(read_until_broken(whole[suffix])[0])
 
 
@@ -654,18 +654,18 @@ def test_a_compressed_chunk_cut_short_gives_its_first_messages(tmp_path):
     path = record(tmp_path / 'bag', camera_messages(200), mode=CompressionMode.STORAGE)
     data = (path / 'bag.mcap').read_bytes()
     (tmp_path / 'cut.mcap').write_bytes(data[:len(data) // 2])
-    delivered, said = read_until_broken(tmp_path / 'cut.mcap')
+    delivered, problem = read_until_broken(tmp_path / 'cut.mcap')
     assert len(delivered) > 100
-    assert 'is cut short' in said
+    assert 'is cut short' in problem
 
 
 def test_a_compressed_file_cut_short_gives_its_first_messages(tmp_path):
     path = record(tmp_path / 'bag', camera_messages(60), mode=CompressionMode.FILE)
     file = path / 'bag.mcap.zstd'
     file.write_bytes(file.read_bytes()[:int(file.stat().st_size * 0.8)])
-    delivered, said = read_until_broken(path)
+    delivered, problem = read_until_broken(path)
     assert len(delivered) > 30
-    assert str(file) in said
+    assert str(file) in problem
     assert not list(Path(os.environ.get('TMPDIR', '/tmp')).glob('djet-*/bag.mcap*'))
 
 
@@ -704,8 +704,8 @@ def test_flipped_bits_end_in_messages_or_one_line(whole, tmp_path, suffix):
         chosen = where[rng.integers(0, 20, rng.integers(1, 4))]
         flipped[chosen] ^= np.uint8(1) << rng.integers(0, 8, len(chosen)).astype(np.uint8)
         path.write_bytes(flipped.tobytes())
-        delivered, said = read_until_broken(path)
-        assert said or delivered
+        delivered, problem = read_until_broken(path)
+        assert problem or delivered
 
 
 def test_a_damaged_chunk_is_noticed_by_its_checksum(whole, tmp_path):
@@ -716,12 +716,12 @@ def test_a_damaged_chunk_is_noticed_by_its_checksum(whole, tmp_path):
               and data[i + 37:i + 41] == bytes(4)][1]
     data[second + 33:second + 37] = b'\x01\x02\x03\x04'
     (tmp_path / 'bad.mcap').write_bytes(data)
-    delivered, said = read_until_broken(tmp_path / 'bad.mcap')
-    assert 'does not match its checksum' in said
+    delivered, problem = read_until_broken(tmp_path / 'bad.mcap')
+    assert 'does not match its checksum' in problem
     assert len(delivered) >= 2
 
 
-@pytest.mark.parametrize(('content', 'said'), [
+@pytest.mark.parametrize(('content', 'problem'), [
     (b'', 'is empty (0 bytes)'),
     (b'hello, this is no bag', "begins with b'hello, t'"),
     (b'#ROSBAG V1.2\n', 'ROS 1 bag (format 2.0)'),
@@ -732,11 +732,11 @@ def test_a_damaged_chunk_is_noticed_by_its_checksum(whole, tmp_path):
     (b'SQLite format 3\x00' + bytes(5000), 'not a database'),
     (b'\x28\xb5\x2f\xfdhello', 'zstd data is damaged'),
 ])
-def test_a_file_that_is_no_bag_is_refused(tmp_path, content, said):
+def test_a_file_that_is_no_bag_is_refused(tmp_path, content, problem):
     (tmp_path / 'file.mcap').write_bytes(content)
-    delivered, heard = read_until_broken(tmp_path / 'file.mcap')
+    delivered, problems = read_until_broken(tmp_path / 'file.mcap')
     assert delivered == []
-    assert said in heard
+    assert problem in problems
 
 
 def test_a_path_that_is_no_bag_is_refused(tmp_path):
@@ -746,7 +746,7 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path):
     assert 'is no regular file' in source_error(tmp_path / 'pipe.mcap')
 
 
-@pytest.mark.parametrize(('statement', 'said'), [
+@pytest.mark.parametrize(('statement', 'problem'), [
     ('DROP TABLE messages', "no table 'messages'"),
     ('DROP TABLE topics', "no table 'topics'"),
     ('ALTER TABLE topics DROP COLUMN type', 'no such column: type'),
@@ -765,17 +765,17 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path):
     ("UPDATE message_definitions SET encoded_message_definition = 'string[2000000000] a'",
      'has fixed arrays of 2000000000 elements'),
 ])
-def test_a_wrong_database_is_refused(whole, tmp_path, statement, said):
+def test_a_wrong_database_is_refused(whole, tmp_path, statement, problem):
     path = shutil.copy(whole['db3'], tmp_path / 'wrong.db3')
     with sqlite3.connect(path) as database:
         database.execute('DROP INDEX timestamp_idx')
         database.executescript(statement)
-    _, heard = read_until_broken(path)
-    assert heard is not None
-    assert said in heard
+    _, problems = read_until_broken(path)
+    assert problems is not None
+    assert problem in problems
 
 
-@pytest.mark.parametrize(('metadata', 'said'), [
+@pytest.mark.parametrize(('metadata', 'problem'), [
     ('[../secret.db3]', "'../secret.db3', which lies outside the bag"),
     ('[/etc/passwd]', "'/etc/passwd', which lies outside the bag"),
     ('[bag.mcap, gone.mcap]', "'gone.mcap', which does not exist"),
@@ -789,11 +789,11 @@ def test_a_wrong_database_is_refused(whole, tmp_path, statement, said):
     ('!!python/object/apply:os.system [exit]', 'is not valid YAML'),
     pytest.param('bag.mcap' * 400_000, 'at most 2097152 are read', id='large'),
 ])
-def test_wrong_metadata_is_refused(tmp_path, metadata, said):
+def test_wrong_metadata_is_refused(tmp_path, metadata, problem):
     path = record(tmp_path / 'bag', camera_messages(2))
     (path / 'metadata.yaml').write_text(
         f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}')
-    assert said in source_error(path)
+    assert problem in source_error(path)
 
 
 def chunk_bomb(data, declared):
@@ -894,9 +894,9 @@ def test_a_sequence_that_declares_more_than_the_message_holds_is_refused(tmp_pat
     data = bytearray(jazzy().serialize_cdr(image(1), 'sensor_msgs/msg/Image'))
     where = data.index(struct.pack('<I', 64 * 48), 20)
     data[where:where + 4] = b'\xff\xff\xff\xff'
-    delivered, said = read_until_broken(whole_message(tmp_path, bytes(data)))
+    delivered, problem = read_until_broken(whole_message(tmp_path, bytes(data)))
     assert delivered == []
-    assert 'it is no sensor_msgs/msg/Image' in said
+    assert 'it is no sensor_msgs/msg/Image' in problem
 
 
 def test_storage_plugins_are_those_that_rosbags_has():

@@ -26,8 +26,8 @@ def test_basins_of_a_pair_differ_significantly_for_its_matches(seed):
     basin = choose_basin(problem, views.x, hemisphere_starts(views.R, 12), EstimatorConfig(), None,
                          None)
     for one, other in combinations([basin.pose, *basin.rivals], 2):
-        told = epipolar_residuals(problem, one.R, one.t)
-        near = told.jacobian[:, np.abs(told.r) < 3 * NOISE]
+        residuals = epipolar_residuals(problem, one.R, one.t)
+        near = residuals.jacobian[:, np.abs(residuals.r) < 3 * NOISE]
         off = pose_difference(one.R, one.t, other)
         # The noise of the best matches.
         assert off @ (near @ near.T) @ off / NOISE**2 > CHI2_999 / 2

@@ -29,7 +29,7 @@ def bench(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope='module')
 def output(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give the figures of the folder, measured once."""
+    """Return the figures of the folder, measured once."""
     path = tmp_path_factory.mktemp('figures') / 'bench.json'
     run = bench(sequence, '--output', path, '--pairs', 2)
     assert run.returncode == 0, run.stderr
@@ -79,14 +79,14 @@ def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output,
     assert bag['djet_ms_by_points'].keys() == folder['djet_ms_by_points'].keys()
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (('missing', '--output', 'a.json'), 'missing'),
     (('.', '--output', 'a.json', '--pairs', 0), '--pairs is 0')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(tmp_path, arguments, said, monkeypatch):
+def test_what_can_be_mended_is_one_line_and_exit_code_2(tmp_path, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = bench(*arguments)
     assert run.returncode == 2
-    assert said in run.stderr
+    assert message in run.stderr
     assert run.stderr.count('\n') == 1
 
 

@@ -119,9 +119,9 @@ def test_elimination_equals_solving_the_full_system():
     # With k1, and no other information: the gauge does not affect it.
     J = np.column_stack([of_k1.ravel(), J])
     information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
-    told = eliminate(observed, weights, 0.7, 4, lens=True).marginal_k1()
-    assert told.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
-    assert told.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
+    marginal = eliminate(observed, weights, 0.7, 4, lens=True).marginal_k1()
+    assert marginal.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
+    assert marginal.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
 
 
 def test_poses_and_depths_are_recovered_without_noise():
@@ -190,6 +190,6 @@ def test_the_gradient_of_a_prior_is_that_of_its_cost():
     since = Poses(rotation_exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
     prior = PosePrior(half @ half.T, rng.normal(size=12), since)
     poses = since.moved(1e-4 * rng.normal(size=12))
-    told = [(prior.at(poses.moved(step)).cost - prior.at(poses.moved(-step)).cost) / 2e-6
+    slopes = [(prior.at(poses.moved(step)).cost - prior.at(poses.moved(-step)).cost) / 2e-6
             for step in 1e-6 * np.eye(12)]
-    assert told == pytest.approx(prior.at(poses).slope, abs=1e-2)
+    assert slopes == pytest.approx(prior.at(poses).slope, abs=1e-2)

@@ -118,10 +118,10 @@ def test_a_fisheye_with_zero_coefficients_is_equidistant():
 @pytest.mark.parametrize('model', [*DISTORTIONS, ''])
 def test_the_jacobian_of_the_projection_is_its_derivative(model):
     camera = Camera(K, DISTORTIONS.get(model, np.empty(0)), SIZE, model or 'plumb_bob')
-    for way in 1e-6 * np.eye(2):
-        more, less = (camera.pixels(PLACES + sign * way, 0.05)[0] for sign in (1, -1))
+    for step in 1e-6 * np.eye(2):
+        more, less = (camera.pixels(PLACES + sign * step, 0.05)[0] for sign in (1, -1))
         _, slopes = camera.pixels(PLACES, 0.05)
-        assert np.allclose((more - less) / 2e-6, slopes @ way / 1e-6, atol=1e-5)
+        assert np.allclose((more - less) / 2e-6, slopes @ step / 1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize('model', DISTORTIONS)

@@ -160,7 +160,7 @@ def test_points_of_many_baselines_away_tell_opencvs_poses_apart(name: str) -> No
 
 @pytest.fixture(scope='module')
 def records(tmp_path_factory: pytest.TempPathFactory) -> list[PairRecord]:
-    """Give the records of all peers on three pairs of a street, with both presets."""
+    """Return the records of all peers on three pairs of a street, with both presets."""
     folder = render_sequence('road', tmp_path_factory.mktemp('road'), 4, size=(480, 160))
     dataset, = open_datasets([folder], Selection(), folder)
     competing = make_methods(['djet', 'poselib', *NAMES], ['best', 'paper'], {})

@@ -43,7 +43,7 @@ def start_probe(body: str, *before: str) -> subprocess.Popen[str]:
 
 
 def verbs(folder: str) -> set[str]:
-    """Give the commands that have a module in a folder of the package."""
+    """Return the commands that have a module in a folder of the package."""
     files = (Path(djet_ros.__file__).parent / folder).glob('*.py')
     return {path.stem.replace('_', '-') for path in files
             if 'def add_arguments(' in path.read_text()}
@@ -54,10 +54,10 @@ def test_the_lists_of_commands_are_the_lists_of_their_modules() -> None:
     assert set(LAB) == verbs('cli/lab')
 
 
-@pytest.mark.parametrize(('words', 'commands'), [((), COMMANDS), (('lab',), LAB)])
+@pytest.mark.parametrize(('call', 'commands'), [((), COMMANDS), (('lab',), LAB)])
 def test_help_names_every_command_without_importing_any(
-        words: tuple[str, ...], commands: dict[str, str]) -> None:
-    listing = subprocess.run([sys.executable, '-X', 'importtime', '-c', DJET, *words, '--help'],
+        call: tuple[str, ...], commands: dict[str, str]) -> None:
+    listing = subprocess.run([sys.executable, '-X', 'importtime', '-c', DJET, *call, '--help'],
                              capture_output=True, text=True, timeout=60, check=False)
     assert listing.returncode == 0
     assert set(commands) <= set(listing.stdout.split())
@@ -82,11 +82,11 @@ def test_help_comes_where_only_ascii_can_be_shown(command: str,
 
 
 def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
-    said = ' '.join(djet('lab', 'surfaces', '--help').stdout.split())
-    assert '(default: paper, ' in said
+    message = ' '.join(djet('lab', 'surfaces', '--help').stdout.split())
+    assert '(default: paper, ' in message
     for name, value in (('window', 7), ('window-sigma', 0.0), ('max-iterations', 20),
                         ('step', "'share'"), ('step-share', 0.3)):
-        _, _, meaning = said.rpartition(f' --{name} ')
+        _, _, meaning = message.rpartition(f' --{name} ')
         assert f'(default: {value})' == meaning[meaning.index('(default: '):].partition(' --')[0]
 
 
@@ -105,14 +105,14 @@ def test_a_wrong_command_line_gives_one_line_and_exit_code_2(arguments: tuple[st
     assert answer.stderr.count('\n') == 1
 
 
-@pytest.mark.parametrize('words', [
+@pytest.mark.parametrize('call', [
     ('slam', 'bag', '--imu', 'true'), ('lab', 'soak', '--output', 'f.json', '--frame', '9')])
-def test_an_option_is_what_it_is_called_and_no_beginning_of_another(words: tuple[str, ...]
+def test_an_option_is_what_it_is_called_and_no_beginning_of_another(call: tuple[str, ...]
                                                                     ) -> None:
-    answer = djet(*words)
+    answer = djet(*call)
     assert answer.returncode == 2
-    command = ' '.join(words[:2] if words[0] == 'lab' else words[:1])
-    assert answer.stderr == (f'djet: error: unrecognized arguments: {" ".join(words[-2:])} '
+    command = ' '.join(call[:2] if call[0] == 'lab' else call[:1])
+    assert answer.stderr == (f'djet: error: unrecognized arguments: {" ".join(call[-2:])} '
                              f'(see djet {command} --help)\n')
 
 
@@ -131,16 +131,16 @@ def test_what_the_user_can_mend_gives_one_line_and_exit_code_2(
     assert probe.returncode == code
 
 
-@pytest.mark.parametrize(('words', 'nodes'), [
+@pytest.mark.parametrize(('call', 'nodes'), [
     (('replay', 'bag', '--output', 'out', '--config'), '/vo_node'),
     (('lens', 'bag', '--config'), '/vo_node'),
     (('slam', 'bag', '--output', 'out', '--config'), '/vo_node and /pose_graph_node'),
     (('live', '-r', '__ns:=/rear', '--params'), '/rear/vo_node')])
 def test_a_file_of_parameters_for_others_alone_is_refused_by_every_command_that_takes_one(
-        tmp_path: Path, words: tuple[str, ...], nodes: str) -> None:
+        tmp_path: Path, call: tuple[str, ...], nodes: str) -> None:
     path = tmp_path / 'theirs.yaml'
     path.write_text('/left/eye: {ros__parameters: {preset: fast}}')
-    done = djet(*words, str(path))
+    done = djet(*call, str(path))
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr == (
         f'djet: error: {path}: it has parameters for /left/eye and none for {nodes}, so it is '
@@ -154,16 +154,16 @@ def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
     assert probe.returncode == 1
 
 
-@pytest.mark.parametrize(('number', 'said', 'code'), [
+@pytest.mark.parametrize(('number', 'message', 'code'), [
     (signal.SIGINT, 'interrupted', 130), (signal.SIGTERM, 'terminated', 143),
     (signal.SIGHUP, 'terminated', 129)])
 def test_an_interrupt_gives_one_line_and_the_exit_code_of_a_shell(
-        number: signal.Signals, said: str, code: int) -> None:
+        number: signal.Signals, message: str, code: int) -> None:
     probe = start_probe("import time; print('ready', flush=True); time.sleep(60)")
     assert probe.stdout is not None
     assert probe.stdout.readline() == 'ready\n'
     probe.send_signal(number)
-    assert probe.communicate(timeout=60) == ('', f'djet: {said}\n')
+    assert probe.communicate(timeout=60) == ('', f'djet: {message}\n')
     assert probe.returncode == code
 
 

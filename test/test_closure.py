@@ -76,14 +76,14 @@ def test_the_command_writes_triangles_and_a_plot(road: Path, tmp_path: Path) -> 
     assert 'D-JET' in answer.stdout and 'RP-E' in answer.stdout
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (('--frames', 2), '--frames is 2'), (('--methods', 'djet,poselib'), "'poselib'"),
     (('--output', '.'), 'is a folder')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
-        road: Path, tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+        road: Path, tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     answer = djet(road, '--output', tmp_path / 'closure.json', *arguments)
     assert answer.returncode == 2
-    assert said in answer.stderr and answer.stderr.count('\n') == 1
+    assert message in answer.stderr and answer.stderr.count('\n') == 1
 
 
 def test_two_frames_are_no_triangle(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def by_numpy() -> Iterator[None]:
 
 
 def both(work: Callable[[], Result]) -> tuple[Result, Result]:
-    """Give what comes of it compiled, and by NumPy."""
+    """Return what comes of it compiled, and by NumPy."""
     done = work()
     with by_numpy():
         return done, work()
@@ -431,8 +431,8 @@ print(compiled.library is None, Tracker(Config(), message_type).diagnosis().valu
 def test_compiled_loops_can_be_disabled_and_the_diagnostics_report_it() -> None:
     answers = [subprocess.run(
         [sys.executable, '-c', SAID],
-        env={**os.environ, 'DJET_COMPILED': told}, capture_output=True, text=True, check=True
-    ).stdout.strip() for told in ('0', '1')]
+        env={**os.environ, 'DJET_COMPILED': switch}, capture_output=True, text=True, check=True
+    ).stdout.strip() for switch in ('0', '1')]
     assert answers == ['True NumPy', 'False compiled']
 
 

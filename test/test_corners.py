@@ -33,10 +33,10 @@ def squares(contrast):
 def test_exactly_the_corners_of_squares_are_detected():
     image, corners = squares(100)
     features = detect_corners(image, 2000, 1.0)
-    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    distances = np.linalg.norm(features.points[:, None] - corners, axis=2)
     fine = features.octaves == 0
-    assert ways[fine].min(0).max() <= 5
-    assert ways.min(1).max() <= 10
+    assert distances[fine].min(0).max() <= 5
+    assert distances.min(1).max() <= 10
 
 
 def test_a_stair_stepped_edge_has_no_corners():
@@ -62,9 +62,9 @@ def test_noise_alone_has_no_corners(sigma):
 def test_corners_are_detected_in_noise_without_false_ones():
     image, corners = squares(100)
     features = detect_corners(noisy(image, 8), 2000, 1.0)
-    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
-    assert ways.min(0).max() <= 10
-    assert (ways.min(1) <= 10).mean() > 0.97
+    distances = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    assert distances.min(0).max() <= 10
+    assert (distances.min(1) <= 10).mean() > 0.97
 
 
 @pytest.mark.parametrize('sigma', [2, 5, 15])
@@ -119,8 +119,8 @@ def test_small_corners_are_added_if_large_ones_are_few():
     image, corners = squares(100)
     features = detect_large_corners(image, 400, 1.0)
     assert set(features.octaves) == {0, 2}
-    ways = np.linalg.norm(features.points[:, None] - corners, axis=2)
-    assert ways[features.octaves == 0].min(0).max() <= 5
+    distances = np.linalg.norm(features.points[:, None] - corners, axis=2)
+    assert distances[features.octaves == 0].min(0).max() <= 5
     assert len(features) <= 400
 
 

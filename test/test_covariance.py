@@ -69,10 +69,10 @@ def test_a_calibration_error_moves_a_pose_as_its_covariance_predicts(camera, t):
         wrong = minimise(problem(calibrated(camera, **{name: off})), views.R, views.t, loss)
         moves.append(np.append(rotation_log(wrong.R @ there.R.T), wrong.t - there.t))
     moves = np.transpose(moves)
-    told = calibration_covariance(right, camera, there.pose, there.residuals, loss, off)
+    estimated = calibration_covariance(right, camera, there.pose, there.residuals, loss, off)
     size = np.sqrt(np.diag(moves @ moves.T))
     assert size[:3].max() > 1e-5 and size[3:].max() > 1e-4
-    np.testing.assert_array_less(np.abs(told - moves @ moves.T), 0.05 * np.outer(size, size))
+    np.testing.assert_array_less(np.abs(estimated - moves @ moves.T), 0.05 * np.outer(size, size))
 
 
 def test_covariance_is_consistent_with_calibration_errors():
@@ -224,16 +224,16 @@ def test_profile_widens_where_matches_become_outliers(share, least, most):
     J = epipolar_residuals(problem, views.R, views.t).jacobian
     # The noise is a tenth of the scale of the loss: the bound is within it, or far beyond.
     claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
-    told = widened_by_profile(claimed, problem, pose, loss)
-    wider = np.linalg.eigvals(np.linalg.solve(claimed, told)).real
+    estimated = widened_by_profile(claimed, problem, pose, loss)
+    wider = np.linalg.eigvals(np.linalg.solve(claimed, estimated)).real
     assert wider.min() > least - 1e-9 and wider.max() < most
     # A sum of squares rises as its curvature predicts, for small differences of the pose.
     squares = widened_by_profile(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
 
 
-@pytest.mark.parametrize('way', [2, -2])
-def test_a_pose_off_its_minimum_is_widened_towards_either_side(way):
+@pytest.mark.parametrize('direction', [2, -2])
+def test_a_pose_off_its_minimum_is_widened_towards_either_side(direction):
     views = two_views(np.random.default_rng(5), count=300)
     surface = ReprojectionSurface(views.x, views.y)
     problem = jet_problem(views.K, views.x, surface.fit_around(views.y))
@@ -241,9 +241,10 @@ def test_a_pose_off_its_minimum_is_widened_towards_either_side(way):
     claimed = np.linalg.inv(residuals.jacobian @ residuals.jacobian.T) * 0.01**2
     variances, axes = np.linalg.eigh(claimed)
     for variance, axis in zip(variances, axes.T):
-        pose = Pose(*retract(views.R, views.t, residuals.tangents, way * np.sqrt(variance) * axis))
-        told = widened_by_profile(claimed, problem, pose, Loss())
-        assert axis @ told @ axis > 50 * variance
+        pose = Pose(*retract(views.R, views.t, residuals.tangents,
+                             direction * np.sqrt(variance) * axis))
+        estimated = widened_by_profile(claimed, problem, pose, Loss())
+        assert axis @ estimated @ axis > 50 * variance
 
 
 def test_bounds_hold_for_a_covariance_from_a_small_sample():

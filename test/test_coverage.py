@@ -152,13 +152,13 @@ def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path
     assert image.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     ((), 'nothing to measure'), (('--scenes', 'moon'), "'moon'"),
     (('--scenes', 'road', '--seeds', 'x'), "'x'"),
     (('--scenes', 'road', '--seeds', '5-3'), "'5-3'"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
-        tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+        tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     answer = djet(*arguments, '--output', tmp_path)
     assert answer.returncode == 2
-    assert said in answer.stderr and answer.stderr.count('\n') == 1
+    assert message in answer.stderr and answer.stderr.count('\n') == 1

@@ -47,7 +47,7 @@ def spot(place):
 
 @pytest.fixture
 def asl(tmp_path):
-    """Give an EuRoC folder: a body that flies 1 m/s along its x axis, its images a spot."""
+    """Return an EuRoC folder: a body that flies 1 m/s along its x axis, its images a spot."""
     folder = tmp_path / 'MH_01'
     (folder / 'mav0' / 'cam0' / 'data').mkdir(parents=True)
     (folder / 'mav0' / 'state_groundtruth_estimate0').mkdir()
@@ -69,7 +69,7 @@ def asl(tmp_path):
 
 @pytest.fixture
 def tum(tmp_path):
-    """Give a TUM RGB-D folder of a turning camera, with ground truth at 100 Hz."""
+    """Return a TUM RGB-D folder of a turning camera, with ground truth at 100 Hz."""
     folder = tmp_path / 'rgbd_dataset_freiburg3_desk'
     (folder / 'rgb').mkdir(parents=True)
     stamps = [f'{1341846313 + i // 30}.{i % 30 * 33333 + 500:06d}' for i in range(40)]
@@ -232,7 +232,7 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
         open_sequence(tmp_path / 'nowhere')
 
 
-@pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
+@pytest.mark.parametrize(('file', 'old', 'new', 'error_text'), [
     ('cam0/data.csv', f',{STAMPS[0]}.png', ',../../secret.png', 'lies outside the folder'),
     ('cam0/data.csv', f',{STAMPS[0]}.png', ',a\0b.png', 'is not a file name'),
     ('cam0/data.csv', f',{STAMPS[0]}.png', '', 'line 2 has 1 words'),
@@ -250,12 +250,12 @@ def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
     ('state_groundtruth_estimate0/data.csv', ',1,0,0,0,', ',2,0,0,0,', 'has length 2; it must'),
     ('state_groundtruth_estimate0/data.csv', ',7,8,', ',1e300,8,', 'farther than 1e[+]09 m'),
 ])
-def test_a_wrong_euroc_folder_is_named(asl, file, old, new, said):
+def test_a_wrong_euroc_folder_is_named(asl, file, old, new, error_text):
     path = asl / 'mav0' / file
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(DjetError, match=said) as caught:
+    with pytest.raises(DjetError, match=error_text) as caught:
         euroc(asl)
     assert '\n' not in str(caught.value)
 

@@ -70,8 +70,8 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
     """Return a function that starts a djet command; it has ended, without a traceback, at last."""
     started: list[Command] = []
 
-    def run(*words: str | Path, before: str = '') -> Command:
-        started.append(Command(tmp_path / f'{words[0]}_{len(started)}.log', *words,
+    def run(*arguments: str | Path, before: str = '') -> Command:
+        started.append(Command(tmp_path / f'{arguments[0]}_{len(started)}.log', *arguments,
                                before=before))
         return started[-1]
 
@@ -86,11 +86,11 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Command]]:
 @pytest.fixture
 def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[..., Command]]:
     """Return a function that starts djet live, and waits until its topics are there."""
-    def run(*words: str, topic: str = IMAGE, before: str = '') -> Command:
-        one = start('live', '-r', f'image:={topic}', *words, before=before)
+    def run(*arguments: str, topic: str = IMAGE, before: str = '') -> Command:
+        one = start('live', '-r', f'image:={topic}', *arguments, before=before)
         for output in TYPES:
             graph_peer.wait(output, lambda output=output: graph_peer.graph.publishers_of(output))
-        for messages in graph_peer.heard.values():
+        for messages in graph_peer.received.values():
             messages.clear()
         return one
 
@@ -113,7 +113,7 @@ def stamp(index: int) -> int:
 def tracked(peer: Peer, stamps: list[int]) -> Callable[[], bool]:
     """Make the condition that these images came out with a pair."""
     return lambda: set(stamps) <= {stamp_ns(message.header)
-                                   for message in peer.heard[f'{NODE}/relative_pose']}
+                                   for message in peer.received[f'{NODE}/relative_pose']}
 
 
 def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
@@ -126,11 +126,11 @@ def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
     live(*EVERY, topic=RECTIFIED)
     # Twenty times as fast: the player has to wait for the node.
     player = start('play', bag, '--rate', '20')
-    peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
+    peer.wait('all odometry', lambda: len(peer.received[ODOMETRY]) == FRAMES)
     assert f'{FRAMES} images published on {RECTIFIED}' in player.finish()
     assert len(expected[poses[0]]) == FRAMES - 1
     for topic in poses:
-        assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
+        assert [serialised(m) for m in peer.received[topic]] == expected[topic]
 
 
 def test_live_poses_with_imu_equal_those_of_djet_replay_bit_for_bit(
@@ -144,11 +144,11 @@ def test_live_poses_with_imu_equal_those_of_djet_replay_bit_for_bit(
     live(*EVERY, '-p', 'odometry.imu:=true', '-r', 'imu:=/imu/data_raw', topic=RECTIFIED)
     # The samples have to come although images wait for room.
     player = start('play', bag, '--rate', '20')
-    peer.wait('all odometry', lambda: len(peer.heard[ODOMETRY]) == FRAMES)
+    peer.wait('all odometry', lambda: len(peer.received[ODOMETRY]) == FRAMES)
     player.finish()
     for topic in poses:
-        assert [serialised(m) for m in peer.heard[topic]] == expected[topic]
-    assert int((peer.said() or {})['gyro samples']) > 0
+        assert [serialised(m) for m in peer.received[topic]] == expected[topic]
+    assert int((peer.diagnostics() or {})['gyro samples']) > 0
 
 
 @pytest.mark.parametrize('reliability', ['best_effort', 'reliable'])
@@ -158,14 +158,14 @@ def test_every_image_at_the_recorded_rate_is_accounted_for(
     start('play', bag).finish()
 
     def all_there() -> bool:
-        said = peer.said() or {}
+        diagnostics = peer.diagnostics() or {}
         fates = ('processed', 'dropped', 'rejected', 'lost on the way')
-        return sum(int(said.get(f'frames {fate}', 0)) for fate in fates) == FRAMES
+        return sum(int(diagnostics.get(f'frames {fate}', 0)) for fate in fates) == FRAMES
 
     peer.wait('all images', all_there)
-    assert int(peer.said()['frames processed']) > FRAMES // 2
+    assert int(peer.diagnostics()['frames processed']) > FRAMES // 2
     if reliability == 'reliable':
-        assert peer.said()['frames lost on the way'] == '0'
+        assert peer.diagnostics()['frames lost on the way'] == '0'
 
 
 def test_publisher_waits_while_the_queue_is_full(live, peer, drive):
@@ -182,25 +182,25 @@ def test_publisher_waits_while_the_queue_is_full(live, peer, drive):
         while not images.publish(image(drive[i % len(drive)], stamp_ns=stamp(i))):
             waited += 1
     assert waited
-    said = peer.wait('all images', lambda: peer.said(frames_received=str(sent)))
-    assert said['frames processed'] == str(sent)
+    diagnostics = peer.wait('all images', lambda: peer.diagnostics(frames_received=str(sent)))
+    assert diagnostics['frames processed'] == str(sent)
     assert any('images pile up' in message.status[0].message
-               for message in peer.heard['/diagnostics'])
+               for message in peer.received['/diagnostics'])
 
 
 def test_node_continues_with_the_next_player(live, start, peer, bag):
     live(*EVERY, *FAST, topic=RECTIFIED)
     for _ in range(2):
         player = start('play', bag, '--loop', '--rate', '5')
-        peer.wait('a round', lambda: len(peer.heard[ODOMETRY]) > FRAMES)
+        peer.wait('a round', lambda: len(peer.received[ODOMETRY]) > FRAMES)
         player.process.kill()
         player.process.wait()
         # What had been sent until then is still worked on.
         peer.spin(0.5)
-        for messages in peer.heard.values():
+        for messages in peer.received.values():
             messages.clear()
-    said = peer.wait('silence', lambda: peer.said(message='waiting for an image'))
-    assert int(said['status: TIME_JUMP']) >= 2
+    diagnostics = peer.wait('silence', lambda: peer.diagnostics(message='waiting for an image'))
+    assert int(diagnostics['status: TIME_JUMP']) >= 2
 
 
 def test_images_of_two_players_are_counted(live, start, peer, bag):
@@ -208,8 +208,8 @@ def test_images_of_two_players_are_counted(live, start, peer, bag):
     players = [start('play', bag, '--rate', '5') for _ in range(2)]
     for player in players:
         player.finish()
-    said = peer.wait('both', lambda: peer.said(frames_received=str(2 * FRAMES)))
-    assert int(said['frames processed']) + int(said['frames dropped']) == 2 * FRAMES
+    diagnostics = peer.wait('both', lambda: peer.diagnostics(frames_received=str(2 * FRAMES)))
+    assert int(diagnostics['frames processed']) + int(diagnostics['frames dropped']) == 2 * FRAMES
 
 
 def test_node_waits_for_a_late_camera_info(live, peer, drive):
@@ -217,7 +217,7 @@ def test_node_waits_for_a_late_camera_info(live, peer, drive):
     images = peer.advertise(IMAGE, IMAGE_TYPE)
     for i in range(3):
         images.publish(image(drive[i], stamp_ns=stamp(i)))
-    peer.wait('a complaint', lambda: peer.said(message='waiting for camera_info',
+    peer.wait('a complaint', lambda: peer.diagnostics(message='waiting for camera_info',
                                                frames_received='3'))
     infos = peer.advertise(INFO, INFO_TYPE)
     infos.publish(camera_info(K, SIZE))
@@ -231,7 +231,7 @@ def test_latched_camera_info_from_before_the_start_is_received(live, peer, drive
     infos = peer.advertise(INFO, INFO_TYPE, Profile(depth=1, latched=True), listeners=0)
     infos.publish(camera_info(K, SIZE))
     live(*EVERY, *FAST)
-    peer.wait('readiness', lambda: peer.said(message='waiting for an image'))
+    peer.wait('readiness', lambda: peer.diagnostics(message='waiting for an image'))
     images = peer.advertise(IMAGE, IMAGE_TYPE)
     for i in range(2):
         images.publish(image(drive[i], stamp_ns=stamp(i)))
@@ -256,8 +256,9 @@ def test_garbage_on_the_topics_is_reported_and_tracking_continues(
         images.send(rubbish)
     images.publish(image(drive[5], stamp_ns=stamp(5)))
     peer.wait('pairs', tracked(peer, [stamp(i) for i in range(1, 6)]))
-    said = peer.wait('the count', lambda: peer.said(frames_lost_on_the_way=str(len(garbage))))
-    assert said['frames processed'] == '6'
+    diagnostics = peer.wait('the count', lambda: peer.diagnostics(
+        frames_lost_on_the_way=str(len(garbage))))
+    assert diagnostics['frames processed'] == '6'
     assert 'could not be read' in one.log
 
 
@@ -286,19 +287,19 @@ def test_services_respond_as_in_ros_on_cyclone_dds(live, peer, drive):
     for i in range(2):
         images.publish(image(drive[i], stamp_ns=stamp(i)))
     peer.wait('a pair', tracked(peer, [stamp(1)]))
-    for number, (service, (said, state)) in enumerate({
+    for number, (service, (diagnostics, state)) in enumerate({
             'pause': (b'paused: images', 'paused'),
             'resume': (b'resumed: images', 'waiting for an image'),
             'reset': (b'reset: 2 images and', 'waiting for an image')}.items()):
-        peer.heard['/diagnostics'].clear()
+        peer.received['/diagnostics'].clear()
         answer = call(peer, service, number)
         # success, and a text with its length and its terminating zero
         success, length = struct.unpack('<B3xI', answer[:8])
         assert success
-        assert answer[8:8 + length].startswith(said)
+        assert answer[8:8 + length].startswith(diagnostics)
         assert answer[8:8 + length].endswith(b'\0')
-        said = peer.wait(state, lambda state=state: peer.said(message=state))
-    assert said['frames received'] == '0'
+        diagnostics = peer.wait(state, lambda state=state: peer.diagnostics(message=state))
+    assert diagnostics['frames received'] == '0'
 
 
 def test_request_from_another_middleware_is_logged_and_ignored(live, peer):
@@ -309,7 +310,7 @@ def test_request_from_another_middleware_is_logged_and_ignored(live, peer):
     requests.send(b'\0\1\0\0\0')
     peer.wait('the log', lambda: 'a request for /vo_node/pause came in the form of another '
               'middleware' in one.log)
-    assert not peer.said(message='paused')
+    assert not peer.diagnostics(message='paused')
 
 
 def test_services_are_absent_to_fast_dds_clients_and_the_log_says_why(live, peer):
@@ -348,9 +349,9 @@ def ends(peer: Peer, service: str) -> tuple[list[str], list[str]]:
 def test_diagnostics_follow_simulated_time(live, start, peer, bag):
     live(*EVERY, *FAST, '-p', 'use_sim_time:=true', topic=RECTIFIED)
     start('play', bag, '--clock', '--rate', '10').finish()
-    peer.wait('tracking', lambda: peer.said(message='tracking'))
+    peer.wait('tracking', lambda: peer.diagnostics(message='tracking'))
     # The bag was recorded in the seconds 1000 and 1001.
-    assert peer.heard['/diagnostics'][-1].header.stamp.sec in (1000, 1001)
+    assert peer.received['/diagnostics'][-1].header.stamp.sec in (1000, 1001)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -358,7 +359,7 @@ def test_signal_during_a_stream_ends_all_processes_within_a_second(live, start, 
     one = live(*EVERY, topic=RECTIFIED)
     player = start('play', bag, '--loop', '--rate', '10')
     echo = start('echo', '--diagnostics')
-    peer.wait('a pair', lambda: peer.heard[f'{NODE}/relative_pose'])
+    peer.wait('a pair', lambda: peer.received[f'{NODE}/relative_pose'])
     peer.wait('an echo', lambda: 'tracking; path: ' in echo.log)
     for command in (one, player, echo):
         code, seconds = command.end(number)
@@ -366,7 +367,7 @@ def test_signal_during_a_stream_ends_all_processes_within_a_second(live, start, 
         assert seconds < 1, command.path
     peer.spin(0.3)
     # Whole or not at all.
-    assert len({len(peer.heard[topic]) for topic in TYPES
+    assert len({len(peer.received[topic]) for topic in TYPES
                 if topic.endswith(('relative_pose', 'relative_pose_cov'))}) == 1
 
 
@@ -383,13 +384,13 @@ def test_echo_writes_a_line_for_each_pose(live, start, peer, bag):
     assert all(len(line.split()) == 8 for line in lines())
 
 
-@pytest.mark.parametrize('words', [(), ('--diagnostics',)])
-def test_echo_names_the_topic_without_messages(start, peer, words):
-    echo = start('echo', *words)
+@pytest.mark.parametrize('arguments', [(), ('--diagnostics',)])
+def test_echo_names_the_topic_without_messages(start, peer, arguments):
+    echo = start('echo', *arguments)
     peer.wait('a line', lambda: echo.log)
     assert echo.log == 'waiting for /vo_node/odometry: nobody publishes it\n'
     front = peer.graph.advertise('/front/vo_node/odometry', 'nav_msgs/msg/Odometry')
-    other = start('echo', *words)
+    other = start('echo', *arguments)
     peer.wait('a line', lambda: other.log)
     assert other.log == ('waiting for /vo_node/odometry: nobody publishes it; did you mean '
                          '/front/vo_node/odometry?\n')
@@ -487,9 +488,10 @@ def test_compressed_topic_may_have_any_name(rules):
 
 
 def test_topic_remappings_are_found_in_the_ros_arguments():
-    words = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap', 'vo_node:c:=/c',
-             '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g', '--', '-r', 'h:=i']
-    assert list(topic_remappings(words, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
+    arguments = ['vo_node', '-r', 'no:=rule', '--ros-args', '-r', 'a:=b', '--remap',
+                 'vo_node:c:=/c', '-r', 'other:d:=e', '-r', '__ns:=/left', '-r', 'rostopic://f:=g',
+                 '--', '-r', 'h:=i']
+    assert list(topic_remappings(arguments, 'vo_node')) == [('a', 'b'), ('c', '/c'), ('f', 'g')]
 
 
 @pytest.mark.parametrize('rule', ['image:=//x', 'image:=/camera/', 'image:=a b', 'image:=/1a',
@@ -501,7 +503,7 @@ def test_invalid_ros_names_are_refused(rule):
         Names('vö')
 
 
-@pytest.mark.parametrize(('words', 'environment', 'reason'), [
+@pytest.mark.parametrize(('arguments', 'environment', 'reason'), [
     (['-r', 'image=/x'], {}, "'image=/x' is not a remapping"),
     (['-p', 'ros.queue_size'], {}, 'write it as name:=value'),
     (['-p', 'ros.queue_sise:=2'], {}, "did you mean 'ros.queue_size'"),
@@ -513,11 +515,11 @@ def test_invalid_ros_names_are_refused(rule):
     ([], {'CYCLONEDDS_URI': '<Cyclone'}, 'check CYCLONEDDS_URI'),
 ])
 def test_user_errors_are_one_line(
-        words, environment, reason, monkeypatch, capfd, tmp_path):
+        arguments, environment, reason, monkeypatch, capfd, tmp_path):
     for name, value in {'ROS_DOMAIN_ID': '231', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
                         **environment}.items():
         monkeypatch.setenv(name, value)
-    assert main(['live', *words]) == 2
+    assert main(['live', *arguments]) == 2
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith('djet: error: ')
     assert reason in line

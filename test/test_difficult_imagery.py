@@ -1,8 +1,8 @@
 """
-What the odometry makes of images that are hard.
+Outcomes of the odometry on difficult images.
 
 doc/bounds.yaml states an outcome for each kind, and doc/robustness.md shows it: the statuses that
-may occur and, where a motion is told, bounds on its median errors. Each is tried here.
+may occur and, where a motion is estimated, bounds on its median errors. Each is tried here.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PERIOD_NS = 10**8
 
 
 class Outcome(NamedTuple):
-    """What was told of a pair; errors in degrees, NaN where there is nothing to compare."""
+    """Outcome of a pair; errors in degrees, NaN where there is nothing to compare."""
 
     status: Status
     rotation: float = np.nan
@@ -53,7 +53,7 @@ class Stated(NamedTuple):
 
 
 def stated() -> dict[str, Stated]:
-    """Give what is stated of each kind."""
+    """Return what is stated of each kind."""
     return {one['images']: Stated({Status(word) for word in one['statuses']},
                                   one.get('rotation'), one.get('direction'))
             for one in yaml.safe_load(BOUNDS.read_text())['hard_images']}
@@ -63,12 +63,12 @@ def stated() -> dict[str, Stated]:
 
 
 def same(image: Gray) -> Iterator[Outcome]:
-    """One image again and again, though not of the same sensor noise."""
-    return told([image] * 3)
+    """One image repeatedly, each time with other sensor noise."""
+    return outcomes_of([image] * 3)
 
 
-def told(images: Iterable[Gray]) -> Iterator[Outcome]:
-    """Outcomes of images without any truth."""
+def outcomes_of(images: Iterable[Gray]) -> Iterator[Outcome]:
+    """Outcomes of images without ground truth."""
     odometry = VisualOdometry(preset('best'))
     for i, image in enumerate(images):
         result = odometry.process(Frame(image, K, (i + 1) * PERIOD_NS))
@@ -96,7 +96,7 @@ def one_feature() -> Gray:
 
 def large() -> Iterator[Outcome]:
     image = cv2.resize(noise(3, (512, 384)), (4096, 3072), interpolation=cv2.INTER_CUBIC)
-    return told([image, image])
+    return outcomes_of([image, image])
 
 
 def drive(scene_name: str, change: Callable[[int, Gray], Gray] = lambda i, gray: gray,
@@ -144,7 +144,7 @@ def grainy(i: int, gray: Gray) -> Gray:
 
 
 def wrong_matches(share: float) -> Iterator[Outcome]:
-    """Give the inliers of a pair, with a share of them replaced by matches to anywhere."""
+    """Return the inliers of a pair, with a share of them replaced by matches to anywhere."""
     scene = make_scene('road', size=SIZE)
     poses = scene.trajectory(2)
     estimator = TwoViewEstimator(preset('best'))
@@ -163,7 +163,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     'white': lambda: same(flat(255)),
     'no feature (one gray)': lambda: same(flat(128)),
     'one feature': lambda: same(one_feature()),
-    'noise, another one in each frame': lambda: told(map(noise, range(5))),
+    'noise, another one in each frame': lambda: outcomes_of(map(noise, range(5))),
     '64×48 pixels, standing still': lambda: (
         outcome for seed in range(5) for outcome in same(noise(seed, SMALL))),
     '4096×3072 pixels, standing still': large,

@@ -34,10 +34,10 @@ def winding(seed: int, frames: int) -> tuple[Poses, Poses]:
     """Return a path of changing speed and direction, and an estimate with all kinds of errors."""
     rng = np.random.default_rng(seed)
     turns = rng.normal(0, (0.003, 0.03, 0.003), (frames, 3))
-    ways = np.stack([np.zeros(frames), np.zeros(frames), rng.uniform(0, 2.2, frames)], axis=1)
-    wrong = turns + rng.normal(2e-4, 1e-3, (frames, 3)), ways * 1.02 + rng.normal(
+    translations = np.pad(rng.uniform(0, 2.2, (frames, 1)), ((0, 0), (2, 0)))
+    wrong = turns + rng.normal(2e-4, 1e-3, (frames, 3)), translations * 1.02 + rng.normal(
         0, 0.02, (frames, 3))
-    return travelled(list(zip(turns, ways))), travelled(list(zip(*wrong)))
+    return travelled(list(zip(turns, translations))), travelled(list(zip(*wrong)))
 
 
 def by_the_book(truth: Poses, estimate: Poses) -> tuple[float, float, int]:
@@ -111,11 +111,12 @@ def test_no_drift_below_100_metres() -> None:
     assert drift(still, still) is None
 
 
-@pytest.mark.parametrize(('truth', 'estimate', 'said'), [
+@pytest.mark.parametrize(('truth', 'estimate', 'message'), [
     (straight(10), straight(11), r'are \(11, 4, 4\) and \(12, 4, 4\)'),
     (straight(10)[:, :3], straight(10)[:, :3], r'\(11, 3, 4\); both must be \(N, 4, 4\)'),
     (straight(10), straight(10) * np.nan, 'not finite'),
 ])
-def test_incomparable_trajectories_are_refused(truth: Poses, estimate: Poses, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_incomparable_trajectories_are_refused(
+        truth: Poses, estimate: Poses, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         drift(truth, estimate)

@@ -290,11 +290,11 @@ class Wall:
 def test_keypoints_move_by_a_share_of_the_distance_or_one_pixel(step):
     wall, lengths = Wall(step), []
     for n, (before, after) in enumerate(pairwise(wall.keypoints)):
-        way = wall.tracks[n].y_opt - before
-        length = np.linalg.norm(way, axis=1, keepdims=True)
+        displacement = wall.tracks[n].y_opt - before
+        length = np.linalg.norm(displacement, axis=1, keepdims=True)
         share = 0.2 if step == 'share' else 1 / np.maximum(length, 1)
         stays = ~wall.tracks[n].voting[:, None]
-        assert np.allclose(after - before, np.where(stays, 0, share * way), atol=1e-9)
+        assert np.allclose(after - before, np.where(stays, 0, share * displacement), atol=1e-9)
         lengths.append(length)
     assert np.min(lengths) < 1 < np.max(lengths)
 

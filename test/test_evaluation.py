@@ -54,13 +54,13 @@ RUN = ('--methods', 'djet,rpe', '--presets', 'paper')
 
 @pytest.fixture(scope='module')
 def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give a rendered street: 7 pairs, which are two chunks."""
+    """Return a rendered street: 7 pairs, which are two chunks."""
     return render_sequence('road', tmp_path_factory.mktemp('road'), FRAMES, size=(480, 160))
 
 
 @pytest.fixture(scope='module')
 def evaluated(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give the results folder of all methods and both presets, by one worker."""
+    """Return the results folder of all methods and both presets, by one worker."""
     folder = tmp_path_factory.mktemp('evaluated') / 'results'
     answer = djet('evaluate', road, '--output', folder, '--workers', '1')
     assert answer.returncode == 0, answer.stderr
@@ -69,7 +69,7 @@ def evaluated(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def short(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give the results folder of what RUN asks for, by one worker."""
+    """Return the results folder of what RUN asks for, by one worker."""
     folder = tmp_path_factory.mktemp('short') / 'results'
     answer = djet('evaluate', road, '--output', folder, '--workers', '1', *RUN)
     assert answer.returncode == 0, answer.stderr
@@ -201,8 +201,8 @@ def test_drift_is_told_of_ways_of_over_100_metres(road, tmp_path):
             expected.rotation_deg_per_100m, rel=1e-3)
     least = f"{float(found['djet']['rotation_deg_per_100m']):.3f}"
     assert f'<b>{least}</b>' in (output / 'index.html').read_text()
-    for told in ('t_rel', 'Lengths are those of the ground truth', least):
-        assert told in ' '.join(answer.stdout.split())
+    for part in ('t_rel', 'Lengths are those of the ground truth', least):
+        assert part in ' '.join(answer.stdout.split())
 
 
 def write_stretched(poses: np.ndarray, times: float, path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_short_way_has_no_drift(evaluated):
 
 def record(pair: int, rotation: tuple[float, ...] = (0, 0, 0),
            translation: tuple[float, ...] = (0, 0, 1), **values: object) -> PairRecord:
-    """Give a record of a perfect pair, but for some values."""
+    """Return a record of a perfect pair, but for some values."""
     plain = {'sequence': 'road', 'previous': pair, 'current': pair + 1, 'method': 'djet',
              'preset': 'best', 'change': '', 'status': Status.OK.value, 'matches': 100,
              'inliers': 90, 'failed': False, 'rotation_error_deg': 0.0,
@@ -358,7 +358,7 @@ def test_a_dask_cluster_writes_the_same_bytes(road, short, tmp_path):
 
 @pytest.fixture
 def running(road: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """Give a run with one worker whose first chunk is done and whose second is not."""
+    """Return a run with one worker whose first chunk is done and whose second is not."""
     process = subprocess.Popen(
         [*DJET, 'lab', 'evaluate', str(road), '--output', str(tmp_path), '--workers', '1', *RUN],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -408,7 +408,7 @@ def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path)
         store.write('{"chunk": "road:5')
     assert djet('evaluate', road, '--output', tmp_path, '--workers', '1', *RUN).returncode == 0
     assert len(chunks(tmp_path)) == 2
-    # With its times, so it was not computed anew.
+    # With its times, so it was not computed again.
     assert chunks(tmp_path)[0] == first
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
 
@@ -417,9 +417,9 @@ def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path)
 def test_a_workers_death_is_said_and_costs_only_its_chunk(road, short, running, tmp_path):
     for worker in workers_of(running):
         os.kill(worker, signal.SIGKILL)
-    _, said = running.communicate(timeout=60)
+    _, printed = running.communicate(timeout=60)
     assert running.returncode == 2
-    assert said.splitlines()[-1].startswith('djet: error: a worker died')
+    assert printed.splitlines()[-1].startswith('djet: error: a worker died')
     assert len(chunks(tmp_path)) == 1
     assert djet('evaluate', road, '--output', tmp_path, *RUN).returncode == 0
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
@@ -427,10 +427,10 @@ def test_a_workers_death_is_said_and_costs_only_its_chunk(road, short, running, 
 
 def test_an_interrupt_is_one_line_and_keeps_what_was_done(running, tmp_path):
     running.send_signal(signal.SIGINT)
-    _, said = running.communicate(timeout=60)
+    _, printed = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert 'Traceback' not in said
-    assert said.splitlines()[-1] == 'djet: interrupted'
+    assert 'Traceback' not in printed
+    assert printed.splitlines()[-1] == 'djet: interrupted'
     assert chunks(tmp_path)
 
 
@@ -468,8 +468,8 @@ LONG = {'evaluate': ('ROAD',) * 40, 'coverage': ('--scenes', 'road', '--frames',
 @pytest.mark.parametrize('moment', ['while a worker starts', 'in the middle of a chunk'])
 @pytest.mark.parametrize('verb', LONG)
 def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, moment, road, tmp_path):
-    words = [str(road) if word == 'ROAD' else word for word in LONG[verb]]
-    process = subprocess.Popen([*DJET, 'lab', verb, *words, '--output', str(tmp_path),
+    call = [str(road) if word == 'ROAD' else word for word in LONG[verb]]
+    process = subprocess.Popen([*DJET, 'lab', verb, *call, '--output', str(tmp_path),
                                 '--workers', '2'], stdout=subprocess.DEVNULL,
                                stderr=subprocess.PIPE, text=True, start_new_session=True)
     enough = 0.0 if moment == 'while a worker starts' else 2.5
@@ -479,9 +479,9 @@ def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, momen
     workers, begin = workers_of(process), monotonic()
     # As a terminal does: to all of them.
     os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, printed = process.communicate(timeout=60)
     assert monotonic() - begin < 3
-    assert (process.returncode, said) == (130, 'djet: interrupted\n')
+    assert (process.returncode, printed) == (130, 'djet: interrupted\n')
     wait_for(lambda: not any(Path(f'/proc/{worker}').exists() for worker in workers))
 
 
@@ -527,7 +527,7 @@ def test_a_damaged_store_is_named(road, tmp_path):
 
 # What the user can mend
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'printed'), [
     (['nowhere'], 'nowhere does not exist'),
     (['.'], 'is neither a bag nor a folder of KITTI'),
     (['road', '--methods', 'djet,orb'], "there is no method 'orb'; choose from djet, rpe, "),
@@ -538,14 +538,14 @@ def test_a_damaged_store_is_named(road, tmp_path):
     (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),
     (['road', '--workers', '2', '--scheduler', 'tcp://x'], 'not allowed with argument'),
 ])
-def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, said, monkeypatch):
+def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, printed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     called = [str(road) if word == 'road' else word for word in arguments]
     answer = djet('evaluate', *called, '--output', tmp_path / 'results')
     assert answer.returncode == 2
     assert answer.stderr.startswith('djet: error: ')
     assert answer.stderr.count('\n') == 1
-    assert said in answer.stderr
+    assert printed in answer.stderr
     assert not (tmp_path / 'results').exists()
 
 
@@ -660,16 +660,16 @@ def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):
     assert not any(found.failed for found in with_it)
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'printed'), [
     (['--parts', 'colour'], "there is no part 'colour'; choose from window, "),
     (['--windows', '4'], 'window is 4; it must be odd'),
     (['--windows', 'five'], "--windows is 'five'; write odd integers such as 3,5,7"),
 ])
-def test_a_wrong_ablation_is_one_line_and_exit_code_2(road, tmp_path, arguments, said):
+def test_a_wrong_ablation_is_one_line_and_exit_code_2(road, tmp_path, arguments, printed):
     answer = djet('ablate', road, *arguments, '--output', tmp_path / 'results')
     assert answer.returncode == 2
     assert answer.stderr.count('\n') == 1
-    assert said in answer.stderr
+    assert printed in answer.stderr
 
 
 def test_the_store_is_plain_json(evaluated):

@@ -75,10 +75,10 @@ def test_a_scene_has_parallax_if_its_points_move_by_more_than_rotation_does(name
     poses = scene.trajectory(frames)
     moved = []
     for i in range(0, frames - 1, 4):
-        way = np.linalg.norm((np.linalg.inv(poses[i]) @ poses[i + 1])[:3, 3])
+        metres = np.linalg.norm((np.linalg.inv(poses[i]) @ poses[i + 1])[:3, 3])
         # The size of a picture does not matter to what is told in pixels of the usual size.
         focal = scene.K[0, 0] * find(name).size[0] / TINY[0]
-        moved.append(np.median(focal * way / scene.depth(poses[i], i)))
+        moved.append(np.median(focal * metres / scene.depth(poses[i], i)))
     assert (np.median(moved) > _MOVES) == find(name).parallax
 
 
@@ -169,15 +169,15 @@ def test_the_way_through_the_corridor_keeps_clear_of_its_walls() -> None:
 @pytest.mark.parametrize('seed', range(5))
 def test_a_hand_turns_in_jerks_and_at_times_only_turns(seed: int) -> None:
     scene = make_scene('handheld', seed, TINY)
-    turns, ways = steps_of(scene, 60)
+    turns, lengths = steps_of(scene, 60)
     rates = np.linalg.norm(turns, axis=1)
     assert rates.mean() > 1.5
     assert rates.max() < 5
     # Changes within one frame of the order of the rate itself.
     assert np.linalg.norm(np.diff(turns, axis=0), axis=1).max() > 3
-    assert ways.max() < 0.04
-    assert 8 < (ways < 1e-3).sum() < 40
-    assert (ways > 0.01).sum() > 20
+    assert lengths.max() < 0.04
+    assert 8 < (lengths < 1e-3).sum() < 40
+    assert (lengths > 0.01).sum() > 20
 
 
 def test_what_moves_during_the_exposure_is_blurred_along_its_motion_and_stays_in_place() -> None:

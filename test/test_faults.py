@@ -32,9 +32,9 @@ ONE_THREAD = {**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 POSE_TOPIC = '/vo_node/odometry'
 
 
-def djet(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
-                          check=False, env=ONE_THREAD)
+def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=120, check=False, env=ONE_THREAD)
 
 
 @pytest.fixture(scope='module')
@@ -98,8 +98,8 @@ def test_what_was_written_before_a_kill_is_readable(drive, tmp_path, seed):
     assert abs(rows - poses) <= 1
     # The bag holds back the newest stamp, and a kill may fall between two files.
     assert delivered >= poses - 2
-    told = json.loads((results / 'summary.json').read_text())
-    assert told['complete'] is False
+    summary = json.loads((results / 'summary.json').read_text())
+    assert summary['complete'] is False
     before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
     again = djet('replay', drive, '--output', results)
     assert again.returncode == 2
@@ -110,7 +110,7 @@ def test_what_was_written_before_a_kill_is_readable(drive, tmp_path, seed):
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """Give a function that mounts a small disk in memory, anew with other options."""
+    """Return a function that mounts a small disk in memory, again with other options."""
     place = tmp_path / 'disk'
     place.mkdir()
     mounted = []
@@ -203,20 +203,20 @@ COMMANDS = {
 @pytest.mark.parametrize('name', COMMANDS)
 def test_a_second_run_changes_nothing_and_says_how_to(tmp_path, capsys, name):
     sequence = write_small_kitti(tmp_path / 'data', frames=2, size=(160, 120))
-    words = [word.replace('SEQUENCE', str(sequence)).replace('OUT', str(tmp_path / 'out'))
+    arguments = [word.replace('SEQUENCE', str(sequence)).replace('OUT', str(tmp_path / 'out'))
              .replace('IMAGE', str(sequence / 'image_0' / '000000.png'))
              for word in COMMANDS[name]]
-    assert main(words) == 0
+    assert main(arguments) == 0
     out = next(tmp_path.glob('out*'))
     before = contents(out)
     assert before
     capsys.readouterr()
-    assert main(words) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith('djet: error: ')
-    assert '--overwrite' in said
+    assert main(arguments) == 2
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert printed.startswith('djet: error: ')
+    assert '--overwrite' in printed
     assert contents(out) == before
-    assert main([*words, '--overwrite']) == 0
+    assert main([*arguments, '--overwrite']) == 0
 
 
 def test_sigterm_leaves_nothing_of_a_bag_that_is_half_made(drive, tmp_path):
@@ -225,8 +225,8 @@ def test_sigterm_leaves_nothing_of_a_bag_that_is_half_made(drive, tmp_path):
                                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: any(place.rglob('*.mcap')))
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (143, 'djet: terminated\n')
+    _, printed = process.communicate(timeout=60)
+    assert (process.returncode, printed) == (143, 'djet: terminated\n')
     assert list(place.iterdir()) == []
 
 

@@ -57,29 +57,29 @@ def test_matching_everywhere_gives_mutual_nearest_neighbours(pair):
 
 def scores(previous, current, radius):
     """Return descriptor distances (N, M), higher with the displacement, inf across octaves."""
-    ways = np.linalg.norm(previous.points[:, None] - current.points, axis=2)
-    apart = distances(previous, current) + 32 * (ways / radius)**2
+    shifts = np.linalg.norm(previous.points[:, None] - current.points, axis=2)
+    apart = distances(previous, current) + 32 * (shifts / radius)**2
     octaves = np.abs(previous.octaves[:, None].astype(int) - current.octaves)
-    return np.where(octaves <= 1, apart, np.inf), ways
+    return np.where(octaves <= 1, apart, np.inf), shifts
 
 
 @pytest.mark.parametrize('radius', [0.5, 15.0, 60.0, 400.0])
 def test_nearby_matches_are_mutual_best_within_the_search_radius(pair, radius):
-    score, ways = scores(*pair, radius)
+    score, shifts = scores(*pair, radius)
     rows, columns = match_nearby(*pair, radius).T
-    assert (ways[rows, columns] <= radius).all()
-    near = np.where(ways <= radius, score, np.inf)
+    assert (shifts[rows, columns] <= radius).all()
+    near = np.where(shifts <= radius, score, np.inf)
     assert (near[rows, columns] <= near[rows].min(1) + 1e-3).all()
     assert (near[rows, columns] <= near[:, columns].min(0) + 1e-3).all()
 
 
 @pytest.mark.parametrize('radius', [15.0, 60.0, 400.0])
 def test_no_mutual_best_match_is_missing(pair, radius):
-    score, ways = scores(*pair, radius)
+    score, shifts = scores(*pair, radius)
     best, back = score.argmin(1), score.argmin(0)
     second = np.partition(score, 1, axis=1)[:, 1], np.partition(score, 1, axis=0)[1]
     expected = {(i, j) for i, j in enumerate(best.tolist())
-                if back[j] == i and ways[i, j] <= radius
+                if back[j] == i and shifts[i, j] <= radius
                 # rounding may decide where two are equally good
                 and second[0][i] > score[i, j] + 1e-3 and second[1][j] > score[i, j] + 1e-3}
     assert len(expected) > 50

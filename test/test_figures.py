@@ -39,9 +39,9 @@ def gray() -> np.ndarray:
     return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def lab(words: list[str]) -> int:
+def lab(call: list[str]) -> int:
     """Run a subcommand of djet lab in this process."""
-    return main(['lab', *words])
+    return main(['lab', *call])
 
 
 def test_a_point_is_most_similar_to_itself(gray):
@@ -121,7 +121,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     assert capsys.readouterr().out == one
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (['similarity', 'nowhere.png'], 'nowhere.png could not be read: No such file or directory'),
     (['similarity', 'text'], 'text: compressed image is neither JPEG nor PNG'),
     (['similarity', 'image', '--points', '5,5'], 'point 5,5 is too close to the border'),
@@ -139,7 +139,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),
     (['surfaces', 'road', '--output', 'a.jpg'], 'its name must end in .png or .gif'),
 ])
-def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, said, capsys,
+def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, message, capsys,
                                                   monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'text').write_text('no image')
@@ -150,7 +150,7 @@ def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, sai
     assert code == 2
     assert captured.err.startswith('djet: error: ')
     assert captured.err.count('\n') == 1
-    assert said in captured.err
+    assert message in captured.err
 
 
 def without_screen():

@@ -62,16 +62,16 @@ def camera() -> Iterator[Peer]:
 @pytest.fixture
 def nodes(tmp_path: Path, listener: Peer) -> Iterator[Callable[..., NodeProcess]]:
     """Return a function that starts a node by name; all have ended cleanly after the test."""
-    listener.heard.clear()
+    listener.received.clear()
     with processes(tmp_path, IMAGE) as start:
         yield lambda name, **parameters: start(name=name, **parameters)
 
 
-def see(camera: Peer, ways: list[float], first: int = 0) -> None:
+def see(camera: Peer, positions: list[float], first: int = 0) -> None:
     """Publish what the camera sees on its way."""
     cards = Cards()
-    for i, way in enumerate(ways, first):
-        camera.send(IMAGE, image(cards.gray(pose(x=way), noise=i), stamp_ns=START + i * PERIOD))
+    for i, metres in enumerate(positions, first):
+        camera.send(IMAGE, image(cards.gray(pose(x=metres), noise=i), stamp_ns=START + i * PERIOD))
         sleep(0.05)
 
 
@@ -83,17 +83,17 @@ def advertise(camera: Peer, listeners: int) -> None:
         sleep(0.1)
 
 
-def said(text: str) -> Callable[[Heard], Any]:
+def diagnostics(text: str) -> Callable[[Heard], Any]:
     """Make the condition that the pose graph says something; its value is what it has."""
-    return lambda heard: next((
+    return lambda received: next((
         {pair.key: pair.value for pair in message.status[0].values}
-        for message in reversed(heard['/diagnostics'])
+        for message in reversed(received['/diagnostics'])
         if message.status[0].name == 'pose_graph_node: pose graph'
         and message.status[0].message == text), None)
 
 
-def transforms(heard: Heard, parent: str) -> dict[int, Any]:
-    return dict(pose_of(one) for message in heard['/tf'] for one in message.transforms
+def transforms(received: Heard, parent: str) -> dict[int, Any]:
+    return dict(pose_of(one) for message in received['/tf'] for one in message.transforms
                 if one.header.frame_id == parent)
 
 
@@ -113,13 +113,14 @@ def drive(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess],
         camera.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', TO_THE_LEFT))
     nodes('vo_node', **ODOMETRY_PARAMETERS, **parameters)
     graph = nodes('pose_graph_node', **SLAM_PARAMETERS, **parameters)
-    listener.wait('both nodes', said('waiting for the mounting of the camera on tf' if parameters
-                                     else 'waiting for odometry'), 60)
+    listener.wait('both nodes', diagnostics(
+        'waiting for the mounting of the camera on tf' if parameters
+        else 'waiting for odometry'), 60)
     advertise(camera, 2)
     see(camera, WAYS)
     last = START + (len(WAYS) - 1) * PERIOD
-    listener.wait('the whole path', lambda heard: heard[PATH] and pose_of(
-        heard[PATH][-1].poses[-1])[0] == last, 60)
+    listener.wait('the whole path', lambda received: received[PATH] and pose_of(
+        received[PATH][-1].poses[-1])[0] == last, 60)
     return graph
 
 
@@ -131,24 +132,25 @@ def driven(listener: Peer, camera: Peer, nodes: Callable[..., NodeProcess]) -> N
 
 def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
     """Wait until the loops are closed, and check the path and the frames."""
-    values = listener.wait('loops', lambda heard: (found := said('mapping')(heard))
+    values = listener.wait('loops', lambda received: (found := diagnostics('mapping')(received))
                            and int(found['keyframes waiting']) == 0
                            and int(found['loops']) >= 3 and found, 60)
     assert values['relative poses missing'] == values['messages dropped'] == '0'
-    path = listener.heard[PATH][-1]
+    path = listener.received[PATH][-1]
     assert path.header.frame_id == 'map'
-    told = dict(pose_of(one) for one in listener.heard[ODOMETRY])
+    by_odometry = dict(pose_of(one) for one in listener.received[ODOMETRY])
     # Loops cannot improve what is accurate to 3 cm already.
     assert worst(dict(pose_of(one) for one in path.poses), to_the_right) < max(
-        worst(told, to_the_right), 0.03)
+        worst(by_odometry, to_the_right), 0.03)
     # REP 105: odom -> camera is the odometry's alone, and map -> odom carries the correction
-    map_to_odom, odom_to_child = (transforms(listener.heard, frame) for frame in ('map', 'odom'))
-    assert map_to_odom.keys() == odom_to_child.keys() == told.keys()
-    for stamp in told:
-        assert np.allclose(told[stamp], odom_to_child[stamp], atol=1e-12)
+    map_to_odom, odom_to_child = (transforms(listener.received, frame)
+                                  for frame in ('map', 'odom'))
+    assert map_to_odom.keys() == odom_to_child.keys() == by_odometry.keys()
+    for stamp in by_odometry:
+        assert np.allclose(by_odometry[stamp], odom_to_child[stamp], atol=1e-12)
     # the first path to a frame goes out with the frame's own correction
     first: dict[int, Any] = {}
-    for message in listener.heard[PATH]:
+    for message in listener.received[PATH]:
         stamp, here = pose_of(message.poses[-1])
         first.setdefault(stamp, here)
     assert len(first) == len(WAYS)
@@ -176,19 +178,19 @@ def test_map_is_of_the_base_frame_with_the_mounting_from_tf(
     drive(listener, camera, nodes, **{'odometry.base_frame': 'base_link'})
     # What the camera that looks to the left has on its right is ahead of the vehicle.
     check_the_map(listener, to_the_right=[1, 0, 0])
-    pairs = {(one.header.frame_id, one.child_frame_id) for message in listener.heard['/tf']
+    pairs = {(one.header.frame_id, one.child_frame_id) for message in listener.received['/tf']
              for one in message.transforms}
     assert pairs == {('map', 'odom'), ('odom', 'base_link')}
 
 
 def test_reset_discards_the_map(
         listener: Peer, camera: Peer, driven: NodeProcess) -> None:
-    listener.heard.clear()
+    listener.received.clear()
     assert camera.call('reset', '/pose_graph_node')['success']
-    listener.wait('the reset', said('waiting for odometry'))
-    listener.heard.clear()
+    listener.wait('the reset', diagnostics('waiting for odometry'))
+    listener.received.clear()
     see(camera, WAYS[1:6], len(WAYS))
-    path = listener.wait('a path', lambda heard: heard[PATH] and heard[PATH][-1])
+    path = listener.wait('a path', lambda received: received[PATH] and received[PATH][-1])
     assert min(stamp_ns(one.header) for one in path.poses) >= START + len(WAYS) * PERIOD
 
 
@@ -205,7 +207,7 @@ def test_missing_inputs_are_logged_with_their_resolved_names(
     nodes('vo_node')
     listener.ask('published', topic=ODOMETRY)
     graph = nodes('pose_graph_node')
-    listener.wait('diagnostics', said('waiting for odometry'), 60)
+    listener.wait('diagnostics', diagnostics('waiting for odometry'), 60)
     for _ in range(100):
         if 'waiting for camera_info' in graph.log:
             break
@@ -218,8 +220,8 @@ def test_missing_inputs_are_logged_with_their_resolved_names(
     assert 'did you mean' not in graph.log
 
 
-def node(*words: str, before: str = '') -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*command('pose_graph_node', before), *words], env=ENVIRONMENT,
+def node(*arguments: str, before: str = '') -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*command('pose_graph_node', before), *arguments], env=ENVIRONMENT,
                           timeout=60, capture_output=True, text=True, check=False)
 
 

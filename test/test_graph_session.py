@@ -35,10 +35,10 @@ class Live:
         self._cards, self._odometry, self._was = Cards(), Odometry(
             'body', base_frame, MOUNTING if base_frame else None), None
 
-    def drive(self, ways):
+    def drive(self, positions):
         self.session.camera_info(camera_info(K, SIZE))
-        for way in ways:
-            stamp, here = self._odometry.stamp, pose(x=way)
+        for metres in positions:
+            stamp, here = self._odometry.stamp, pose(x=metres)
             self.session.image(image(self._cards.gray(here, noise=stamp % 97), stamp_ns=stamp))
             if self._was is None:
                 status, odometry = self._odometry.start()
@@ -75,8 +75,8 @@ def until(condition):
 def test_odometry_does_not_wait_for_the_loop_search(live):
     one = live(optimise_period=0.0)
     one.drive(WAYS)
-    until(lambda: len(one.graph.heard('/tf')) == len(WAYS))
-    stamps = [stamp_ns(message.transforms[0].header) for message in one.graph.heard('/tf')]
+    until(lambda: len(one.graph.published('/tf')) == len(WAYS))
+    stamps = [stamp_ns(message.transforms[0].header) for message in one.graph.published('/tf')]
     assert stamps == [START + i * 100_000_000 for i in range(len(WAYS))]
     until(lambda: one.slam.idle and one.slam.map.count('loop') >= 2)
     assert one.slam.map.without_image == 0
@@ -88,11 +88,12 @@ def test_odometry_of_a_base_frame_waits_for_the_mounting_on_tf(live):
     until(lambda: any("tf has no transform from 'base_link' (odometry.base_frame) to 'camera'; "
                       'publish it on /tf_static; until then the odometry is ignored' in line
                       for line in one.graph.lines))
-    assert not one.graph.heard('/tf')
+    assert not one.graph.published('/tf')
     one.graph.frames['base_link', 'camera'] = MOUNTING
     one.drive(WAYS[3:6])
-    until(lambda: [stamp_ns(message.transforms[0].header) for message in one.graph.heard('/tf')][
-        -3:] == [START + i * 100_000_000 for i in (3, 4, 5)])
+    last = [START + i * 100_000_000 for i in (3, 4, 5)]
+    until(lambda: [stamp_ns(message.transforms[0].header)
+                   for message in one.graph.published('/tf')][-3:] == last)
 
 
 def test_graph_is_optimised_when_the_odometry_is_silent(live, monkeypatch):
@@ -111,12 +112,12 @@ def test_missing_inputs_are_logged_with_their_topics(live, monkeypatch):
     one.session.camera_info(camera_info(K, SIZE))
     for _ in range(3):
         one.session.tick()
-    until(lambda: one.graph.heard('/diagnostics'))
+    until(lambda: one.graph.published('/diagnostics'))
     silent = [(what, topic) for what, topic in TOPICS.items() if what != 'camera_info']
     assert one.graph.lines == [
         f'warning: waiting for {what} on {topic}: nothing is seen of {topic}'
         for what, topic in silent]
-    assert one.graph.said()['state'] == 'waiting for odometry'
+    assert one.graph.diagnostics()['state'] == 'waiting for odometry'
 
 
 def test_closed_loops_are_logged(live):
@@ -130,18 +131,18 @@ def test_closed_loops_are_logged(live):
 def test_reset_starts_a_new_map(live):
     one = live()
     one.drive(WAYS[:5])
-    until(lambda: len(one.graph.heard('/tf')) == 5)
+    until(lambda: len(one.graph.published('/tf')) == 5)
     one.session.reset()
-    until(lambda: one.graph.said()['keyframes'] == '0')
+    until(lambda: one.graph.diagnostics()['keyframes'] == '0')
     one.drive(WAYS[5:])
-    until(lambda: len(one.graph.heard('/tf')) == len(WAYS))
+    until(lambda: len(one.graph.published('/tf')) == len(WAYS))
     assert one.slam.map.keyframes[0].stamp_ns == START + 5 * 100_000_000
 
 
 def test_nothing_is_published_after_a_stop(live):
     one = live()
     one.drive(WAYS[:3])
-    until(lambda: one.graph.heard('/tf'))
+    until(lambda: one.graph.published('/tf'))
     one.session.stop(5)
     count = len(one.graph.batches)
     one.drive(WAYS[3:])

@@ -44,8 +44,8 @@ class Floor:
         rays = rays @ floor_pose(pitch, yaw=yaw)[:3, :3].T
         below, aside, along = self._met(rays, height)
         # 2 cm a pixel
-        places = [((at + way) / 0.02 % 1024).astype(np.float32)
-                  for at, way in ((x, aside), (z, along))]
+        places = [((at + metres) / 0.02 % 1024).astype(np.float32)
+                  for at, metres in ((x, aside), (z, along))]
         image = np.where(below, cv2.remap(self._texture, *places, cv2.INTER_LINEAR,
                                           borderMode=cv2.BORDER_WRAP), 200.0)
         if seed is not None:
@@ -76,9 +76,9 @@ class Hill(Floor):
         arc = np.arctan(reach * rays[..., 2] / (centre - reach * rays[..., 1]))
         return below, reach * rays[..., 0], self._radius * arc
 
-    def motion(self, way):
+    def motion(self, metres):
         """Motion of a camera that goes so far along the ground, as that turns it."""
-        angle, centre = way / self._radius, HEIGHT + self._radius
+        angle, centre = metres / self._radius, HEIGHT + self._radius
         after = floor_pose(angle, z=centre * np.sin(angle))
         after[1, 3] = centre * (1 - np.cos(angle))
         return moved(floor_pose(0.0), after)
@@ -94,7 +94,7 @@ def floor_pose(pitch, x=0.0, z=0.0, yaw=0.0):
 
 
 def moved(before, after, sigma=1e-3):
-    """Give the true motion between two camera poses, as sure as is said."""
+    """Return the true motion between two camera poses, as sure as is said."""
     M = np.linalg.inv(after) @ before
     return RelativePose(Status.OK, M[:3, :3], unit(M[:3, 3]), np.eye(5) * sigma**2)
 
@@ -110,17 +110,17 @@ def floor():
 
 # One pair
 
-@pytest.mark.parametrize('way', [0.15, 0.8, 1.5])
+@pytest.mark.parametrize('metres', [0.15, 0.8, 1.5])
 @pytest.mark.parametrize(('pitch', 'turn'), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.05)])
-def test_the_translation_is_measured_in_camera_heights(floor, way, pitch, turn):
-    heading = np.array([np.sin(turn / 2), np.cos(turn / 2)]) * way
+def test_the_translation_is_measured_in_camera_heights(floor, metres, pitch, turn):
+    heading = np.array([np.sin(turn / 2), np.cos(turn / 2)]) * metres
     motion = moved(floor_pose(pitch), floor_pose(pitch, *heading, yaw=turn))
     seen = Ground(K, SIZE[::-1], pitch).motion(
         view(floor.gray(pitch, seed=1)),
         view(floor.gray(pitch, *heading, yaw=turn, seed=2)), motion)
-    off, sigmas = seen.value - [way / HEIGHT, pitch, 0.0], np.sqrt(np.diag(seen.covariance))
+    off, sigmas = seen.value - [metres / HEIGHT, pitch, 0.0], np.sqrt(np.diag(seen.covariance))
     assert (np.abs(off) < 3 * sigmas).all()
-    assert (sigmas < [0.05 * way / HEIGHT, np.radians(1), np.radians(1)]).all()
+    assert (sigmas < [0.05 * metres / HEIGHT, np.radians(1), np.radians(1)]).all()
 
 
 def test_the_pitch_may_be_slightly_wrong(floor):
@@ -137,14 +137,14 @@ def test_the_covariance_of_one_pair_is_consistent_over_many():
     rng, ground, errors = np.random.default_rng(3), Ground(K, SIZE[::-1], 0.0), []
     sigma = 4e-3
     for seed in range(40):
-        floor, way = Floor(seed), rng.uniform(0.4, 1.6)
-        motion = moved(floor_pose(0.0), floor_pose(0.0, z=way), sigma)
+        floor, metres = Floor(seed), rng.uniform(0.4, 1.6)
+        motion = moved(floor_pose(0.0), floor_pose(0.0, z=metres), sigma)
         off = rng.normal(0, sigma, 5)
         motion = RelativePose(Status.OK, rotation_exp(off[:3]) @ motion.R,
                               unit(motion.t + np.array([*off[3:], 0.0])), motion.covariance_5)
         seen = ground.motion(view(floor.gray(seed=2 * seed)),
-                             view(floor.gray(z=way, seed=2 * seed + 1)), motion)
-        off = seen.value - [way / HEIGHT, 0.0, 0.0]
+                             view(floor.gray(z=metres, seed=2 * seed + 1)), motion)
+        off = seen.value - [metres / HEIGHT, 0.0, 0.0]
         errors.append(off @ np.linalg.solve(seen.covariance, off))
     # three are expected of each; the inflation is for real roads
     assert 0.5 < np.mean(errors) < 4.5
@@ -261,10 +261,10 @@ def test_lengths_are_metric_with_the_uncertainty_of_height_and_images(floor):
 
 def test_speed_may_change_at_once(floor):
     scale, z = CameraHeightScale(HEIGHT, 0.0), 0.0
-    for i, way in enumerate((0.9, 0.9, 0.3, 0.9, 0.1, 0.9)):
-        length = see_pair(scale, floor, i, z, way)
-        assert length.value == pytest.approx(way, rel=0.04)
-        z += way
+    for i, metres in enumerate((0.9, 0.9, 0.3, 0.9, 0.1, 0.9)):
+        length = see_pair(scale, floor, i, z, metres)
+        assert length.value == pytest.approx(metres, rel=0.04)
+        z += metres
 
 
 def test_without_ground_a_length_is_held_for_half_a_second_and_then_unknown(floor):
@@ -336,14 +336,15 @@ def test_the_covariance_of_tilt_is_propagated_through_a_rotation():
                                      np.repeat([0.0, 2.0, 0.0], 7)])
 def test_pitching_of_the_vehicle_does_not_bias_lengths(floor, pitches):
     """Thrice in two seconds, as when it bounces, or all of a sudden; pitches in degrees."""
-    scale, lengths, way = CameraHeightScale(HEIGHT, 0.0), [], 0.8
+    scale, lengths, metres = CameraHeightScale(HEIGHT, 0.0), [], 0.8
     for i, pair in enumerate(pairwise(np.radians(pitches))):
-        views = [view(floor.gray(pitch, z=way * at, seed=at)) for at, pitch in enumerate(pair, i)]
-        motion = moved(floor_pose(pair[0]), floor_pose(pair[1], z=way))
+        views = [view(floor.gray(pitch, z=metres * at, seed=at))
+                 for at, pitch in enumerate(pair, i)]
+        motion = moved(floor_pose(pair[0]), floor_pose(pair[1], z=metres))
         scale.observe(i * 10**8, (i + 1) * 10**8, *views, motion)
         lengths.append(scale.between(i * 10**8, (i + 1) * 10**8))
     assert all(length.known for length in lengths)
-    off = np.array([length.value for length in lengths[3:]]) / way - 1
+    off = np.array([length.value for length in lengths[3:]]) / metres - 1
     assert np.sqrt(np.mean(off**2)) < 0.015
 
 
@@ -354,12 +355,12 @@ def test_a_vehicle_that_pitches_with_the_road_is_on_a_hill(radius):
 
     On a crest that is nearer than the ground, on which the vehicle turns without leaning.
     """
-    hill, scale, way = Hill(radius), CameraHeightScale(HEIGHT, 0.0), 0.8
-    motion, ground = hill.motion(way), Ground(K, SIZE[::-1], 0.0)
-    true = 2 * (HEIGHT + radius) * np.sin(way / radius / 2)
+    hill, scale, metres = Hill(radius), CameraHeightScale(HEIGHT, 0.0), 0.8
+    motion, ground = hill.motion(metres), Ground(K, SIZE[::-1], 0.0)
+    true = 2 * (HEIGHT + radius) * np.sin(metres / radius / 2)
     alone, lengths = [], []
     for i in range(25):
-        views = [view(hill.gray(z=way * at, seed=at)) for at in (i, i + 1)]
+        views = [view(hill.gray(z=metres * at, seed=at)) for at in (i, i + 1)]
         scale.observe(i * 10**8, (i + 1) * 10**8, *views, motion)
         lengths.append(scale.between(i * 10**8, (i + 1) * 10**8).value)
         alone.append(HEIGHT * ground.motion(*views, motion).value[0])
@@ -389,15 +390,15 @@ def drive(street, **config):
 
 
 def test_the_length_of_a_street_is_measured(street):
-    ways = np.linalg.norm(np.diff(np.array(street[2])[:, :3, 3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(np.array(street[2])[:, :3, 3], axis=0), axis=1)
     results = drive(street, **CAR)
     assert all(result.scale_known for result in results)
-    for result, way in zip(results, ways):
+    for result, metres in zip(results, steps):
         direction = unit(result.motion[:3, 3])
         sigma = np.sqrt(direction @ result.motion_covariance[:3, :3] @ direction)
         assert 0.05 < sigma / result.scale < 0.2
-        assert abs(result.scale - way) < 2 * sigma
-    assert sum(result.scale for result in results) == pytest.approx(ways.sum(), rel=0.06)
+        assert abs(result.scale - metres) < 2 * sigma
+    assert sum(result.scale for result in results) == pytest.approx(steps.sum(), rel=0.06)
 
 
 def test_a_wrong_height_is_a_wrong_length_in_proportion(street):
@@ -437,10 +438,10 @@ def test_real_roads_are_as_long_as_their_ground_truth_says(kitti, name):
     results = [vo.process(Frame(sequence.image(i), sequence.K, int(sequence.stamps_ns[i])))
                for i in range(first, first + 15)][1:]
     truth = np.array(sequence.poses)[first:first + 15, :3, 3]
-    ways = np.linalg.norm(np.diff(truth, axis=0), axis=1)
-    ratios = np.array([result.scale for result in results]) / ways
+    steps = np.linalg.norm(np.diff(truth, axis=0), axis=1)
+    ratios = np.array([result.scale for result in results]) / steps
     assert all(result.scale_known for result in results)
     assert np.median(ratios) == pytest.approx(1, abs=0.04)
-    surprise = [(result.scale - way) / np.sqrt(np.trace(result.motion_covariance[:3, :3]))
-                for result, way in zip(results, ways)]
+    surprise = [(result.scale - metres) / np.sqrt(np.trace(result.motion_covariance[:3, :3]))
+                for result, metres in zip(results, steps)]
     assert np.sqrt(np.mean(np.square(surprise))) < 2

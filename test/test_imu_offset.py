@@ -27,14 +27,14 @@ def seen(poses: Array, noise: float, seed: int = 0) -> VisualRotations:
     return VisualRotations(start, start + PERIOD, R)
 
 
-def way(frames: int = 150, seed: int = 0) -> Array:
+def trajectory(frames: int = 150, seed: int = 0) -> Array:
     hand = HandHeld((0.0, -1.3, 0.0), 0.2, seed, limit=frames)
     return np.stack([hand.pose(i) for i in range(frames)])
 
 
 @pytest.mark.parametrize('offset', [0.0, 0.0123, -0.087, 0.31])
 def test_offset_mounting_and_bias_are_found(offset: float) -> None:
-    poses = way()
+    poses = trajectory()
     felt = feel(poses, 0.1, Mems(), 1)
     fit = fit_imu(seen(poses, np.radians(0.02)),
                   felt.stamps_ns + 5 * 10**9 + round(offset * 1e9), felt.rates)
@@ -45,7 +45,7 @@ def test_offset_mounting_and_bias_are_found(offset: float) -> None:
 
 
 def test_some_pairs_that_are_wrong_do_not_matter() -> None:
-    poses = way()
+    poses = trajectory()
     felt, turns = feel(poses, 0.1, Mems(), 1), seen(poses, np.radians(0.02))
     turns.R[::6] = np.eye(3)
     fit = fit_imu(turns, felt.stamps_ns + 5 * 10**9 + 40_000_000, felt.rates)
@@ -60,7 +60,7 @@ def test_a_camera_that_hardly_turns_tells_nothing() -> None:
 
 
 def test_clocks_that_are_far_apart_are_said() -> None:
-    poses = way()
+    poses = trajectory()
     felt = feel(poses, 0.1, Mems(), 1)
     with pytest.raises(DjetError, match='the IMU covers 0 of 149 pairs'):
         fit_imu(seen(poses, 1e-5), felt.stamps_ns + 500 * 10**9, felt.rates)
@@ -70,11 +70,11 @@ def test_the_command_prints_what_goes_into_a_parameter_file(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = render_sequence('handheld', tmp_path, 30, 0, (320, 240))
     assert main(['lab', 'imu-offset', str(folder)]) == 0
-    said = capsys.readouterr().out.splitlines()
-    name, value = said[0].split('#')[0].split(':')
+    lines = capsys.readouterr().out.splitlines()
+    name, value = lines[0].split('#')[0].split(':')
     assert name == 'odometry.imu_offset'
     assert abs(float(value)) < 0.005
-    x, y, z, w = map(float, said[1].split('"')[1].split())
+    x, y, z, w = map(float, lines[1].split('"')[1].split())
     assert abs(np.dot((x, y, z, w), (0.5, -0.5, 0.5, 0.5))) > np.cos(np.radians(1))
 
 

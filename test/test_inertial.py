@@ -30,7 +30,7 @@ def constant(rate: Array, seconds: float = 1.0, hertz: int = 200, **more: object
     return gyro
 
 
-def way(frames: int = 60, seed: int = 0) -> Array:
+def trajectory(frames: int = 60, seed: int = 0) -> Array:
     hand = HandHeld((0.0, -1.3, 0.0), 0.2, seed, limit=frames)
     return np.stack([hand.pose(i) for i in range(frames)])
 
@@ -61,7 +61,7 @@ def test_a_constant_rate_turns_by_rate_times_time_between_any_two_stamps() -> No
 
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_the_jerks_of_a_hand_are_integrated_to_a_hundredth_of_a_degree(seed: int) -> None:
-    poses = way(seed=seed)
+    poses = trajectory(seed=seed)
     gyro, _ = felt_by(poses, EXACT, seed)
     for i in range(len(poses) - 1):
         turn = gyro.turn(i * PERIOD, (i + 1) * PERIOD)
@@ -194,7 +194,7 @@ def test_memory_is_bounded() -> None:
 @pytest.mark.parametrize('seed', range(5))
 def test_after_30_s_of_pairs_the_bias_is_known_to_a_tenth_of_it(seed: int) -> None:
     """Visual rotations as in a street: 0.004 degrees, the mean of measured errors."""
-    poses, rng = way(301, seed), np.random.default_rng(seed)
+    poses, rng = trajectory(301, seed), np.random.default_rng(seed)
     gyro, biases = felt_by(poses, Mems(), seed)
     sigma = np.radians(0.004)
     for i in range(300):
@@ -221,10 +221,10 @@ def test_rest_is_distinguished_from_the_slowest_rotation() -> None:
         assert not gyro.at_rest(0, 2 * PERIOD)  # it might be the bias
         gyro.bias = feel(np.tile(np.eye(4), (31, 1, 1)), 0.1, Mems(), 4).rate_biases[0].copy()
         gyro.bias_covariance = np.eye(3) * 1e-4**2
-    told = [[gyro.at_rest(i * PERIOD, (i + 1) * PERIOD) for i in range(30)]
+    at_rest = [[gyro.at_rest(i * PERIOD, (i + 1) * PERIOD) for i in range(30)]
             for gyro in (at_rest, turning)]
-    assert all(told[0])
-    assert not any(told[1])
+    assert all(at_rest[0])
+    assert not any(at_rest[1])
 
 
 def test_a_gyro_that_never_agrees_is_not_trusted() -> None:
@@ -251,16 +251,16 @@ def pair(R: Array, t: Array, covariance: Array) -> RelativePose:
 def test_fused_errors_are_consistent_with_their_covariance_and_smaller() -> None:
     rng = np.random.default_rng(2)
     root = rng.normal(0, 1e-3, (5, 5))
-    covariance, told = root @ root.T, np.eye(3) * 5e-4**2
+    covariance, gyro_covariance = root @ root.T, np.eye(3) * 5e-4**2
     R, t = rotation_exp(np.array([0.1, 0.2, -0.1])), np.array([0.6, 0.0, 0.8])
     before, after = [], []
     for _ in range(2000):
         error = root @ rng.standard_normal(5)
         seen = t + sphere_tangents(t) @ error[3:]
         visual = pair(rotation_exp(error[:3]) @ R, seen / np.linalg.norm(seen), covariance)
-        turn = MeasuredRotation(rotation_exp(rng.normal(0, 5e-4, 3)) @ R, told)
+        turn = MeasuredRotation(rotation_exp(rng.normal(0, 5e-4, 3)) @ R, gyro_covariance)
         found = fused(visual, turn)
-        off = np.concatenate([MeasuredRotation(found.R, told).correction(R),
+        off = np.concatenate([MeasuredRotation(found.R, gyro_covariance).correction(R),
                               sphere_tangents(found.t).T @ (found.t - t)])
         before.append(error @ np.linalg.solve(covariance, error))
         after.append(off @ np.linalg.solve(found.covariance_5, off))
@@ -289,10 +289,10 @@ def test_a_rotation_decides_between_two_motions_only_by_its_covariance() -> None
     one, other = (rotation_exp(np.radians([0, angle, 0])) for angle in (0.0, 0.3))
     wrong = {}
     for sigma in np.radians([0.02, 0.1, 1.0]):
-        told = [MeasuredRotation(rotation_exp(rng.normal(0, sigma, 3)) @ one, np.eye(3) * sigma**2)
-                for _ in range(500)]
-        wrong[sigma] = np.mean([turn.prefers(other, one) for turn in told])
-        right = np.mean([turn.prefers(one, other) for turn in told])
+        measured = [MeasuredRotation(rotation_exp(rng.normal(0, sigma, 3)) @ one,
+                                     np.eye(3) * sigma**2) for _ in range(500)]
+        wrong[sigma] = np.mean([turn.prefers(other, one) for turn in measured])
+        right = np.mean([turn.prefers(one, other) for turn in measured])
         assert right == 1 if sigma < 1e-3 else right < 1
     assert max(wrong.values()) < 0.01
     assert right == 0  # with a sigma of a degree
@@ -300,7 +300,7 @@ def test_a_rotation_decides_between_two_motions_only_by_its_covariance() -> None
 
 def test_a_bias_estimated_from_a_moving_object_is_reset() -> None:
     """The images show the rotation of a lorry for a second, and then that of the world."""
-    poses = way(frames=160)
+    poses = trajectory(frames=160)
     gyro, biases = felt_by(poses, Mems(), 6)
     sure, lorry = np.eye(3) * np.radians(0.01)**2, rotation_exp(np.radians([0, 0.2, 0.1]))
     fitted = []

@@ -119,9 +119,9 @@ def test_measurements_are_weighted_by_their_precision() -> None:
         found = views.y + sigma[:, None] * rng.normal(size=views.y.shape)
         alone = jet_problem(K, views.x, surfaces(y_star, S))
         start = minimise(alone, views.R, views.t, Loss())
-        told = Aligned(found, sigma[:, None, None]**2 * np.eye(2))
+        known = Aligned(found, sigma[:, None, None]**2 * np.eye(2))
         return [minimise(fuse_alignment(alone, start, K, placed), views.R, views.t, Loss()).pose
-                for placed in (told, alike(found))]
+                for placed in (known, alike(found))]
 
     weighed, unweighed = rotation_errors(poses, 20, 200)
     assert weighed < 0.5 * unweighed

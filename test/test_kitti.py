@@ -118,13 +118,13 @@ DAMAGES = {
 }
 
 
-@pytest.mark.parametrize('said', DAMAGES)
-def test_a_wrong_folder_is_named_in_one_line(small_kitti, said):
+@pytest.mark.parametrize('message', DAMAGES)
+def test_a_wrong_folder_is_named_in_one_line(small_kitti, message):
     folder = small_kitti(frames=6)
-    DAMAGES[said](folder)
+    DAMAGES[message](folder)
     with pytest.raises(DjetError) as caught:
         KittiSequence(folder)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert '\n' not in str(caught.value)
 
 

@@ -35,9 +35,9 @@ def moment(frame: int = 1, aid: str = GYRO, seed: int = 0, dark: bool = False,
 def test_every_pair_of_the_whip_turns_by_fifteen_degrees_and_goes_on() -> None:
     poses = make_scene('whip', 3).trajectory(30)
     turns = [np.degrees(rotation_angle(a[:3, :3], b[:3, :3])) for a, b in pairwise(poses)]
-    ways = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert min(turns) > 14 and max(turns) < 16
-    assert ways.min() > 0.01
+    assert lengths.min() > 0.01
 
 
 def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None:
@@ -66,7 +66,7 @@ def test_of_two_bodies_that_may_turn_as_was_measured_each_is_led_to_its_end() ->
 
 
 def felt_turn(poses: Array) -> KnownMotion:
-    """Give the turn between two poses (2, 4, 4) as a gyro tells it, to a hundredth of a degree."""
+    """Return the rotation between two poses (2, 4, 4) by a gyro, to a hundredth of a degree."""
     R = poses[1, :3, :3].T @ poses[0, :3, :3]
     return KnownMotion(MeasuredRotation(R, np.radians(0.01)**2 * np.eye(3)))
 
@@ -104,21 +104,21 @@ def test_the_command_runs_each_trial_with_all_aids_and_takes_up_where_it_ended(
     assert masked['failed'] == 0 and masked['direction_deg'][1] < 2
     # Whatever its bias may be, nobody takes the lorry for the world.
     assert with_gyro['wrong'] == 0 and with_gyro['bias_off'][0] < 1.05
-    said, records = capsys.readouterr().out, (tmp_path / 'records.jsonl').read_bytes()
+    output, records = capsys.readouterr().out, (tmp_path / 'records.jsonl').read_bytes()
     assert main(command) == 0
-    assert capsys.readouterr().out == said
+    assert capsys.readouterr().out == output
     assert (tmp_path / 'records.jsonl').read_bytes() == records
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'output'), [
     (('--trials', 'moon'), "'moon'"), (('--frames', '2'), '--frames is 2'),
     (('--workers', '0'), 'workers is 0')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
-        said: str) -> None:
+        output: str) -> None:
     assert main(['lab', 'beside', *arguments, '--output', str(tmp_path)]) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count('\n') == 1
+    assert output in error and error.count('\n') == 1
 
 
 def gone(scene: Scene, poses: Array, seed: int, period: float = 0.1, first: int = 0

@@ -136,13 +136,13 @@ def environment(tmp_path: Path) -> dict[str, str]:
             'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_LOG_DIR': str(tmp_path / 'log')}
 
 
-def launched(environment: dict[str, str], log: Path, *words: str, until: str,
+def launched(environment: dict[str, str], log: Path, *launch_arguments: str, until: str,
              times: int = 1) -> str:
     """Run ros2 launch until its output has a text so often, end it by Ctrl-C, give the output."""
     with log.open('w') as file:
         # A shell's background job, such as this run of the tests may be, has Ctrl-C switched off.
         process = subprocess.Popen(
-            ['ros2', 'launch', 'djet_ros', *words], env=environment, stdout=file,
+            ['ros2', 'launch', 'djet_ros', *launch_arguments], env=environment, stdout=file,
             stderr=subprocess.STDOUT, start_new_session=True,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     try:
@@ -159,13 +159,13 @@ def launched(environment: dict[str, str], log: Path, *words: str, until: str,
     return log.read_text()
 
 
-def parameters_of_launched(environment: dict[str, str], folder: Path, *words: str
+def parameters_of_launched(environment: dict[str, str], folder: Path, *launch_arguments: str
                            ) -> tuple[bool, bool]:
     """Return use_sim_time and ros.publish_tf of the odometry that a launch file starts."""
     node = folder / 'lib' / 'djet_ros' / 'vo_node'
     node.write_text(f'#!/bin/sh\nexec {shlex.join([sys.executable, "-c", TELL])} "$@"\n')
-    said = launched(environment, folder / 'out', *words, until='TOLD')
-    clock, tf = re.findall(r'TOLD (\w+) (\w+)', said)[0]
+    output = launched(environment, folder / 'out', *launch_arguments, until='TOLD')
+    clock, tf = re.findall(r'TOLD (\w+) (\w+)', output)[0]
     return clock == 'True', tf == 'True'
 
 
@@ -183,11 +183,11 @@ rclpy.spin(node)
 @pytest.mark.ros
 def test_vo_launch_starts_the_node_on_the_topics_given(
         environment: dict[str, str], tmp_path: Path) -> None:
-    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'image:=/left/image_raw',
+    output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'image:=/left/image_raw',
                     until='queue policy')
-    assert 'images from /left/image_raw, camera_info from /left/camera_info' in said
-    assert 'queue policy latest' in said
-    assert re.search(r'vo_node-1\]: process has finished cleanly', said)
+    assert 'images from /left/image_raw, camera_info from /left/camera_info' in output
+    assert 'queue policy latest' in output
+    assert re.search(r'vo_node-1\]: process has finished cleanly', output)
 
 
 @pytest.mark.ros
@@ -195,21 +195,21 @@ def test_vo_launch_names_and_respawns_the_node(
         environment: dict[str, str], tmp_path: Path) -> None:
     broken = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
     broken.write_text('#!/bin/sh\necho started with "$@"\nexit 1\n')
-    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'namespace:=left',
+    output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'namespace:=left',
                     'name:=eye', 'respawn:=true', 'log_level:=warn',
                     until='process started with pid', times=2)
-    assert '__node:=eye' in said
-    assert '__ns:=/left' in said
-    assert '--log-level warn' in said
+    assert '__node:=eye' in output
+    assert '__ns:=/left' in output
+    assert '--log-level warn' in output
 
 
 @pytest.mark.ros
 def test_missing_parameter_file_ends_the_launch(
         environment: dict[str, str], tmp_path: Path) -> None:
-    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
+    output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
                     until='params_file')
-    assert 'params_file:=/no/such.yaml does not exist or is not a file' in said
-    assert 'process started' not in said
+    assert 'params_file:=/no/such.yaml does not exist or is not a file' in output
+    assert 'process started' not in output
 
 
 OUTER = """\
@@ -252,11 +252,11 @@ def test_slam_launch_publishes_tf_by_default(
 def test_launch_arguments_set_tf_and_image_transport(
         environment: dict[str, str], tmp_path: Path, included: str) -> None:
     given = ['publish_tf:=true', 'image_transport:=compressed', 'image:=/eye/image_raw']
-    told = [*given, 'bag:=/no/bag'] if included == 'replay.launch.py' else given
+    with_bag = [*given, 'bag:=/no/bag'] if included == 'replay.launch.py' else given
     outside = with_player(environment, tmp_path, 'exec sleep 60')
-    said = launched(outside, tmp_path / 'out', included, *told, until='queue policy')
-    assert 'images from /eye/image_raw/compressed, camera_info from /eye/camera_info' in said
-    assert parameters_of_launched(outside, tmp_path, included, *told)[1]
+    output = launched(outside, tmp_path / 'out', included, *with_bag, until='queue policy')
+    assert 'images from /eye/image_raw/compressed, camera_info from /eye/camera_info' in output
+    assert parameters_of_launched(outside, tmp_path, included, *with_bag)[1]
 
 
 @pytest.mark.ros
@@ -273,21 +273,21 @@ def test_missing_rviz_ends_the_launch_with_one_line(
     from ament_index_python.packages import get_packages_with_prefixes
     if 'rviz2' in get_packages_with_prefixes():
         pytest.skip('rviz2 is installed')
-    said = launched(environment, tmp_path / 'out', 'vo.launch.py', 'rviz:=true', until='rviz2')
-    assert 'rviz:=true needs rviz2, which is not installed: sudo apt install ros-$ROS_' in said
-    assert 'process started' not in said
+    output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'rviz:=true', until='rviz2')
+    assert 'rviz:=true needs rviz2, which is not installed: sudo apt install ros-$ROS_' in output
+    assert 'process started' not in output
 
 
 @pytest.mark.ros
 def test_two_cameras_have_their_own_nodes_and_topics(
         environment: dict[str, str], tmp_path: Path) -> None:
     pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
-    said = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
+    output = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
                     'base_frame:=base_link',
                     until='queue policy', times=2)
     for side in ('left', 'right'):
         assert f'[{side}.vo_node]: images from /{side}/camera/image_raw, camera_info from ' \
-               f'/{side}/camera/camera_info' in said
+               f'/{side}/camera/camera_info' in output
 
 
 def with_player(environment: dict[str, str], folder: Path, does: str) -> dict[str, str]:
@@ -307,32 +307,32 @@ def test_replay_launch_ends_if_the_player_fails(
         place = tmp_path / str(code)
         place.mkdir()
         begun = monotonic()
-        said = launched(with_player(environment, place, f'exit {code}'), place / 'out',
+        output = launched(with_player(environment, place, f'exit {code}'), place / 'out',
                         'replay.launch.py', 'bag:=/no/bag', until=until)
         assert monotonic() - begun < 20
-        assert ('the bag player failed' in said) is bool(code)
-    assert re.search(r'vo_node-\d\]: process has finished cleanly', said)
+        assert ('the bag player failed' in output) is bool(code)
+    assert re.search(r'vo_node-\d\]: process has finished cleanly', output)
 
 
 @pytest.mark.ros
 def test_replay_launch_plays_a_bag_into_a_node_that_drops_nothing(
         environment: dict[str, str], tmp_path: Path) -> None:
-    said = launched(with_player(environment, tmp_path, 'exec sleep 60'), tmp_path / 'out',
+    output = launched(with_player(environment, tmp_path, 'exec sleep 60'), tmp_path / 'out',
                     'replay.launch.py', 'bag:=/no/bag', 'loop:=true', until='queue policy')
-    assert 'images from /camera/image_rect, camera_info from /camera/camera_info' in said
-    assert 'queue policy every' in said
-    assert re.search(r'bag_player-\d\]: process started', said)
-    assert re.search(r'vo_node-\d\]: process has finished cleanly', said)
+    assert 'images from /camera/image_rect, camera_info from /camera/camera_info' in output
+    assert 'queue policy every' in output
+    assert re.search(r'bag_player-\d\]: process started', output)
+    assert re.search(r'vo_node-\d\]: process has finished cleanly', output)
 
 
 @pytest.mark.ros
 def test_slam_launch_feeds_the_pose_graph_with_the_odometry(
         environment: dict[str, str], tmp_path: Path) -> None:
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    said = launched(environment, tmp_path / 'out', 'slam.launch.py', 'image:=/left/image_raw',
+    output = launched(environment, tmp_path / 'out', 'slam.launch.py', 'image:=/left/image_raw',
                     until='odometry from')
     assert re.search(r'odometry from /vo_node/odometry, images from /left/image_raw, '
-                     'camera_info from /left/camera_info', said)
-    assert 'unknown parameter' not in said
+                     'camera_info from /left/camera_info', output)
+    assert 'unknown parameter' not in output
     for node in ('vo_node-1', 'pose_graph_node-2'):
-        assert f'[{node}]: process has finished cleanly' in said
+        assert f'[{node}]: process has finished cleanly' in output

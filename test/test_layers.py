@@ -85,12 +85,12 @@ def cycle(imports: Imports) -> list[str]:
               for module, names in imports.items()}
     done: set[str] = set()
 
-    def search(module: str, way: list[str]) -> list[str]:
-        if module in way:
-            return [*way[way.index(module):], module]
+    def search(module: str, chain: list[str]) -> list[str]:
+        if module in chain:
+            return [*chain[chain.index(module):], module]
         if module in done:
             return []
-        found = next(filter(None, (search(end, [*way, module]) for end in arrows[module])), [])
+        found = next(filter(None, (search(end, [*chain, module]) for end in arrows[module])), [])
         done.add(module)
         return found
 
@@ -98,7 +98,7 @@ def cycle(imports: Imports) -> list[str]:
 
 
 def planted(module: str, name: str) -> Imports:
-    """Give the imports as they would be with one more."""
+    """Return the imports as they would be with one more."""
     return {**IMPORTS, module: IMPORTS[module] | {name}}
 
 
@@ -192,5 +192,5 @@ def test_whoever_misses_a_library_is_told_what_setup_py_says() -> None:
     bounds = {name_of(line): set(re.findall(r'[<>=][^,; ]+', line.partition(';')[0]))
               for line in declared if 'extra' not in line}
     for requirement in REQUIREMENTS.values():
-        said = set(re.findall(r'[<>=][^,]+', requirement))
-        assert not said or said == bounds[name_of(requirement)]
+        versions = set(re.findall(r'[<>=][^,]+', requirement))
+        assert not versions or versions == bounds[name_of(requirement)]

@@ -51,7 +51,7 @@ cam0:
 
 @pytest.fixture
 def asl(tmp_path: Path) -> Path:
-    """Give an EuRoC folder with an IMU at 100 Hz that turns by 0.1, 0.2 and 0.3 rad/s."""
+    """Return an EuRoC folder with an IMU at 100 Hz that turns by 0.1, 0.2 and 0.3 rad/s."""
     folder = tmp_path / 'MH_02'
     camera, imu = folder / 'mav0' / 'cam0', folder / 'mav0' / 'imu0'
     (camera / 'data').mkdir(parents=True)
@@ -98,13 +98,13 @@ def test_what_the_imu_felt_is_turned_to_the_camera(asl: Path) -> None:
 
 def test_samples_come_before_the_image_up_to_the_first_one_after_it(asl: Path) -> None:
     with open_recording(asl, auxiliary={'imu': None}) as recording:
-        said = list(recording.messages())
-    images = [i for i, one in enumerate(said) if one.topic == recording.image_topic]
+        error_text = list(recording.messages())
+    images = [i for i, one in enumerate(error_text) if one.topic == recording.image_topic]
     for number, place in enumerate(images):
-        felt = [stamp_ns(one.message.header) for one in said[:place]
+        felt = [stamp_ns(one.message.header) for one in error_text[:place]
                 if one.topic == recording.auxiliary['imu']]
         assert felt[-2] < STAMPS[number] <= felt[-1]
-    assert said[0].topic == recording.auxiliary['frames']
+    assert error_text[0].topic == recording.auxiliary['frames']
 
 
 def test_nothing_of_the_imu_comes_unless_it_is_wanted(asl: Path) -> None:
@@ -132,17 +132,17 @@ def test_a_bag_of_a_folder_holds_its_imu_and_how_it_is_mounted(asl: Path) -> Non
         assert len(list(bag.messages({'/tf_static'}))) == 2
 
 
-@pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
+@pytest.mark.parametrize(('file', 'old', 'new', 'error_text'), [
     ('imu0/data.csv', ',0.1,', ',nan,', 'not a finite number'),
     ('imu0/data.csv', ',0.1,0.2', ',0.1', 'has 6 numbers'),
     ('imu0/sensor.yaml', 'T_BS', 'S_BT', 'no ASL sensor description'),
     ('imu0/sensor.yaml', '[0.0, -1.0', '[5.0, -1.0', 'no rigid transformation'),
 ])
-def test_a_wrong_imu_is_named(asl: Path, file: str, old: str, new: str, said: str) -> None:
+def test_a_wrong_imu_is_named(asl: Path, file: str, old: str, new: str, error_text: str) -> None:
     path = asl / 'mav0' / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(DjetError, match=said):
+    with pytest.raises(DjetError, match=error_text):
         euroc(asl)
 
 
@@ -248,7 +248,7 @@ CALIBRATION = {
 
 @pytest.fixture
 def raw(tmp_path: Path) -> Path:
-    """Give a drive that goes east at 10 m/s, level, and turns left by 0.1 rad/s."""
+    """Return a drive that goes east at 10 m/s, level, and turns left by 0.1 rad/s."""
     drive = tmp_path / '2011_09_26' / '2011_09_26_drive_0001_sync'
     (drive / 'image_00' / 'data').mkdir(parents=True)
     (drive / 'oxts' / 'data').mkdir(parents=True)
@@ -293,7 +293,7 @@ def test_unrectified_images_of_a_raw_drive_have_their_distortion(raw: Path) -> N
     assert sequence.distortion.tolist() == [-0.3, 0.1, 0, 0, 0]
 
 
-@pytest.mark.parametrize(('file', 'old', 'new', 'said'), [
+@pytest.mark.parametrize(('file', 'old', 'new', 'error_text'), [
     ('../calib_cam_to_cam.txt', 'S_rect_00: 160', 'S_rect_00: 161', 'these are 160x120'),
     ('../calib_cam_to_cam.txt', 'P_rect_00', 'P_rect_99', "has no line 'P_rect_00:'"),
     ('../calib_cam_to_cam.txt', 'P_rect_00: 50.0', 'P_rect_00: -50.0', 'is no valid camera'),
@@ -305,11 +305,12 @@ def test_unrectified_images_of_a_raw_drive_have_their_distortion(raw: Path) -> N
     ('oxts/data/0000000001.txt', '49.0', '', 'has 29 numbers'),
     ('oxts/data/0000000001.txt', '49.0', '95.0', 'farther than'),
 ])
-def test_a_wrong_raw_drive_is_named(raw: Path, file: str, old: str, new: str, said: str) -> None:
+def test_a_wrong_raw_drive_is_named(
+        raw: Path, file: str, old: str, new: str, error_text: str) -> None:
     path = raw / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(DjetError, match=said) as caught:
+    with pytest.raises(DjetError, match=error_text) as caught:
         open_sequence(raw)
     assert '\n' not in str(caught.value)
 

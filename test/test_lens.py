@@ -44,7 +44,7 @@ CAMERA = Camera(K, np.empty(0), SIZE)
 
 
 def undistorted(pixels: Array, k1: float) -> Array:
-    """Give the points X/Z, Y/Z seen at pixels: r (1 + k1 r^2) is solved by Newton's steps."""
+    """Return the points X/Z, Y/Z seen at pixels: r (1 + k1 r^2) is solved by Newton's steps."""
     seen = (pixels - K[:2, 2]) / K[0, 0]
     radii = np.linalg.norm(seen, axis=1)
     r = radii.copy()
@@ -190,16 +190,16 @@ def examined(sequence: Path, config: Config | None = None) -> lens.LensReport:
     return lens.examine(recording, config or Config(), lambda: None)
 
 
-def row_of(said: str) -> str:
-    return next(line for line in said.splitlines() if line.startswith('D: '))
+def row_of(printed: str) -> str:
+    return next(line for line in printed.splitlines() if line.startswith('D: '))
 
 
 def test_a_correct_calibration_is_kept(
         whip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'lens.yaml').write_text('of an earlier run')
     assert main(['lens', str(whip), '--output', str(tmp_path), '--overwrite']) == 0
-    said = capsys.readouterr().out
-    assert 'not worth correcting' in said and 'D:' not in said
+    printed = capsys.readouterr().out
+    assert 'not worth correcting' in printed and 'D:' not in printed
     assert [path.name for path in tmp_path.iterdir()] == ['lens.png']
 
 
@@ -207,10 +207,10 @@ def test_a_wrong_calibration_is_detected_and_corrected(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'lens'
     assert main(['lens', str(distorted), '--output', str(output)]) == 0
-    said = capsys.readouterr().out
-    flag, k1 = said.splitlines()[-1 - said.count('plot: ')].split()
+    printed = capsys.readouterr().out
+    flag, k1 = printed.splitlines()[-1 - printed.count('plot: ')].split()
     assert float(k1) == pytest.approx(-0.02, abs=1e-3)
-    assert 'recalibrating on the raw images' in said and 'odometry.residual_k1' in said
+    assert 'recalibrating on the raw images' in printed and 'odometry.residual_k1' in printed
     # With that flag next to nothing remains.
     assert main(['lens', str(distorted), flag, k1]) == 0
     again = capsys.readouterr().out
@@ -224,16 +224,16 @@ def test_a_wrong_row_of_a_calib_txt_is_told_by_the_right_one(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = with_row(distorted, tmp_path, 'D: 0.01 0 0 0 0')
     assert main(['lens', str(wrong)]) == 0
-    said = capsys.readouterr().out
-    assert 'row of its calib.txt' in said and '--residual-k1' not in said
-    assert float(row_of(said).split()[1]) == pytest.approx(-0.02, abs=1e-3)
+    printed = capsys.readouterr().out
+    assert 'row of its calib.txt' in printed and '--residual-k1' not in printed
+    assert float(row_of(printed).split()[1]) == pytest.approx(-0.02, abs=1e-3)
     # The parameter is for images without distortion by their calibration.
     assert main(['lens', str(wrong), '--residual-k1', '0.01']) == 2
     assert 'odometry.residual_k1 is 0.01, but' in capsys.readouterr().err
 
 
 def tracked(sequence: Path, k1: float = 0.0) -> Array:
-    """Poses (N, 4, 4) that the odometry tells of a sequence."""
+    """Poses (N, 4, 4) that the odometry estimates in a sequence."""
     recording = SequenceRecording(open_sequence(sequence))
     tracker = Tracker(Config(odometry=OdometryConfig(residual_k1=k1)), message_type,
                       image_topic=recording.image_topic)
@@ -278,22 +278,22 @@ def raw_bag(distorted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_driver_gets_a_file_where_its_images_are_raw(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lens', str(raw_bag), '--output', str(tmp_path / 'out')]) == 0
-    said = capsys.readouterr().out
-    assert '(calibrated: 0.01)' in said
-    assert 'camera_info_manager' in said and 'calib.txt' not in said
+    printed = capsys.readouterr().out
+    assert '(calibrated: 0.01)' in printed
+    assert 'camera_info_manager' in printed and 'calib.txt' not in printed
     written = yaml.safe_load((tmp_path / 'out' / 'lens.yaml').read_text())
     D = written['distortion_coefficients']['data']
     assert D[0] == pytest.approx(-0.02, abs=1e-3)
     assert not any(D[1:])
-    assert row_of(said) == f'D: {D[0]:.4g} 0 0 0 0'
+    assert row_of(printed) == f'D: {D[0]:.4g} 0 0 0 0'
 
 
 def test_of_rectified_images_a_driver_gets_no_file(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # As if rectified with an unknown calibration.
     assert main(['lens', str(raw_bag), '--rectified', 'true', '--output', str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert '--residual-k1 -0.0' in said and 'lens.yaml' not in said
+    printed = capsys.readouterr().out
+    assert '--residual-k1 -0.0' in printed and 'lens.yaml' not in printed
     assert [path.name for path in tmp_path.iterdir()] == ['lens.png']
 
 
@@ -339,9 +339,9 @@ def test_without_rotation_there_is_no_estimate(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     road = render_sequence('road', tmp_path, 5, size=(480, 144))
     assert main(['lens', str(road), '--output', str(tmp_path / 'out')]) == 2
-    said = capsys.readouterr()
-    assert 'forward motion does not determine k1' in said.err and said.err.count('\n') == 1
-    assert not said.out
+    printed = capsys.readouterr()
+    assert 'forward motion does not determine k1' in printed.err and printed.err.count('\n') == 1
+    assert not printed.out
     assert not (tmp_path / 'out').exists()
 
 

@@ -29,7 +29,7 @@ class Graph:
         self.offered: dict[str, Profile] = {}
         self.callbacks: dict[str, Callable[[Any], None]] = {}
         self.kinds: dict[str, str] = {}
-        self.heard: list[str] = []
+        self.taken: list[str] = []
         # Topics of other publishers, whatever the type.
         self.elsewhere: list[str] = []
         self.frames: dict[tuple[str, str], Any] = {}
@@ -56,7 +56,7 @@ class Graph:
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
                ready: Callable[[], bool] | None = None) -> Any:
         self.callbacks[topic], self.kinds[topic] = callback, kind
-        self.heard.append(topic)
+        self.taken.append(topic)
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
                                new_incompatible=lambda: int(topic in self.offered))
 
@@ -150,7 +150,7 @@ def test_inputs_enabled_at_run_time_are_subscribed_once(node):
     one.change(**{'odometry.scale': 'speed', 'odometry.mask': True, 'odometry.guess': True})
     one.change(**{'odometry.guess_frame': 'wheels'})
     one.change(**{'odometry.max_gap': 2.0})
-    assert sorted(one.graph.heard) == ['/camera_info', '/guess', '/image', '/imu', '/mask',
+    assert sorted(one.graph.taken) == ['/camera_info', '/guess', '/image', '/imu', '/mask',
                                        '/speed', '/speed_odometry', '/tf', '/tf_static']
 
 

@@ -78,7 +78,7 @@ class Odometry:
 
 # Steps
 
-def told(steps, *messages):
+def by_odometry(steps, *messages):
     """Return the steps that messages complete."""
     return [step for message in messages for step in take(steps, message)]
 
@@ -97,8 +97,8 @@ def take(taker, message):
 def test_step_is_the_motion_of_the_camera_in_optical_axes(convention):
     odometry, steps, motion = Odometry(convention), StepMessages(convention), pose(z=1.0, yaw=0.1)
     covariance = np.diag(np.arange(1.0, 7)**2) * 1e-6
-    first, = told(steps, *odometry.start())
-    second, = told(steps, *odometry.move(motion, covariance))
+    first, = by_odometry(steps, *odometry.start())
+    second, = by_odometry(steps, *odometry.move(motion, covariance))
     assert (first.tracked, second.tracked) == (False, True)
     assert second.previous_stamp_ns == first.stamp_ns
     assert second.scale_known
@@ -112,8 +112,8 @@ def test_step_of_a_base_frame_is_the_motion_of_the_camera(convention):
     motion, covariance = pose(z=1.0, yaw=0.1), np.diag(np.arange(1.0, 7)**2) * 1e-6
     odometry = Odometry(convention, 'base_link', MOUNTING)
     steps = StepMessages(convention, 'base_link', MOUNTING)
-    told(steps, *odometry.start())
-    step, = told(steps, *odometry.move(motion, covariance))
+    by_odometry(steps, *odometry.start())
+    step, = by_odometry(steps, *odometry.move(motion, covariance))
     assert np.allclose(step.motion, motion)
     assert np.allclose(step.pose, motion)
     assert np.allclose(step.covariance, covariance, atol=2e-9)
@@ -121,19 +121,19 @@ def test_step_of_a_base_frame_is_the_motion_of_the_camera(convention):
 
 def test_odometry_of_another_frame_is_refused_with_the_remedy():
     odometry, steps = Odometry('body', 'base_link', MOUNTING), StepMessages('body')
-    told(steps, *odometry.start())
+    by_odometry(steps, *odometry.start())
     with pytest.raises(DjetError, match="odometry is 'base_link', not 'camera_body'; give both "
                        'nodes the same odometry.base_frame'):
-        told(steps, *odometry.move(pose(z=1.0)))
+        by_odometry(steps, *odometry.move(pose(z=1.0)))
 
 
 def test_messages_of_a_frame_may_arrive_in_any_order():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, *odometry.start())
+    by_odometry(steps, *odometry.start())
     for order in permutations(range(3)):
         frame = odometry.move(pose(z=1.0))
-        assert not told(steps, frame[order[0]], frame[order[1]])
-        step, = told(steps, frame[order[2]])
+        assert not by_odometry(steps, frame[order[0]], frame[order[1]])
+        step, = by_odometry(steps, frame[order[2]])
         assert step.tracked
     assert steps.missing == 0
 
@@ -142,45 +142,45 @@ def test_late_start_begins_at_the_current_pose_of_the_odometry():
     odometry, steps = Odometry(), StepMessages('optical')
     odometry.start()
     odometry.move(pose(z=3.0))
-    first, = told(steps, *odometry.move(pose(z=1.0)))
+    first, = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert first.pose[2, 3] == 4.0
 
 
 def test_motions_of_a_stationary_camera_start_at_its_first_frame():
     odometry, steps = Odometry(), StepMessages('optical')
-    _, reference = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    _, reference = by_odometry(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     for _ in range(3):
-        stationary, = told(steps, *odometry.move(np.eye(4), standing=True))
+        stationary, = by_odometry(steps, *odometry.move(np.eye(4), standing=True))
         assert stationary.previous_stamp_ns == reference.stamp_ns
-    step, = told(steps, *odometry.move(pose(x=0.5)))
+    step, = by_odometry(steps, *odometry.move(pose(x=0.5)))
     assert step.previous_stamp_ns == reference.stamp_ns
     assert np.allclose(step.covariance, np.diag(SIGMAS**2), atol=2e-9)
-    after, = told(steps, *odometry.move(pose(x=0.5)))
+    after, = by_odometry(steps, *odometry.move(pose(x=0.5)))
     assert after.previous_stamp_ns == step.stamp_ns
 
 
 def test_motion_over_a_gap_is_unknown():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    by_odometry(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     odometry.lose_track()
-    step, = told(steps, *odometry.start())
+    step, = by_odometry(steps, *odometry.start())
     assert (step.tracked, step.status) == (False, Status.FIRST_FRAME)
     assert np.array_equal(step.covariance, UNKNOWN_MOTION)
-    after, = told(steps, *odometry.move(pose(z=1.0)))
+    after, = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert after.previous_stamp_ns == step.stamp_ns
 
 
 def test_motion_after_lost_tracking_starts_at_a_frame_without_a_motion():
     """That frame comes with it, as from results, or one more motion would be lost."""
     odometry, steps = Odometry(), StepMessages('optical')
-    known = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    known = by_odometry(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
     for _ in range(3):
-        assert not told(steps, *odometry.lose_track())
-    lost, step = told(steps, *odometry.move(pose(z=1.0)))
+        assert not by_odometry(steps, *odometry.lose_track())
+    lost, step = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert (lost.tracked, lost.status) == (False, Status.TOO_FEW_MATCHES)
     assert step.previous_stamp_ns == lost.stamp_ns == step.stamp_ns - PERIOD
     assert step.previous_stamp_ns not in {one.stamp_ns for one in known}
-    after, = told(steps, *odometry.move(pose(z=1.0)))
+    after, = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert after.previous_stamp_ns == step.stamp_ns
     assert steps.missing == 0
 
@@ -188,25 +188,25 @@ def test_motion_after_lost_tracking_starts_at_a_frame_without_a_motion():
 @pytest.mark.parametrize('convention', ['optical', 'body'])
 def test_step_has_the_rotation_covariance_of_its_pose(convention):
     odometry, steps = Odometry(convention), StepMessages(convention)
-    told(steps, *odometry.start())
-    step, = told(steps, *odometry.move(pose(z=1.0), np.diag(np.arange(1.0, 7)**2) * 1e-6))
+    by_odometry(steps, *odometry.start())
+    step, = by_odometry(steps, *odometry.move(pose(z=1.0), np.diag(np.arange(1.0, 7)**2) * 1e-6))
     assert np.allclose(step.rotation_covariance, odometry.covariance[3:, 3:], atol=2e-9)
 
 
 def test_bridged_failed_frame_is_not_a_step():
     odometry, steps = Odometry(), StepMessages('optical')
-    *_, before = told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
-    told(steps, *odometry.lose_track(bridged=True))
-    step, = told(steps, *odometry.move(pose(z=1.0)))
+    *_, before = by_odometry(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    by_odometry(steps, *odometry.lose_track(bridged=True))
+    step, = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert step.previous_stamp_ns == before.stamp_ns
 
 
 @pytest.mark.parametrize('lost', [0, 1, 2])
 def test_lost_message_leaves_a_counted_gap(lost):
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
-    assert not told(steps, *np.delete(np.array(odometry.move(pose(z=2.0)), object), lost))
-    step, = told(steps, *odometry.move(pose(z=1.0)))
+    by_odometry(steps, *odometry.start(), *odometry.move(pose(z=1.0)))
+    assert not by_odometry(steps, *np.delete(np.array(odometry.move(pose(z=2.0)), object), lost))
+    step, = by_odometry(steps, *odometry.move(pose(z=1.0)))
     assert step.previous_stamp_ns == step.stamp_ns - PERIOD
     assert np.allclose(step.pose, pose(z=4.0))
     assert steps.missing == (lost != 2)
@@ -214,9 +214,9 @@ def test_lost_message_leaves_a_counted_gap(lost):
 
 def test_status_gives_the_kind_of_scale():
     odometry, steps = Odometry(), StepMessages('optical')
-    told(steps, *odometry.start())
+    by_odometry(steps, *odometry.start())
     for known in (True, False, True):
-        step, = told(steps, *odometry.move(pose(z=1.0), known=known))
+        step, = by_odometry(steps, *odometry.move(pose(z=1.0), known=known))
         assert step.scale_known == known
 
 
@@ -259,7 +259,7 @@ class Drive:
                                  MOUNTING if base_frame else None)
         self._cards, self._drift, self._frame = Cards(), pose(x=drift), 0
         self._true = np.eye(4)
-        self.true, self.told, self.corrections, self.path = {}, {}, {}, None
+        self.true, self.by_odometry, self.corrections, self.path = {}, {}, {}, None
 
     def start(self, place=REST):
         """Start or restart at a place."""
@@ -286,7 +286,7 @@ class Drive:
         for message in messages():
             outgoing += take(self.slam, message)
             if hasattr(message, 'twist'):
-                self.told[stamp] = pose_of(message)[1]
+                self.by_odometry[stamp] = pose_of(message)[1]
         self.true[stamp] = self._true
         while not self.slam.idle:
             outgoing += self.slam.work()
@@ -299,23 +299,23 @@ class Drive:
         return outgoing
 
     @property
-    def said(self):
+    def reported(self):
         """Values of its diagnostics, as they are now."""
         message = self.slam.diagnostics(0).message
         return {pair.key: pair.value for pair in message.status[0].values}
 
     def to_and_fro(self, steps=8):
         """Go 2 m to the right on a curve, and back."""
-        ways = [0.25 * i for i in (*range(steps + 1), *range(steps - 1, -1, -1))]
+        positions = [0.25 * i for i in (*range(steps + 1), *range(steps - 1, -1, -1))]
         self.start()
-        for way in ways[1:]:
-            self.go(pose(x=way, z=0.3 * way**2))
+        for metres in positions[1:]:
+            self.go(pose(x=metres, z=0.3 * metres**2))
 
     def errors(self):
         """Distances from the truth of the path's poses, by odometry and as optimised."""
         pairs = [pose_of(one) for one in self.path.poses]
         return [np.array([np.linalg.norm((poses[stamp] - self.true[stamp])[:3, 3])
-                          for stamp, _ in pairs]) for poses in (self.told, dict(pairs))]
+                          for stamp, _ in pairs]) for poses in (self.by_odometry, dict(pairs))]
 
 
 def test_live_keyframes_have_the_residual_distortion_corrected(live):
@@ -371,8 +371,8 @@ def test_loop_closure_removes_drift(driven):
     assert before.max() > 0.12
     assert after.max() < before.max() / 2
     assert after.mean() < before.mean() / 2
-    assert int(driven.said['loops']) >= 3
-    assert driven.said['state'] == 'mapping'
+    assert int(driven.reported['loops']) >= 3
+    assert driven.reported['state'] == 'mapping'
 
 
 def test_map_to_odom_and_odom_to_camera_compose_to_the_optimised_pose(driven):
@@ -381,11 +381,13 @@ def test_map_to_odom_and_odom_to_camera_compose_to_the_optimised_pose(driven):
     newest = max(optimised)
     correction = driven.slam.map.correction
     assert np.abs(correction - np.eye(4)).max() > 0.05
-    assert np.allclose(correction @ driven.told[newest], optimised[newest], rtol=0, atol=1e-9)
+    assert np.allclose(correction @ driven.by_odometry[newest], optimised[newest], rtol=0,
+                       atol=1e-9)
     # at all times: each was valid until the next optimisation
-    assert driven.corrections.keys() == driven.told.keys()
+    assert driven.corrections.keys() == driven.by_odometry.keys()
     changes = np.diff([driven.corrections[stamp] for stamp in sorted(driven.corrections)], axis=0)
-    assert 0 < np.count_nonzero(np.abs(changes).max((1, 2))) <= int(driven.said['optimisations'])
+    assert 0 < np.count_nonzero(np.abs(changes).max((1, 2))) <= int(
+        driven.reported['optimisations'])
 
 
 def test_the_messages_name_their_frames_and_carry_the_stamps_of_the_images(live):
@@ -409,7 +411,8 @@ def test_map_with_body_axes_is_the_same_in_other_axes(live, driven):
         assert np.allclose(pose_of(ours)[1], axes @ pose_of(theirs)[1] @ axes.T, atol=1e-6)
     stamp, newest = pose_of(drive.path.poses[-1])
     drive.go(pose(x=0.01))
-    assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
+    correction = drive.corrections[max(drive.corrections)]
+    assert np.allclose(correction @ drive.by_odometry[stamp], newest)
 
 
 def test_map_is_of_the_base_frame_once_tf_has_the_mounting(live, driven):
@@ -429,7 +432,8 @@ def test_map_is_of_the_base_frame_once_tf_has_the_mounting(live, driven):
         assert np.allclose(pose_of(one)[1], turned, atol=1e-4)
     stamp, newest = pose_of(drive.path.poses[-1])
     drive.go(pose(x=0.01))
-    assert np.allclose(drive.corrections[max(drive.corrections)] @ drive.told[stamp], newest)
+    correction = drive.corrections[max(drive.corrections)]
+    assert np.allclose(correction @ drive.by_odometry[stamp], newest)
 
 
 def test_odometry_reset_continues_at_the_last_pose_until_a_loop_corrects_it(live):
@@ -444,8 +448,8 @@ def test_odometry_reset_continues_at_the_last_pose_until_a_loop_corrects_it(live
     assert np.allclose(newest, pose(x=3.0), atol=0.02)
     for i in range(5):
         drive.go(pose(x=1.6 - 0.4 * i))
-    assert drive.said['unknown motions'] == '1'
-    assert int(drive.said['loops']) >= 2
+    assert drive.reported['unknown motions'] == '1'
+    assert int(drive.reported['loops']) >= 2
     # in the map's first frame, by loops alone
     _, after = drive.errors()
     assert after.max() < 0.1
@@ -459,7 +463,7 @@ def test_step_back_in_time_starts_a_new_map(live):
     drive.odometry.reset()
     drive.start()
     assert [pose_of(one)[0] for one in drive.path.poses] == [START - 10**9]
-    assert drive.said['keyframes'] == '1'
+    assert drive.reported['keyframes'] == '1'
     assert np.array_equal(drive.corrections[START - 10**9], np.eye(4))
 
 
@@ -477,7 +481,7 @@ def test_map_memory_is_bounded(live):
     graph = drive.slam.map
     assert len(graph.keyframes) == 7
     assert graph.first >= 4
-    assert drive.said['keyframes forgotten'] == str(graph.first)
+    assert drive.reported['keyframes forgotten'] == str(graph.first)
     assert in_memory(Frame) - frames == 7
     assert in_memory(image_type) - messages <= 3
     ends = {end for edge in graph.edges for end in (edge.source, edge.target)}
@@ -494,15 +498,15 @@ def test_edges_of_a_removed_keyframe_are_transferred_to_its_successor(live, sour
     rng = np.random.default_rng(3)
     poses = np.array([pose(), pose(x=0.3, z=2.0, yaw=0.4), pose(x=-1.0, z=3.0, yaw=-0.7)])
     spread = rng.normal(size=(6, 6)) * 0.1
-    told = Edge(source, target, np.linalg.inv(poses[source]) @ poses[target],
+    by_odometry = Edge(source, target, np.linalg.inv(poses[source]) @ poses[target],
                 spread @ spread.T + np.eye(6) * 1e-3, 'loop')
-    ours = transferred(told, 0, np.linalg.inv(poses[0]) @ poses[1])
+    ours = transferred(by_odometry, 0, np.linalg.inv(poses[0]) @ poses[1])
     assert {ours.source, ours.target} == {1, 2}
     for _ in range(5):
         moved = poses.copy()
         moved[2] = moved[2] @ pose(*rng.normal(size=4) * 1e-3)
         costs = [factor_graph(PoseGraph(np.arange(3), poses, (edge,))).error(
-            initial_values(moved)) for edge in (told, ours)]
+            initial_values(moved)) for edge in (by_odometry, ours)]
         assert costs[0] > 0
         assert costs[1] == pytest.approx(costs[0], rel=0.01)
 
@@ -519,13 +523,13 @@ def test_map_of_unknown_scale_keeps_the_units_of_the_odometry(live):
 
     drive.odometry.move = move_somehow_far
     drive.to_and_fro()
-    assert int(drive.said['loops']) >= 3
+    assert int(drive.reported['loops']) >= 3
     assert not any(edge.scale_known for edge in drive.slam.map.edges)
     poses = dict(pose_of(one) for one in drive.path.poses)
     stamps = sorted(poses)
     for before, after in pairwise(stamps):
         ours = poses[after][:3, 3] - poses[before][:3, 3]
-        theirs = drive.told[after][:3, 3] - drive.told[before][:3, 3]
+        theirs = drive.by_odometry[after][:3, 3] - drive.by_odometry[before][:3, 3]
         assert unit(ours) @ unit(theirs) > 0.9
         assert 0.3 < np.linalg.norm(ours) / np.linalg.norm(theirs) < 3
 
@@ -552,15 +556,15 @@ def test_covariance_does_not_grow_while_stationary(live):
     assert np.allclose(edge.covariance, np.diag(SIGMAS**2), atol=2e-9)
 
 
-@pytest.mark.parametrize(('told', 'believed', 'kept'), [
+@pytest.mark.parametrize(('by_odometry', 'believed', 'kept'), [
     (0.05, 0.05, 0.02), (0.01, 0.01, 0.01), (0.05, 0.5, 0.02), (0.1, 0.05, 0.0889)])
-def test_common_length_error_does_not_distort_a_loop(live, told, believed, kept):
+def test_common_length_error_does_not_distort_a_loop(live, by_odometry, believed, kept):
     """Shares of the length: as the odometry says, as the parameter has it, and in the map."""
     config = from_flat({'estimator.max_features': 800, 'odometry.scale_uncertainty': believed})
     drive = Drive(live, config, drift=0.0)
     drive.start()
     covariance = np.diag(SIGMAS**2)
-    covariance[0, 0] = (2.0 * told)**2
+    covariance[0, 0] = (2.0 * by_odometry)**2
     drive.odometry.move, move = lambda motion: move(motion, covariance), drive.odometry.move
     drive.go(pose(x=2.0))
     edge, = drive.slam.map.edges
@@ -571,11 +575,11 @@ def test_keyframe_needs_its_image(live):
     drive = Drive(live)
     drive.start()
     drive.go(pose(x=0.6), seen=False)
-    assert drive.said['keyframes'] == '1'
+    assert drive.reported['keyframes'] == '1'
     drive.go(pose(x=0.7))
-    assert (drive.said['keyframes'], drive.said['keyframes without image']) == ('2', '1')
+    assert (drive.reported['keyframes'], drive.reported['keyframes without image']) == ('2', '1')
     edge, = drive.slam.map.edges
-    assert np.allclose(edge.motion, np.linalg.inv(drive.told[START]) @ drive.odometry.here)
+    assert np.allclose(edge.motion, np.linalg.inv(drive.by_odometry[START]) @ drive.odometry.here)
 
 
 def test_diagnostics_once_a_second_and_at_state_changes(live):

@@ -73,7 +73,7 @@ def test_live_loop_closure_reduces_the_trajectory_error(block):
     hear = {'relative_pose_cov': slam.relative_pose, 'odometry': slam.odometry,
             'relative_pose_status': slam.relative_pose_status}
     before, pairs, made, images = {}, {}, {}, 0
-    told = {'odometry': before, 'relative_pose_cov': pairs}
+    expected = {'odometry': before, 'relative_pose_cov': pairs}
     for topic, _, message in source.messages({source.image_topic, source.info_topic}):
         if topic == source.info_topic:
             tracker.camera_info(message)
@@ -87,8 +87,8 @@ def test_live_loop_closure_reduces_the_trajectory_error(block):
         for name, said in tracker.image(message):
             if name in hear:
                 hear[name](said)
-            if name in told:
-                told[name].update([pose_of(said)])
+            if name in expected:
+                expected[name].update([pose_of(said)])
         while not slam.idle:
             made.update(slam.work())
     # nothing comes where the last keyframe's loops were optimised just now

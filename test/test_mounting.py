@@ -45,7 +45,7 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
     T, pose, velocity = random_pose(rng), random_pose(rng, 5.0), rng.normal(size=6)
     root = rng.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
-    here, told = pose_of_base(pose, covariance, T)
+    here, frames_of = pose_of_base(pose, covariance, T)
     moving, told_of_twist = twist_of_base(velocity, covariance, T)
     off, off_of_twist = [], []
     for error in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
@@ -56,11 +56,12 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
         off.append([*(there - here)[:3, 3], *Rotation.from_matrix(
             there[:3, :3] @ here[:3, :3].T).as_rotvec()])
         off_of_twist.append(twist_of_base(velocity + error, covariance, T)[0] - moving)
-    for samples, said in ((off, told), (off_of_twist, told_of_twist)):
-        assert np.allclose(np.cov(np.transpose(samples)), said, atol=0.05 * np.diag(said).max())
+    for samples, expected in ((off, frames_of), (off_of_twist, told_of_twist)):
+        assert np.allclose(np.cov(np.transpose(samples)), expected,
+                           atol=0.05 * np.diag(expected).max())
 
 
-def told(*frames):
+def frames_of(*frames):
     """Return the transforms of (parent, child, pose)."""
     known = StaticFrames()
     for parent, child, pose in frames:
@@ -71,19 +72,19 @@ def told(*frames):
 def test_a_frame_is_found_along_the_tree_upwards_and_downwards():
     rng = np.random.default_rng(5)
     mast, head, wheel = (random_pose(rng) for _ in range(3))
-    frames = told(('base', 'mast', mast), ('/mast', '/head', head), ('base', 'wheel', wheel))
+    frames = frames_of(('base', 'mast', mast), ('/mast', '/head', head), ('base', 'wheel', wheel))
     assert np.allclose(frames.transform('base', 'head'), mast @ head)
     assert np.allclose(frames.transform('wheel', 'head'), np.linalg.inv(wheel) @ mast @ head)
     assert np.allclose(frames.transform('/head', 'base'), np.linalg.inv(mast @ head))
     assert frames.transform('base', 'antenna') is None
     # a single transform is exactly that of its message
-    assert np.array_equal(told(('base', 'cam', AHEAD)).transform('base', 'cam'), AHEAD)
+    assert np.array_equal(frames_of(('base', 'cam', AHEAD)).transform('base', 'cam'), AHEAD)
 
 
 def test_the_last_transform_counts_and_invalid_ones_are_ignored():
     nonsense = MAKE.frame(0, 'base', 'cam', np.eye(4))
     nonsense.transforms[0].transform.rotation.w = 0.0
-    frames = told(('base', 'cam', np.eye(4)), ('base', 'cam', AHEAD), ('a', 'b', np.eye(4)),
+    frames = frames_of(('base', 'cam', np.eye(4)), ('base', 'cam', AHEAD), ('a', 'b', np.eye(4)),
                   ('b', 'a', np.eye(4)))
     frames.add(nonsense)
     assert np.array_equal(frames.transform('base', 'cam'), AHEAD)

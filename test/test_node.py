@@ -85,11 +85,11 @@ def publisher() -> Iterator[Peer]:
 def node(tmp_path: Path, subscriber: Peer) -> Iterator[Callable[..., NodeProcess]]:
     """Return a function that starts the node; it has ended, with a clean log, after the test."""
     with nodes(tmp_path, IMAGE) as begin:
-        def start(*words: str, **parameters: Any) -> NodeProcess:
-            one = begin(*words, **parameters)
+        def start(*arguments: str, **parameters: Any) -> NodeProcess:
+            one = begin(*arguments, **parameters)
             for topic in TYPES:
                 subscriber.ask('published', topic=topic)
-            subscriber.heard.clear()
+            subscriber.received.clear()
             return one
 
         yield start
@@ -118,13 +118,13 @@ def play(publisher: Peer, images: list[Any], first: int = 0, pause: float = 0.0)
 
 
 def paired(index: int) -> Callable[[dict[str, list[Any]]], bool]:
-    """Make the condition that an image came out with a pair."""
-    return lambda heard: any(stamp_ns(m.header) == stamp(index) for m in heard[RELATIVE])
+    """Return the condition that a pair of an image was published."""
+    return lambda received: any(stamp_ns(m.header) == stamp(index) for m in received[RELATIVE])
 
 
-def said(text: str) -> Callable[[dict[str, list[Any]]], Any]:
-    """Make the condition that diagnostics say something; its value is what they have."""
-    return lambda heard: next((values(m) for m in reversed(heard['/diagnostics'])
+def reported(text: str) -> Callable[[dict[str, list[Any]]], Any]:
+    """Return the condition that diagnostics contain a text; its value is their values."""
+    return lambda received: next((values(m) for m in reversed(received['/diagnostics'])
                                if m.status[0].message == text), None)
 
 
@@ -133,7 +133,7 @@ def values(diagnostics: Any) -> dict[str, str]:
 
 
 def wait_for_log(node: NodeProcess, text: str, seconds: float = 2 * PATIENCE) -> str:
-    """Wait for a line in the node's log, and give it."""
+    """Wait for a line in the node's log, and return it."""
     end = monotonic() + seconds
     while monotonic() < end:
         for line in node.log.splitlines():
@@ -194,19 +194,20 @@ def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         publisher.advertise(source.image_topic, IMAGE_TYPE)
         # Until the node knows all publishers, as they know the node.
         publisher.send(source.info_topic, camera_info(K, SIZE))
-        subscriber.wait('readiness', said('waiting for an image'))
+        subscriber.wait('readiness', reported('waiting for an image'))
         sleep(0.5)
         for message in source.messages():
             if message.topic != '/tf_static':
                 publisher.send(message.topic, message.message)
     subscriber.wait('the last pair', paired(len(drive) - 1))
-    subscriber.wait('all odometry', lambda heard: len(heard[f'{NODE}/odometry']) == len(drive))
+    subscriber.wait('all odometry',
+                    lambda received: len(received[f'{NODE}/odometry']) == len(drive))
     assert len(expected[RELATIVE]) == len(drive) - 1
-    last = subscriber.wait('the last word', lambda heard: (
-        found := said('waiting for an image')(heard))['frames processed'] == '12' and found)
+    last = subscriber.wait('the last word', lambda received: (
+        found := reported('waiting for an image')(received))['frames processed'] == '12' and found)
     assert last.get('gyro samples', '0') == str(len(sequence.imu.rates) if imu else 0)
     for topic in poses:
-        assert [serialised(m) for m in subscriber.heard[topic]] == expected[topic]
+        assert [serialised(m) for m in subscriber.received[topic]] == expected[topic]
 
 
 # The camera
@@ -247,7 +248,7 @@ def test_latched_camera_info_from_before_the_start_is_received(
     publisher.send(INFO, camera_info(K, SIZE))
     node(**EVERY)
     publisher.advertise(IMAGE, IMAGE_TYPE)
-    subscriber.wait('readiness', said('waiting for an image'))
+    subscriber.wait('readiness', reported('waiting for an image'))
     play(publisher, drive[:3])
     subscriber.wait('a pair', paired(2))
 
@@ -258,14 +259,14 @@ def test_late_and_periodic_camera_info(node, publisher, subscriber, drive):
     publisher.advertise(IMAGE, IMAGE_TYPE)
     play(publisher, drive[:3])
     # Topics are not in order with one another: all three images have to be there first.
-    waiting = said('waiting for camera_info')
-    subscriber.wait('a complaint about each', lambda heard: (waiting(heard) or {}).get(
+    waiting = reported('waiting for camera_info')
+    subscriber.wait('a complaint about each', lambda received: (waiting(received) or {}).get(
         'frames dropped: waiting_for_camera_info') == '3')
     for i in range(3, 8):
         publisher.send(INFO, camera_info(K, SIZE, stamp_ns=stamp(i)))
         play(publisher, drive[i:i + 1], first=i, pause=0.1)
     subscriber.wait('a pair', paired(7))
-    last = subscriber.wait('tracking', said('tracking'))
+    last = subscriber.wait('tracking', reported('tracking'))
     assert last['frames dropped: waiting_for_camera_info'] == '3'
     assert 'status: SIZE_CHANGED' not in last
 
@@ -277,16 +278,16 @@ def test_camera_driver_may_be_restarted(
         camera(victim)
         play(victim, drive[4 * i:4 * i + 4], first=4 * i)
         subscriber.wait('a pair', paired(4 * i + 3))
-        subscriber.heard.clear()
+        subscriber.received.clear()
         victim.kill()
-        subscriber.wait('silence', said('waiting for an image'))
+        subscriber.wait('silence', reported('waiting for an image'))
         wait_for_log(one, f'waiting for image on {IMAGE}: it has no publisher')
-        subscriber.heard.clear()
+        subscriber.received.clear()
     again = Peer('camera_driver')
     camera(again)
     play(again, drive[8:10], first=8)
     subscriber.wait('a pair', paired(9))
-    last = subscriber.wait('all images', lambda heard: (found := said('tracking')(heard))
+    last = subscriber.wait('all images', lambda received: (found := reported('tracking')(received))
                            and found['frames processed'] == '10' and found)
     again.close()
     # The gaps were no longer than max_gap in the images' own time.
@@ -298,7 +299,7 @@ def test_compressed_images_are_tracked(node, publisher, subscriber, drive):
     publisher.advertise(f'{IMAGE}/compressed', 'sensor_msgs/msg/CompressedImage')
     publisher.advertise(INFO, INFO_TYPE)
     publisher.send(INFO, camera_info(K, SIZE))
-    subscriber.wait('readiness', said('waiting for an image'))
+    subscriber.wait('readiness', reported('waiting for an image'))
     for i, gray in enumerate(drive[:3]):
         jpeg = cv2.imencode('.jpg', gray)[1].tobytes()
         publisher.send(f'{IMAGE}/compressed', compressed(jpeg, 'jpeg', stamp(i)))
@@ -346,7 +347,7 @@ def test_bad_image_is_logged_once_and_tracking_continues(
     one = node(**EVERY)
     camera(publisher)
     for round_, (reason, make) in enumerate(BAD_IMAGES.items()):
-        subscriber.heard.clear()
+        subscriber.received.clear()
         # The camera restarts each time.
         assert publisher.call('reset')['success'], round_
         play(publisher, drive[:3])
@@ -354,11 +355,11 @@ def test_bad_image_is_logged_once_and_tracking_continues(
             publisher.send(IMAGE, make(drive[3]))
         play(publisher, drive[4:6], first=4)
         subscriber.wait(f'a pair after {reason}', paired(5))
-        assert paired(4)(subscriber.heard)
-        bad, = (m for m in subscriber.heard['/diagnostics']
+        assert paired(4)(subscriber.received)
+        bad, = (m for m in subscriber.received['/diagnostics']
                 if m.status[0].message == f'message rejected: {reason}')
         assert bad.status[0].level == 2
-        subscriber.wait('tracking', said('tracking'))
+        subscriber.wait('tracking', reported('tracking'))
         assert one.log.count(f'message rejected: {reason}: ') == 1
 
 
@@ -368,7 +369,7 @@ def test_black_images_lead_to_lost_and_good_ones_recover(
     camera(publisher)
     play(publisher, drive[:2])
     play(publisher, [np.zeros_like(drive[0])] * 4, first=2)
-    subscriber.wait('lost', said('lost: TOO_FEW_MATCHES'))
+    subscriber.wait('lost', reported('lost: TOO_FEW_MATCHES'))
     play(publisher, drive[2:4], first=6)
     subscriber.wait('a pair', paired(7))
 
@@ -388,7 +389,7 @@ def test_bad_camera_info_is_reported_until_a_good_one_arrives(
         publisher.send(INFO, info)
         sleep(0.1)
         play(publisher, drive[i:i + 1], first=i)
-        subscriber.wait(reason, said(f'message rejected: {reason}'))
+        subscriber.wait(reason, reported(f'message rejected: {reason}'))
         wait_for_log(one, f'message rejected: {reason}: ')
     publisher.send(INFO, camera_info(K, SIZE))
     sleep(0.1)
@@ -397,7 +398,7 @@ def test_bad_camera_info_is_reported_until_a_good_one_arrives(
     publisher.send(INFO, camera_info(K, SIZE, roi=roi(0, 0, 160, 120)))
     sleep(0.1)
     play(publisher, drive[5:6], first=5)
-    subscriber.wait('a complaint', said('message rejected: size_mismatch'))
+    subscriber.wait('a complaint', reported('message rejected: size_mismatch'))
 
 
 # Time
@@ -407,10 +408,10 @@ def test_looping_bag_resets_the_odometry(node, publisher, subscriber, drive):
     camera(publisher)
     play(publisher, drive[:8])
     play(publisher, drive[:8])
-    subscriber.wait('two rounds', lambda heard: len(heard[f'{NODE}/odometry']) == 16)
-    odometry = [serialised(m) for m in subscriber.heard[f'{NODE}/odometry']]
+    subscriber.wait('two rounds', lambda received: len(received[f'{NODE}/odometry']) == 16)
+    odometry = [serialised(m) for m in subscriber.received[f'{NODE}/odometry']]
     assert odometry[:8] == odometry[8:]
-    assert said('restarted: TIME_JUMP')(subscriber.heard)
+    assert reported('restarted: TIME_JUMP')(subscriber.received)
 
 
 def test_late_image_does_not_reset_the_odometry(node, publisher, subscriber, drive):
@@ -420,8 +421,8 @@ def test_late_image_does_not_reset_the_odometry(node, publisher, subscriber, dri
     publisher.send(IMAGE, image(drive[3], stamp_ns=stamp(5) - PERIOD // 2))
     play(publisher, drive[6:8], first=6)
     subscriber.wait('a pair', paired(7))
-    last = subscriber.wait('tracking', lambda heard: (said('tracking')(heard) or {}).get(
-        'frames received') == '9' and said('tracking')(heard))
+    last = subscriber.wait('tracking', lambda received: (reported('tracking')(received) or {}).get(
+        'frames received') == '9' and reported('tracking')(received))
     assert last['frames dropped: late'] == '1'
     assert 'restarted' not in one.log
 
@@ -431,7 +432,7 @@ def test_camera_with_zero_stamps_is_reported(node, publisher, subscriber, drive)
     camera(publisher)
     for gray in drive:
         publisher.send(IMAGE, image(gray, stamp_ns=0))
-    last = subscriber.wait('the complaint', said('started; stamps stand still'))
+    last = subscriber.wait('the complaint', reported('started; stamps stand still'))
     assert 'the camera driver has to stamp' in last['to mend: stamps stand still']
     wait_for_log(one, 'stamps stand still: ')
 
@@ -446,14 +447,14 @@ def test_messages_have_image_stamps_and_diagnostics_simulated_time(
         # The first may be sent before the node knows the sender.
         publisher.send('/clock', message_type('rosgraph_msgs/msg/Clock')(clock=time))
         sleep(0.1)
-        if any(m.header.stamp.sec == 777 for m in list(subscriber.heard['/diagnostics'])):
+        if any(m.header.stamp.sec == 777 for m in list(subscriber.received['/diagnostics'])):
             break
-    subscriber.heard.clear()
+    subscriber.received.clear()
     play(publisher, drive[:3])
     subscriber.wait('a pair', paired(2))
-    subscriber.wait('diagnostics', said('tracking'))
-    assert {m.header.stamp.sec for m in subscriber.heard['/diagnostics']} == {777}
-    assert [stamp_ns(m.header) for m in subscriber.heard[RELATIVE]] == [stamp(1), stamp(2)]
+    subscriber.wait('diagnostics', reported('tracking'))
+    assert {m.header.stamp.sec for m in subscriber.received['/diagnostics']} == {777}
+    assert [stamp_ns(m.header) for m in subscriber.received[RELATIVE]] == [stamp(1), stamp(2)]
 
 
 # Services
@@ -470,9 +471,9 @@ def test_pause_and_resume(node, publisher, subscriber, drive):
     assert publisher.call('resume')['success']
     play(publisher, drive[6:8], first=6)
     subscriber.wait('a pair', paired(7))
-    last = subscriber.wait('tracking', said('tracking'))
-    assert not any(paired(i)(subscriber.heard) for i in (3, 4, 5))
-    assert said('paused')(subscriber.heard)
+    last = subscriber.wait('tracking', reported('tracking'))
+    assert not any(paired(i)(subscriber.received) for i in (3, 4, 5))
+    assert reported('paused')(subscriber.received)
     assert last['frames dropped: paused'] == '3'
 
 
@@ -482,14 +483,14 @@ def test_reset_during_a_stream_discards_everything(node, publisher, subscriber, 
     play(publisher, drive[:6])
     subscriber.wait('a pair', paired(3))
     assert publisher.call('reset')['success']
-    subscriber.heard.clear()
+    subscriber.received.clear()
     play(publisher, drive[8:12], first=100)
     subscriber.wait('a pair', paired(103))
-    first = next(m for m in subscriber.heard[f'{NODE}/odometry']
+    first = next(m for m in subscriber.received[f'{NODE}/odometry']
                  if stamp_ns(m.header) >= stamp(100))
     assert first.pose.pose.position.x == first.pose.pose.position.z == 0
     assert first.pose.pose.orientation.w == 1
-    last = subscriber.wait('tracking', said('tracking'))
+    last = subscriber.wait('tracking', reported('tracking'))
     assert int(last['frames received']) <= 6
     assert last['status: FIRST_FRAME'] == '1'
 
@@ -546,10 +547,10 @@ def test_parameter_change_is_applied_or_rejected_with_the_reason(
     assert reasons[6].count('ground_truth') == 1
     assert publisher.ask('configure', node=NODE, values={'odometry.scale': 'none'})[0][0]
     play(publisher, drive[3:5], first=3)
-    subscriber.wait('all odometry', lambda heard: len(heard[f'{NODE}/odometry']) == 5)
+    subscriber.wait('all odometry', lambda received: len(received[f'{NODE}/odometry']) == 5)
     # without a scale each translation has length one
     lengths = [np.linalg.norm(pose_of(m)[1][:3, 3])
-               for m in subscriber.heard[f'{NODE}/relative_pose']]
+               for m in subscriber.received[f'{NODE}/relative_pose']]
     assert [length == pytest.approx(1, abs=1e-9) for length in lengths[-3:]] == [False, True, True]
     assert publisher.ask('configured', node=NODE, names=[
         'odometry.max_gap', 'estimator.window']) == [2.0, 5]
@@ -632,7 +633,7 @@ def test_param_dump_and_load_round_trip(node, publisher):
 BROKEN_YAML = '/**: {ros__parameters: {estimator: '
 
 
-@pytest.mark.parametrize(('words', 'reason'), [
+@pytest.mark.parametrize(('arguments', 'reason'), [
     (['-p', 'estimator.window:=4'], 'estimator.window is 4; it must be odd'),
     (['-p', 'odometry.scale:=ground_truth'], 'available offline only'),
     (['-p', 'odometry.scale:=camera_height'], 'give the metres from the ground to the camera'),
@@ -650,9 +651,9 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-p', 'qos_overrides./image.subscription.depth:=many'],
      "{'subscription.depth': 'many'"),
 ])
-def test_user_error_ends_the_node_with_one_line_and_exit_code_2(tmp_path, words, reason):
+def test_user_error_ends_the_node_with_one_line_and_exit_code_2(tmp_path, arguments, reason):
     (tmp_path / 'broken.yaml').write_text(BROKEN_YAML)
-    done = subprocess.run([*command('vo_node'), '--ros-args', *words], env=ENVIRONMENT,
+    done = subprocess.run([*command('vo_node'), '--ros-args', *arguments], env=ENVIRONMENT,
                           capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
     assert done.returncode == 2
     line, = done.stderr.splitlines()
@@ -692,17 +693,17 @@ def test_path_tf_and_debug_image_are_published_on_demand(
         viewer.ask('published', topic=topic)
     sleep(0.5)
     play(publisher, drive[:4])
-    viewer.wait('pictures', lambda heard: len(heard[f'{NODE}/debug_image']) == 3)
-    picture = viewer.heard[f'{NODE}/debug_image'][-1]
+    viewer.wait('pictures', lambda received: len(received[f'{NODE}/debug_image']) == 3)
+    picture = viewer.received[f'{NODE}/debug_image'][-1]
     assert (picture.width, picture.height, picture.encoding) == (*SIZE, 'bgr8')
-    assert [len(m.poses) for m in viewer.heard[f'{NODE}/path']] == [1, 2, 3, 4]
-    transform = viewer.heard['/tf'][-1].transforms[0]
+    assert [len(m.poses) for m in viewer.received[f'{NODE}/path']] == [1, 2, 3, 4]
+    transform = viewer.received['/tf'][-1].transforms[0]
     assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'camera_body')
     viewer.ask('unsubscribe', topic=f'{NODE}/debug_image')
     sleep(0.5)
     play(publisher, drive[4:6], first=4)
     subscriber.wait('a pair', paired(5))
-    assert len(viewer.heard[f'{NODE}/debug_image']) == 3
+    assert len(viewer.received[f'{NODE}/debug_image']) == 3
     viewer.close()
 
 
@@ -717,25 +718,25 @@ def test_odometry_is_of_the_base_frame_and_the_camera_keeps_its_tf_parent(
     play(publisher, drive[:3])
     subscriber.wait('pairs', paired(2))
     wait_for_log(one, "tf has no transform from 'base_link' to 'camera'")
-    assert not subscriber.heard[f'{NODE}/odometry']
+    assert not subscriber.received[f'{NODE}/odometry']
     publisher.advertise('/tf_static', TF_TYPE, durability='transient_local', depth=1)
     publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', AHEAD))
     for i in range(3, 12):
         # Nothing says when the node has taken the mounting in.
         play(publisher, drive[i:i + 1], first=i, pause=0.3)
-    listener.wait('the vehicle', lambda heard: heard['/tf'] and stamp_ns(
-        heard['/tf'][-1].transforms[0].header) == stamp(11))
-    frames = {(one.header.frame_id, one.child_frame_id) for message in listener.heard['/tf']
+    listener.wait('the vehicle', lambda received: received['/tf'] and stamp_ns(
+        received['/tf'][-1].transforms[0].header) == stamp(11))
+    frames = {(one.header.frame_id, one.child_frame_id) for message in listener.received['/tf']
               for one in message.transforms}
     assert frames == {('odom', 'base_link')}
-    odometry = subscriber.heard[f'{NODE}/odometry'][-1]
+    odometry = subscriber.received[f'{NODE}/odometry'][-1]
     assert odometry.child_frame_id == 'base_link'
     # it drives ahead, and keeps to the plane on which it drives
     position = odometry.pose.pose.position
     assert position.x > 0.5
     assert abs(position.z) < 0.2 * position.x
     assert odometry.twist.twist.linear.x > 0
-    # what is known needs not be heard any more
+    # A known mounting needs no subscription any more.
     publisher.ask('alone', topic='/tf_static')
     listener.close()
 
@@ -748,8 +749,8 @@ def test_speed_topic_gives_the_length(node, publisher, subscriber, drive):
     twist = message_type('geometry_msgs/msg/Twist')(
         linear=vector(x=2.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
     play(publisher, drive[:1])
-    subscriber.wait('odometry', lambda heard: heard[f'{NODE}/odometry'])
-    message = subscriber.heard[f'{NODE}/odometry'][0]
+    subscriber.wait('odometry', lambda received: received[f'{NODE}/odometry'])
+    message = subscriber.received[f'{NODE}/odometry'][0]
     for i in range(3):
         message.header = header(stamp(i))
         message.twist.twist = twist
@@ -757,9 +758,10 @@ def test_speed_topic_gives_the_length(node, publisher, subscriber, drive):
     sleep(0.3)
     play(publisher, drive[1:3], first=1)
     subscriber.wait('a pair', paired(2))
-    way = subscriber.heard[RELATIVE][-1].pose.position
+    translation = subscriber.received[RELATIVE][-1].pose.position
     # The steps are of one length, by the speeds and by what the images share.
-    assert np.linalg.norm([way.x, way.y, way.z]) == pytest.approx(0.2, rel=0.02)
+    assert np.linalg.norm([translation.x, translation.y, translation.z]) == pytest.approx(
+        0.2, rel=0.02)
 
 
 # Load and end
@@ -770,8 +772,8 @@ def test_every_image_is_accounted_for_under_load(node, publisher, subscriber, dr
     camera(publisher)
     for round_ in range(4):
         play(publisher, drive, first=100 * round_)
-    last = subscriber.wait('all', lambda heard: next(
-        (values(m) for m in heard['/diagnostics'] if values(m)['frames received'] == '48'),
+    last = subscriber.wait('all', lambda received: next(
+        (values(m) for m in received['/diagnostics'] if values(m)['frames received'] == '48'),
         None))
     assert int(last['frames dropped: queue_full']) > 0
     assert int(last['frames processed']) + int(last['frames dropped']) == 48
@@ -786,14 +788,14 @@ def test_images_beyond_the_queue_limit_are_dropped_and_reported(
     camera(publisher)
     for round_ in range(sent // len(drive)):
         play(publisher, drive, first=100 * round_, pause=0.01)
-    last = subscriber.wait('all', lambda heard: next(
-        (values(m) for m in heard['/diagnostics'] if values(m)['frames received'] == str(sent)),
+    last = subscriber.wait('all', lambda received: next(
+        (values(m) for m in received['/diagnostics'] if values(m)['frames received'] == str(sent)),
         None))
     assert int(last['frames dropped: queue_full']) > sent // 4
     assert int(last['frames processed']) + int(last['frames dropped']) == sent
-    said = [m.status[0].message for m in subscriber.heard['/diagnostics']]
+    reported = [m.status[0].message for m in subscriber.received['/diagnostics']]
     for complaint in ('images pile up', 'images dropped under load'):
-        assert any(complaint in message for message in said)
+        assert any(complaint in message for message in reported)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -804,14 +806,14 @@ def test_signal_during_a_stream_ends_the_node_within_a_second(
     camera(publisher)
     stream = Thread(target=play, args=[publisher, drive * 3], kwargs={'pause': 0.03})
     stream.start()
-    subscriber.wait('a pair', lambda heard: heard[RELATIVE])
+    subscriber.wait('a pair', lambda received: received[RELATIVE])
     code, seconds = one.end(number)
     stream.join()
     assert code == 0
     assert seconds < 1
     sleep(0.3)
     # Whole or not at all.
-    assert len({len(subscriber.heard[topic]) for topic in (
+    assert len({len(subscriber.received[topic]) for topic in (
         RELATIVE, f'{NODE}/relative_pose_cov')}) == 1
     assert not [line for line in one.log.splitlines()
                 if not line.startswith(('[INFO]', '[WARN]'))]

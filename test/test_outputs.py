@@ -1,4 +1,4 @@
-"""What is written takes the place of nothing that it was not told to."""
+"""Outputs replace nothing without a request."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Count:
 
 
 def held(folder: Path) -> dict[str, str]:
-    """Give the files of a folder with their content."""
+    """Return the files of a folder with their content."""
     return {path.name: path.read_text('utf-8') for path in folder.iterdir()}
 
 
@@ -82,9 +82,9 @@ def test_figures_are_json_and_their_plot_overwrites_no_photo(
     for name, why in (('g.png', 'its name must end in .json'),
                       ('f.json', f'{tmp_path / "f.png"} exists already; choose another name')):
         assert main(['lab', *verb, '--output', str(tmp_path / name)]) == 2
-        said = capsys.readouterr().err
-        assert why in said
-        assert said.count('\n') == 1
+        stderr = capsys.readouterr().err
+        assert why in stderr
+        assert stderr.count('\n') == 1
     assert held(tmp_path) == {'f.png': 'my photo'}
 
 

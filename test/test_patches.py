@@ -19,7 +19,7 @@ def texture(points: np.ndarray) -> np.ndarray:
 
 
 def image(warp: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Give what `texture` looks like where each place x is seen at W (x - middle) + shift."""
+    """Return what `texture` looks like where each place x is seen at W (x - middle) + shift."""
     y = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1).astype(float)
     x = (y - MIDDLE - shift) @ np.linalg.inv(warp).T + MIDDLE
     return np.clip(np.rint(texture(x)), 0, 255).astype(np.uint8)
@@ -30,7 +30,7 @@ def seen(warp: np.ndarray, shift: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def as_seen(warp: np.ndarray, count: int) -> np.ndarray:
-    """Give the same warp (3, 2) for all points, of depths that are all alike."""
+    """Return the same warp (3, 2) for all points, of depths that are all alike."""
     return np.tile(np.vstack([warp, [0, 0]]), (count, 1, 1))
 
 
@@ -105,10 +105,10 @@ def test_errors_are_proportional_to_covariances_over_the_image(points: np.ndarra
     there, here = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (there, here))
     found, covariances = align_patches(there, here, points, points,
                                        as_seen(np.eye(2), len(points)))
-    told = (found != points).any(1) & (np.abs(points[:, 0] - 200) > 10)
-    assert told.mean() > 0.9
-    off, sigma = (found - points)[told], np.sqrt(covariances[told][:, [0, 1], [0, 1]])
-    across = points[told, 0] - 200
+    determined = (found != points).any(1) & (np.abs(points[:, 0] - 200) > 10)
+    assert determined.mean() > 0.9
+    off, sigma = (found - points)[determined], np.sqrt(covariances[determined][:, [0, 1], [0, 1]])
+    across = points[determined, 0] - 200
     parts = [np.median(np.abs(off[part] / sigma[part]), axis=0) / 0.6745
              for part in (across < -60, (across > -60) & (across < 0), across > 0)]
     # Larger than stated, since interpolation smooths.
@@ -122,9 +122,9 @@ def test_a_patch_without_gradient_is_undetermined(points: np.ndarray) -> None:
     flat = np.full(SIZE[::-1], 90, np.uint8)
     there = image(np.eye(2), np.zeros(2))
     eye = as_seen(np.eye(2), len(points))
-    told, untold = (align_patches(one, one, points, points, eye).covariances[:, 0, 0]
+    determined, undetermined = (align_patches(one, one, points, points, eye).covariances[:, 0, 0]
                     for one in (there, flat))
-    assert untold.min() > 1e3 * told.max()
+    assert undetermined.min() > 1e3 * determined.max()
 
 
 def test_threads_change_nothing(points: np.ndarray) -> None:

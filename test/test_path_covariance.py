@@ -34,8 +34,8 @@ def sampled(scales, own):
     """
     true, R, p = np.eye(4), np.tile(np.eye(3), (SAMPLES, 1, 1)), np.zeros((SAMPLES, 3))
     for scale, error in zip(scales, own):
-        way = STEP[:3, 3] * np.exp(scale)[:, None] + error[:, :3]
-        p = p + np.einsum('nij,nj->ni', R, way)
+        motion = STEP[:3, 3] * np.exp(scale)[:, None] + error[:, :3]
+        p = p + np.einsum('nij,nj->ni', R, motion)
         R = R @ rotation_exp(error[:, 3:]) @ STEP[:3, :3]
         true = true @ STEP
     off = np.concatenate([p - true[:3, 3], rotation_log(R @ true[:3, :3].T)], axis=1)
@@ -108,12 +108,12 @@ def test_common_errors_are_in_the_sigma_of_metric_lengths_only():
 
 def test_a_metric_path_has_the_relative_error_of_its_source():
     common = Common(np.array([0.0, 0.05**2]), np.ones(2))
-    path, here, way = PathCovariance(), np.eye(4), np.eye(4)
-    way[2, 3] = 1.0
+    path, here, motion = PathCovariance(), np.eye(4), np.eye(4)
+    motion[2, 3] = 1.0
     for _ in range(100):
-        path, here = path.moved_by_pair(here, way, np.eye(6) * 1e-12, common), here @ way
+        path, here = path.moved_by_pair(here, motion, np.eye(6) * 1e-12, common), here @ motion
     assert np.sqrt(path.pose[2, 2]) == pytest.approx(5, rel=1e-3)
-    back = way.copy()
+    back = motion.copy()
     back[2, 3] = -1.0
     for _ in range(100):
         path, here = path.moved_by_pair(here, back, np.eye(6) * 1e-12, common), here @ back

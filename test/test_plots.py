@@ -36,7 +36,7 @@ def test_errors_far_below_those_of_a_dataset_are_drawn_where_they_are(
 
 
 def kept(drawn: dict[str, Figure]) -> Any:
-    """Give what draws as ever, and keeps the figures by the names of their files."""
+    """Return what draws as ever, and keeps the figures by the names of their files."""
     @contextmanager
     def keeping(path: Path, width: float, height: float) -> Iterator[Figure]:
         with figure(path, width, height) as empty:

@@ -33,9 +33,9 @@ FRAMES = 5
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 
 
-def djet(*words, expect=0):
-    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
-                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+def djet(*arguments, expect=0):
+    done = subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=120, check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
     assert done.returncode == expect, done.stderr
     assert 'Traceback' not in done.stderr
     return done
@@ -170,9 +170,9 @@ def test_repeated_stamps_after_a_reset_get_their_own_motions(tmp_path):
     alone = [read_results(replayed(tmp_path / str(i), run)) for i, run in enumerate(runs)]
     both = read_results(replayed(tmp_path / 'both', Both()))
     assert len(both.poses) == len(alone[0].poses) + len(alone[1].poses)
-    told, expected = ([edge for graph in graphs for edge in graph.edges if edge.kind == 'odometry']
-                      for graphs in ([both], alone))
-    for edge, one in zip(told, expected, strict=True):
+    edges, expected = ([edge for graph in graphs for edge in graph.edges
+                        if edge.kind == 'odometry'] for graphs in ([both], alone))
+    for edge, one in zip(edges, expected, strict=True):
         assert np.array_equal(edge.motion, one.motion)
         assert np.array_equal(edge.covariance, one.covariance)
 
@@ -187,15 +187,15 @@ def test_time_gap_is_an_edge_with_unknown_motion(tmp_path):
 def test_other_folders_and_damaged_results_are_refused(results, tmp_path):
     with pytest.raises(DjetError, match='is not a results folder'):
         read_results(tmp_path)
-    for name, damage, said in (
+    for name, damage, error_text in (
             ('frames.csv', lambda text: text.replace('OK', 'SPLENDID', 1), 'line 3'),
             ('frames.csv', lambda text: text.replace('1100000000', '1100000001'), 'same run'),
             ('trajectory_tum.txt', lambda text: 'x' + text, 'not a number')):
-        folder = tmp_path / f'damaged {said}'
+        folder = tmp_path / f'damaged {error_text}'
         shutil.copytree(results, folder)
         file = folder / name
         file.write_text(damage(file.read_text()))
-        with pytest.raises(DjetError, match=said):
+        with pytest.raises(DjetError, match=error_text):
             read_results(folder)
 
 
@@ -217,7 +217,7 @@ def test_information_is_the_inverse_covariance_in_the_target_frame():
     assert np.abs(np.cov(white) - np.eye(6)).max() < 0.05
 
 
-@pytest.mark.parametrize(('spoil', 'said'), [
+@pytest.mark.parametrize(('spoil', 'error_text'), [
     (lambda C: C * np.nan, 'is not a finite 6x6 matrix'),
     (lambda C: np.zeros((6, 6)), 'has the variance 0'),
     (lambda C: -C, 'has the variance -'),
@@ -226,14 +226,14 @@ def test_information_is_the_inverse_covariance_in_the_target_frame():
     (lambda C: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
     (lambda C: C[:5, :5], 'is not a finite 6x6 matrix')])
 def test_singular_covariance_is_refused_with_the_edge_name(
-        spoil, said, tmp_path):
+        spoil, error_text, tmp_path):
     graph = random_graph(2)
     bad = replace(graph.edges[4], covariance=spoil(graph.edges[4].covariance))
     graph = replace(graph, edges=(*graph.edges[:4], bad, *graph.edges[5:]))
     for kind in ('g2o', 'csv'):
         with pytest.raises(DjetError, match=r'edge 4 -> 5 \(1400000000 ns') as refused:
             write_graph(graph, tmp_path / 'graph', kind)
-        assert said in str(refused.value)
+        assert error_text in str(refused.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -268,13 +268,13 @@ SPOILT = [(lambda C, _: C * np.nan, 'is not a finite 6x6 matrix'),
           (no_orientation, 'is not a finite pose')]
 
 
-@pytest.mark.parametrize(('spoil', 'said'), SPOILT)
+@pytest.mark.parametrize(('spoil', 'error_text'), SPOILT)
 def test_edited_results_are_refused_with_the_edge_name(
-        results, spoil, said, tmp_path):
+        results, spoil, error_text, tmp_path):
     graph = read_results(spoilt(results, tmp_path / 'spoilt', spoil))
     with pytest.raises(DjetError, match=r'odometry edge 1 -> 2 \(1200000000 ns') as refused:
         graph.check()
-    assert said in str(refused.value)
+    assert error_text in str(refused.value)
     with pytest.raises(DjetError, match='edge 1 -> 2'):
         write_graph(graph, tmp_path / 'graph', 'g2o')
 
@@ -283,11 +283,11 @@ def test_invalid_edge_gives_one_line_and_no_output(results, tmp_path):
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     folder, out = spoilt(results, tmp_path / 'spoilt', asymmetric), tmp_path / 'out'
     sequence = write_small_kitti(tmp_path / 'dataset')
-    for words in (('export', folder, '--output', out),
+    for arguments in (('export', folder, '--output', out),
                   ('slam', folder, '--source', sequence, '--output', tmp_path / 'slam')):
-        said = djet(*words, expect=2).stderr
-        assert 'odometry edge 1 -> 2' in said
-        assert len(said.strip().splitlines()) == 1
+        error_text = djet(*arguments, expect=2).stderr
+        assert 'odometry edge 1 -> 2' in error_text
+        assert len(error_text.strip().splitlines()) == 1
     assert not out.exists()
 
 
@@ -299,19 +299,19 @@ def test_results_of_a_killed_replay_give_the_graph_up_to_the_break(results, tmp_
     (killed / 'bag' / 'metadata.yaml').unlink()
     with pytest.raises(DjetError, match='cut short'):
         read_results(killed)
-    said = []
-    graph = read_results(killed, said.append)
+    warnings = []
+    graph = read_results(killed, warnings.append)
     assert 2 <= len(graph.poses) < FRAMES
     assert np.array_equal(graph.stamps_ns, whole.stamps_ns[:len(graph.poses)])
     assert np.array_equal(graph.poses, whole.poses[:len(graph.poses)])
-    assert f'only the first {len(graph.poses)} of {FRAMES} frames are used' in said[0]
+    assert f'only the first {len(graph.poses)} of {FRAMES} frames are used' in warnings[0]
     done = djet('export', killed, '--output', tmp_path / 'graph.g2o')
-    assert done.stderr == f'djet: warning: {said[0]}\n'
+    assert done.stderr == f'djet: warning: {warnings[0]}\n'
     assert f'{len(graph.poses)} poses' in done.stdout
     # Of a bag that holds no motion at all there is no graph.
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(DjetError):
-        read_results(killed, said.append)
+        read_results(killed, warnings.append)
 
 
 # Files
@@ -423,8 +423,8 @@ def g2o_errors(path):
         result[:3, :3], result[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
         return result
 
-    rows = [(words[0], np.array(words[1:], float))
-            for words in map(str.split, path.read_text().splitlines())]
+    rows = [(arguments[0], np.array(arguments[1:], float))
+            for arguments in map(str.split, path.read_text().splitlines())]
     poses = {row[0]: motion(row[1:]) for kind, row in rows if kind == 'VERTEX_SE3:QUAT'}
     errors = {}
     for kind, row in rows:

@@ -1,4 +1,4 @@
-"""Laws that hold for whatever comes: geometry, messages, paraboloids, and the rules of time."""
+"""Properties that hold for any input: geometry, messages, paraboloids, and the rules of time."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def test_exact_matches_lie_on_their_epipolar_lines_in_front_of_both_cameras(R, t
     assert (np.abs(line_distances(epipolar_lines(F, x), y)) < off).all()
     assert np.linalg.matrix_rank(F, tol=1e-9 * np.abs(F).max()) == 2
     parallax = np.linalg.norm(np.cross(unit(rays(K, x) @ R.T), unit(rays(K, y))), axis=1)
-    told = parallax > 1e-9
-    assert in_front(R, t, rays(K, x), rays(K, y))[told].all()
-    assert not in_front(R, -t, rays(K, x), rays(K, y))[told].any()
+    distinct = parallax > 1e-9
+    assert in_front(R, t, rays(K, x), rays(K, y))[distinct].all()
+    assert not in_front(R, -t, rays(K, x), rays(K, y))[distinct].any()
 
 
 @given(rotations, rotations, rotations, directions, directions)
@@ -212,9 +212,9 @@ BLACK = np.zeros((48, 64), np.uint8)
 
 def rules(stamps, max_gap_ns, max_lost):
     """
-    Give what the README says of frames in which nothing is seen: (status, reference) of each.
+    Return (status, reference) of each frame without features, by the rules of the README.
 
-    A gap or a step back begins anew; else a frame refers to the newest reference, which the
+    A gap or a step back restarts; otherwise a frame refers to the newest reference, which the
     newest frame takes over after max_lost bad pairs in a row.
     """
     last = reference = None
@@ -247,9 +247,9 @@ def test_every_frame_refers_to_what_the_rules_of_time_say(start, between, max_lo
                               OdometryConfig(max_gap=1.0, max_lost=max_lost))
     # Ten nanoseconds: stamps of this size are compared as floats of seconds.
     for stamp, (status, reference) in zip(stamps, rules(stamps, SECOND, max_lost)):
-        told = odometry.process(Frame(BLACK, K, stamp))
-        assert (told.status, told.previous_stamp_ns) == (status, reference)
-        assert np.isfinite(told.pose_covariance).all()
+        result = odometry.process(Frame(BLACK, K, stamp))
+        assert (result.status, result.previous_stamp_ns) == (status, reference)
+        assert np.isfinite(result.pose_covariance).all()
     with pytest.raises(ValueError, match='two frames in a row'):
         odometry.process(Frame(BLACK, K, stamps[-1]))
 

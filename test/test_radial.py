@@ -32,7 +32,7 @@ def test_distorted_pixels_and_their_jacobians_are_those_of_the_lens(k1: float) -
 
 
 def clouds() -> NDArray[np.uint8]:
-    """Give a smooth image (480, 640), which interpolation hardly changes."""
+    """Return a smooth image (480, 640), which interpolation hardly changes."""
     noise = np.random.default_rng(18).uniform(0, 255, (480, 640)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 6)
     return np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)

@@ -84,9 +84,9 @@ def test_a_block_edited_by_hand_is_detected_and_restored(tmp_path):
     readme.write_text(whole.replace('<!-- generated: summary -->\n',
                                     '<!-- generated: summary -->\nD-JET is the best.\n'))
     command = [sys.executable, tmp_path / 'doc' / 'pages.py']
-    said = subprocess.run([*command, '--check'], capture_output=True, text=True, check=False)
-    assert said.returncode == 1
-    assert 'README.md' in said.stderr
+    output = subprocess.run([*command, '--check'], capture_output=True, text=True, check=False)
+    assert output.returncode == 1
+    assert 'README.md' in output.stderr
     subprocess.run(command, check=True)
     assert readme.read_text() == whole
 
@@ -131,7 +131,7 @@ def test_every_test_that_is_named_exists(page):
 def test_every_make_target_that_is_named_exists(page):
     makefile, text = (ROOT / 'Makefile').read_text(), page.read_text()
     for target in [*re.findall(r'`make ([a-z]+)', text),
-                   *(words[1] for words in commands(text) if words[0] == 'make')]:
+                   *(arguments[1] for arguments in commands(text) if arguments[0] == 'make')]:
         assert f'\n{target}:' in makefile, target
 
 
@@ -139,17 +139,17 @@ def commands(text: str) -> Iterator[list[str]]:
     """Yield the words of each command in the blocks of shell code."""
     for block in re.findall(r'^```(?:sh|bash)\n(.*?)^```', text, re.MULTILINE | re.DOTALL):
         for command in re.split(r'\n|&&', block):
-            words = shlex.split(command, comments=True)
-            if words:
-                yield words
+            arguments = shlex.split(command, comments=True)
+            if arguments:
+                yield arguments
 
 
 def calls(text: str) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
     """Yield subcommands and options of djet in blocks of code, and its subcommands in text."""
-    for words in commands(text):
-        if words[0] == 'djet':
-            options = tuple(word.partition('=')[0] for word in words if word.startswith('-'))
-            yield tuple(words[1:3 if words[1] == 'lab' else 2]), options
+    for arguments in commands(text):
+        if arguments[0] == 'djet':
+            options = tuple(word.partition('=')[0] for word in arguments if word.startswith('-'))
+            yield tuple(arguments[1:3 if arguments[1] == 'lab' else 2]), options
     for verbs in re.findall(r'`djet ((?:lab )?[a-z][a-z-]*)', text):
         yield tuple(verbs.split()), ()
 
@@ -160,9 +160,9 @@ def test_every_command_and_option_that_is_named_exists(page, capsys):
         with pytest.raises(SystemExit) as ended:
             main([*verbs, '--help'])
         assert ended.value.code == 0, verbs
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         for option in options:
-            assert re.search(rf'(?<![\w-]){option}(?![\w-])', said), (verbs, option)
+            assert re.search(rf'(?<![\w-]){option}(?![\w-])', output), (verbs, option)
 
 
 @each_page

@@ -32,11 +32,11 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def record(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def record(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Measure tables, with a short PATIENCE."""
     return subprocess.run(
         [sys.executable, '-c', 'import record; record.PATIENCE = 5; raise SystemExit('
-         'record.main())', *words, '--data', place], cwd=place, env=ENVIRONMENT,
+         'record.main())', *arguments, '--data', place], cwd=place, env=ENVIRONMENT,
         capture_output=True, text=True, timeout=120, check=False)
 
 

@@ -1,4 +1,4 @@
-"""``djet replay`` in real processes: what it writes, and what it says where it can't."""
+"""``djet replay`` in real processes: what it writes, and its error messages."""
 
 import csv
 import json
@@ -46,8 +46,8 @@ STEP = pose(x=0.25, z=0.15, yaw=0.01)
 SECOND = 10**9
 
 
-def djet(*words, expect=0, **settings):
-    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
+def djet(*call, expect=0, **settings):
+    done = subprocess.run([*DJET, *map(str, call)], capture_output=True, text=True, timeout=120,
                           check=False, env={**os.environ, 'OMP_NUM_THREADS': '1', **settings})
     assert done.returncode == expect, done.stderr
     assert 'Traceback' not in done.stderr
@@ -56,7 +56,7 @@ def djet(*words, expect=0, **settings):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Write a small KITTI sequence with ground truth, and give its folder."""
+    """Write a small KITTI sequence with ground truth, and return its folder."""
     root = tmp_path_factory.mktemp('dataset')
     sequence = root / 'sequences' / '00'
     (sequence / 'image_0').mkdir(parents=True)
@@ -152,13 +152,13 @@ def on_a_robot():
 @pytest.mark.slow
 def test_odometry_is_of_the_base_frame_with_the_mounting_from_the_bag(tmp_path):
     path = record(tmp_path / 'bag', on_a_robot())
-    for name, words in (('camera', ()), ('base', ('--base-frame', 'base_link'))):
-        djet('replay', path, '--output', tmp_path / name, *words)
+    for name, call in (('camera', ()), ('base', ('--base-frame', 'base_link'))):
+        djet('replay', path, '--output', tmp_path / name, *call)
     with Bag(tmp_path / 'base' / 'bag') as result:
-        told = [one.message for one in result.messages({'/vo_node/odometry'})]
+        published = [one.message for one in result.messages({'/vo_node/odometry'})]
     _, camera = read_tum(tmp_path / 'camera' / 'trajectory_tum.txt')
-    assert len(told) == FRAMES
-    for message, here in zip(told, camera):
+    assert len(published) == FRAMES
+    for message, here in zip(published, camera):
         assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
         assert np.allclose(pose_of(message)[1], AHEAD @ here @ np.linalg.inv(AHEAD), atol=1e-6)
     # the files stay those of the camera
@@ -169,7 +169,7 @@ def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
     """Messages of tf are recorded between the images, a little after the image they cover."""
     here = np.eye(4)
 
-    def told():
+    def with_tf():
         nonlocal here
         for topic, message, stamp in on_a_robot():
             yield topic, message, stamp
@@ -178,14 +178,15 @@ def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
                 yield '/tf', MAKE.frame(stamp, 'wheels', 'base_link', base), stamp + 20_000_000
                 here = here @ STEP
 
-    path, words = record(tmp_path / 'bag', told()), ('--scale', 'guess', '--guess-frame', 'wheels')
-    djet('replay', path, '--output', tmp_path / 'out', *words)
+    path = record(tmp_path / 'bag', with_tf())
+    call = ('--scale', 'guess', '--guess-frame', 'wheels')
+    djet('replay', path, '--output', tmp_path / 'out', *call)
     assert summary(tmp_path / 'out')['pairs_of_known_scale'] == FRAMES - 1
     _, camera = read_tum(tmp_path / 'out' / 'trajectory_tum.txt')
     true = [np.linalg.matrix_power(STEP, i)[:3, 3] for i in range(FRAMES)]
     assert np.allclose(camera[:, :3, 3], true, atol=0.02)
     without = djet('replay', record(tmp_path / 'none', drive()), '--output', tmp_path / 'no',
-                   *words, expect=2)
+                   *call, expect=2)
     assert 'has no topic /tf, which odometry.guess_frame requires' in without.stderr
 
 
@@ -202,12 +203,12 @@ def test_missing_mounting_in_a_recording_is_one_line(tmp_path, folder):
 
 def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(tmp_path):
     folder = render_sequence('road', tmp_path, 4, size=(480, 160))
-    words = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
-    assert "has no transform from it to 'camera'" in djet(*words, expect=2).stderr
-    djet(*words, '--imu', 'true')
+    call = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
+    assert "has no transform from it to 'camera'" in djet(*call, expect=2).stderr
+    djet(*call, '--imu', 'true')
     with Bag(tmp_path / 'out' / 'bag') as result:
-        told = [one.message for one in result.messages({'/vo_node/odometry'})]
-    assert [message.child_frame_id for message in told] == ['imu'] * 4
+        published = [one.message for one in result.messages({'/vo_node/odometry'})]
+    assert [message.child_frame_id for message in published] == ['imu'] * 4
 
 
 def test_missing_mounting_keeps_earlier_results(tmp_path):
@@ -233,33 +234,33 @@ def replayed(bag, tmp_path_factory):
 
 def test_summary_has_counts_and_errors(replayed):
     results, _ = replayed
-    said = summary(results)
-    assert said['complete'] is True
-    assert said['error'] is None
-    assert (said['frames'], said['pairs'], said['images']) == (FRAMES, FRAMES - 1, FRAMES)
-    assert said['status'] == {'FIRST_FRAME': 1, 'OK': FRAMES - 1}
-    assert said['seconds'] > 0
-    assert said['inner_loops'] in ('compiled', 'NumPy')
-    assert said['compared_pairs'] == FRAMES - 1
-    assert said['failures'] == said['translation_failures'] == 0
+    found = summary(results)
+    assert found['complete'] is True
+    assert found['error'] is None
+    assert (found['frames'], found['pairs'], found['images']) == (FRAMES, FRAMES - 1, FRAMES)
+    assert found['status'] == {'FIRST_FRAME': 1, 'OK': FRAMES - 1}
+    assert found['seconds'] > 0
+    assert found['inner_loops'] in ('compiled', 'NumPy')
+    assert found['compared_pairs'] == FRAMES - 1
+    assert found['failures'] == found['translation_failures'] == 0
     for name, limit in (('rotation_error_deg', 0.5), ('translation_error_deg', 10)):
-        assert set(said[name]) == {'mean', 'median', 'p95', 'max'}
-        assert 0 < said[name]['median'] <= said[name]['p95'] <= said[name]['max'] < limit
+        assert set(found[name]) == {'mean', 'median', 'p95', 'max'}
+        assert 0 < found[name]['median'] <= found[name]['p95'] <= found[name]['max'] < limit
 
 
 def test_position_error_is_after_alignment_with_scale(replayed, folder):
     results, _ = replayed
-    said = summary(results)
+    found = summary(results)
     truth = KittiSequence(folder).poses[:, :3, 3]
     _, estimate = read_tum(results / 'trajectory_tum.txt')
-    metric = said['scale_kind'] == 'metric'
-    assert said['positions']['rmse_m'] == pytest.approx(
+    metric = found['scale_kind'] == 'metric'
+    assert found['positions']['rmse_m'] == pytest.approx(
         position_rmse(aligned(estimate[:, :3, 3], truth, metric), truth), rel=1e-3)
-    assert said['positions']['way_m'] == pytest.approx(
+    assert found['positions']['way_m'] == pytest.approx(
         np.linalg.norm(np.diff(truth, axis=0), axis=1).sum())
-    assert said['positions']['scale_change'] == pytest.approx(
+    assert found['positions']['scale_change'] == pytest.approx(
         scale_change(estimate[:, :3, 3], truth), rel=1e-6)
-    assert said['positions']['rmse_m'] < 0.02 * said['positions']['way_m']
+    assert found['positions']['rmse_m'] < 0.02 * found['positions']['way_m']
 
 
 @pytest.mark.slow
@@ -269,23 +270,23 @@ def test_drift_is_given_for_paths_over_100_metres(replayed, folder, tmp_path):
     truth = KittiSequence(folder).poses
     truth[:, :3, 3] *= 100
     np.savetxt(tmp_path / 'far.txt', truth[:, :3].reshape(-1, 12))
-    told = {}
+    drifts = {}
     places = {}
     for scale in ('none', 'ground_truth'):
         done = djet('replay', folder, '--poses', tmp_path / 'far.txt', '--scale', scale,
                     '--output', tmp_path / scale)
-        told[scale], places[scale] = (summary(tmp_path / scale)[what]
+        drifts[scale], places[scale] = (summary(tmp_path / scale)[what]
                                       for what in ('drift', 'positions'))
         _, estimate = read_tum(tmp_path / scale / 'trajectory_tum.txt')
         expected = drift(truth, estimate)
-        assert told[scale]['rotation_deg_per_100m'] == pytest.approx(
+        assert drifts[scale]['rotation_deg_per_100m'] == pytest.approx(
             expected.rotation_deg_per_100m, rel=1e-3)
-        assert (told[scale]['segments'], told[scale]['longest']) == (1, 100)
+        assert (drifts[scale]['segments'], drifts[scale]['longest']) == (1, 100)
         assert 'r_rel' in done.stdout
         assert ('t_rel' in done.stdout) == (scale != 'none')
     # Without a scale the lengths of the estimate mean nothing, but its rotations do.
-    assert told['none']['translation_percent'] is None
-    assert told['ground_truth']['translation_percent'] == pytest.approx(
+    assert drifts['none']['translation_percent'] is None
+    assert drifts['ground_truth']['translation_percent'] == pytest.approx(
         expected.translation_percent, rel=1e-3)
     assert 0 < expected.translation_percent < 10
     assert places['none'] is None
@@ -392,8 +393,8 @@ def test_folder_and_bag_give_identical_results(folder, replayed, tmp_path):
     # All else holds how long the work took, and differs in nothing but that.
     rows = [list(csv.DictReader((place / 'frames.csv').open())) for place in places]
     assert [{**row, 'ms': ''} for row in rows[0]] == [{**row, 'ms': ''} for row in rows[1]]
-    told = [{**summary(place), 'seconds': 0, 'source': ''} for place in places]
-    assert told[0] == told[1]
+    summaries = [{**summary(place), 'seconds': 0, 'source': ''} for place in places]
+    assert summaries[0] == summaries[1]
     bags = []
     for place in places:
         with Bag(place / 'bag') as out:
@@ -461,9 +462,9 @@ def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_pat
     shutil.copytree(replayed[0], results)
     (results / 'notes.txt').write_text('mine')
     before = (results / 'summary.json').read_bytes()
-    said = djet('replay', bag, '--output', results, expect=2).stderr
-    assert '--overwrite' in said
-    assert len(said.splitlines()) == 1
+    printed = djet('replay', bag, '--output', results, expect=2).stderr
+    assert '--overwrite' in printed
+    assert len(printed.splitlines()) == 1
     assert (results / 'summary.json').read_bytes() == before
     djet('replay', bag, '--output', results, '--overwrite', '--preset', 'paper')
     assert summary(results)['preset'] == 'paper'
@@ -482,10 +483,10 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replaye
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
     before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
-    source, *words = mistake
-    said = djet('replay', bag if source == 'bag' else tmp_path / source, *words, '--output',
+    source, *call = mistake
+    printed = djet('replay', bag if source == 'bag' else tmp_path / source, *call, '--output',
                 results, '--overwrite', expect=2).stderr
-    assert said.count('\n') == 1
+    assert printed.count('\n') == 1
     assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
 
 
@@ -582,10 +583,10 @@ def test_unwritable_output_is_one_line_without_results(
     file.write_text('')
     for place, why in ((file / 'x.png', f'{file} exists and is not a folder; choose another'),
                        ('/proc/x/y.png', 'could not be created: ')):
-        said = djet(*verb, folder, '--output', place, expect=2).stderr
-        assert why in said
-        assert said.count('\n') == 1
-        assert 'readable' not in said
+        printed = djet(*verb, folder, '--output', place, expect=2).stderr
+        assert why in printed
+        assert printed.count('\n') == 1
+        assert 'readable' not in printed
     assert file.read_text() == ''
 
 
@@ -624,9 +625,9 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
             'TOO_FEW_MATCHES): the images are dark') in done.stderr
     assert 'positions' not in done.stdout
     assert 'plot' not in done.stdout
-    told = summary(tmp_path / 'out')
-    assert (told['positions'], told['drift']) == (None, None)
-    assert told['failures'] == FRAMES - 1
+    found = summary(tmp_path / 'out')
+    assert (found['positions'], found['drift']) == (None, None)
+    assert found['failures'] == FRAMES - 1
 
 
 def test_stationary_camera_gives_a_warning(tmp_path):
@@ -654,9 +655,9 @@ def test_12_bit_camera_gives_a_warning_that_gray_range_resolves(tmp_path):
             (IMAGE_TOPIC, image(values, 'mono16', SECOND + i * SECOND // 10))]])
     done = djet('replay', source, '--output', tmp_path / 'dark')
     assert 'djet: warning: few gray levels: ' in done.stderr
-    done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'told')
+    done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'stretched')
     assert 'warning' not in done.stderr
-    assert summary(tmp_path / 'told')['status'][Status.OK.value] == FRAMES - 1
+    assert summary(tmp_path / 'stretched')['status'][Status.OK.value] == FRAMES - 1
 
 
 def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
@@ -664,17 +665,17 @@ def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
     whole = next(bag.glob('*.mcap')).read_bytes()
     cut.write_bytes(whole[:len(whole) * 6 // 10])
     results = tmp_path / 'results'
-    said = djet('replay', cut, '--output', results, expect=2).stderr
-    assert len(said.splitlines()) == 1
-    assert 'cut short' in said
-    told = summary(results)
-    assert told['complete'] is False
-    assert 'cut short' in told['error']
-    assert 1 < told['frames'] < FRAMES
-    assert len(read_tum(results / 'trajectory_tum.txt')[0]) == told['frames']
+    printed = djet('replay', cut, '--output', results, expect=2).stderr
+    assert len(printed.splitlines()) == 1
+    assert 'cut short' in printed
+    found = summary(results)
+    assert found['complete'] is False
+    assert 'cut short' in found['error']
+    assert 1 < found['frames'] < FRAMES
+    assert len(read_tum(results / 'trajectory_tum.txt')[0]) == found['frames']
     with Bag(results / 'bag') as out:
-        assert len(list(out.messages({'/vo_node/odometry'}))) == told['frames']
-    assert told['rotation_error_deg'] is not None
+        assert len(list(out.messages({'/vo_node/odometry'}))) == found['frames']
+    assert found['rotation_error_deg'] is not None
 
 
 @pytest.mark.parametrize('damage, reason, frames', [
@@ -686,14 +687,14 @@ def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
 def test_bad_image_is_named_and_the_rest_is_tracked(
         damage, reason, frames, tmp_path):
     results = tmp_path / 'results'
-    said = djet('replay', record(tmp_path / 'bag', drive(damage)), '--output', results,
+    printed = djet('replay', record(tmp_path / 'bag', drive(damage)), '--output', results,
                 expect=2).stderr
-    assert len(said.splitlines()) == 1
-    assert f'{FRAMES - frames} of {FRAMES} images' in said
-    told = summary(results)
-    assert told['complete'] is True
-    assert told['frames'] == frames
-    assert set(told['rejected']) <= set(reason.split('|'))
+    assert len(printed.splitlines()) == 1
+    assert f'{FRAMES - frames} of {FRAMES} images' in printed
+    found = summary(results)
+    assert found['complete'] is True
+    assert found['frames'] == frames
+    assert set(found['rejected']) <= set(reason.split('|'))
     rows = list(csv.DictReader((results / 'frames.csv').open()))
     assert sum(row['status'] == 'UNUSED' for row in rows) == FRAMES - frames
 
@@ -703,10 +704,10 @@ def test_bad_first_image_is_named_and_does_not_change_the_other_poses(bad, tmp_p
     def damage(i, message):
         return image(np.zeros(SIZE[::-1], np.uint8), **bad) if i == 0 else message
 
-    said = djet('replay', record(tmp_path / 'bad', drive(damage)), '--output', tmp_path / 'r',
+    printed = djet('replay', record(tmp_path / 'bad', drive(damage)), '--output', tmp_path / 'r',
                 expect=2).stderr
-    assert said.count('\n') == 1
-    assert f'1 of {FRAMES} images could not be used; image 0: ' in said
+    assert printed.count('\n') == 1
+    assert f'1 of {FRAMES} images could not be used; image 0: ' in printed
     djet('replay', record(tmp_path / 'good', drive(lambda i, message: message if i else None)),
          '--output', tmp_path / 'without')
     assert summary(tmp_path / 'r')['complete'] is True
@@ -720,13 +721,13 @@ def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(at, folder, tmp
     shutil.copytree(folder, tmp_path / '00')
     cut = tmp_path / '00' / 'image_0' / f'{at:06d}.png'
     cut.write_bytes(cut.read_bytes()[:500])
-    said = djet('replay', tmp_path / '00', '--output', tmp_path / 'r', expect=2).stderr
-    assert said == (
+    printed = djet('replay', tmp_path / '00', '--output', tmp_path / 'r', expect=2).stderr
+    assert printed == (
         f'djet: error: {tmp_path / "00"}: 1 of {FRAMES} images could not be used; image {at}: '
         'PNG image of 500 bytes is cut short\n')
-    told = summary(tmp_path / 'r')
-    assert (told['complete'], told['frames']) == (True, FRAMES - 1)
-    assert told['rejected'] == {'undecodable': 1}
+    found = summary(tmp_path / 'r')
+    assert (found['complete'], found['frames']) == (True, FRAMES - 1)
+    assert found['rejected'] == {'undecodable': 1}
     # The commands that make something of each image go no further.
     done = djet('kitti-to-bag', tmp_path / '00', tmp_path / 'bag', expect=2)
     assert f'{cut} is a damaged image' in done.stderr
@@ -737,14 +738,14 @@ def test_zero_camera_info_loses_the_images_up_to_the_next_one(at, tmp_path):
     messages, zero = list(drive()), camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
     messages.insert(2 * at + 1, (INFO_TOPIC, zero, messages[2 * at][2]))
     path = record(tmp_path / 'bag', messages)
-    said = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
-    assert said.count('\n') == 1
-    assert ': 1 CameraInfo could not be used; ' in said
-    assert 'all zeros' in said
-    told = summary(tmp_path / 'r')
-    assert (told['complete'], told['frames']) == (True, FRAMES - 1)
-    assert told['dropped'] == {'waiting_for_camera_info': 1}
-    assert sum(told['rejected_infos'].values()) == 1
+    printed = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
+    assert printed.count('\n') == 1
+    assert ': 1 CameraInfo could not be used; ' in printed
+    assert 'all zeros' in printed
+    found = summary(tmp_path / 'r')
+    assert (found['complete'], found['frames']) == (True, FRAMES - 1)
+    assert found['dropped'] == {'waiting_for_camera_info': 1}
+    assert sum(found['rejected_infos'].values()) == 1
     # What goes through the recording again has the cameras that the odometry had.
     with open_recording(path) as recording:
         frame = frame_finder(recording, Config())(SECOND + 5 * SECOND // 10)
@@ -758,9 +759,9 @@ def test_change_of_image_size_is_reported(tmp_path):
             message.height, message.data = 200, message.data[:200 * SIZE[0]]
         elif i >= 6:
             message.height = 200
-    said = djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
+    printed = djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
                 expect=2).stderr
-    assert 'changes once' in said
+    assert 'changes once' in printed
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
 
 
@@ -772,8 +773,8 @@ def test_images_before_the_first_camera_info_give_a_warning(tmp_path):
             yield topic, message, stamp
 
     path = record(tmp_path / 'bag', messages())
-    said = djet('replay', path, '--output', tmp_path / 'r').stderr
-    assert said == (
+    printed = djet('replay', path, '--output', tmp_path / 'r').stderr
+    assert printed == (
         f'djet: warning: 2 of {FRAMES} images have no earlier CameraInfo on {INFO_TOPIC} and were '
         'dropped, as in a live node: the first one was recorded 0.200 s after the first image; '
         'record it before the images\n')
@@ -790,8 +791,8 @@ def shifted(frames, seconds):
 
 def test_stamps_that_go_back_are_reported_with_the_restart(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3), 10))
-    said = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
-    assert said == (f'djet: error: {path}: the stamps go back once; the poses restart at the '
+    printed = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
+    assert printed == (f'djet: error: {path}: the stamps go back once; the poses restart at the '
                     'origin at stamp 1.300000000\n')
     assert summary(tmp_path / 'r')['complete'] is True
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
@@ -810,8 +811,8 @@ def test_image_stamped_ahead_does_not_change_the_poses(tmp_path):
 
 def test_gap_gives_a_warning_with_its_length(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3, FRAMES), 5))
-    said = djet('replay', path, '--output', tmp_path / 'r').stderr
-    assert said == (
+    printed = djet('replay', path, '--output', tmp_path / 'r').stderr
+    assert printed == (
         'djet: warning: 1 gaps between images exceed odometry.max_gap; the longest, 5.100 s, ends '
         'at stamp 6.300000000; the trajectory continues at the last pose, without the motion in '
         'the gap\n')
@@ -825,9 +826,10 @@ def test_constant_stamps_give_a_warning(goes_on, tmp_path):
         for i, stamp in enumerate(stamps):
             yield IMAGE_TOPIC, image(Cards().gray(), stamp_ns=stamp * SECOND), SECOND + i
 
-    said = djet('replay', record(tmp_path / 'bag', messages()), '--output', tmp_path / 'r').stderr
+    bag = record(tmp_path / 'bag', messages())
+    printed = djet('replay', bag, '--output', tmp_path / 'r').stderr
     assert ('djet: warning: stamps stand still: 7 images in a row have the stamp 1.000000000 and '
-            'are dropped; ') in said
+            'are dropped; ') in printed
     assert summary(tmp_path / 'r')['dropped'] == {'equal_stamp': 7}
 
 
@@ -851,10 +853,10 @@ def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sig
     process.send_signal(sign)
     assert process.wait(30) == code
     assert 'Traceback' not in process.stderr.read()
-    told = summary(results)
-    assert told['complete'] is False
-    assert (told['source'], told['image_topic']) == (str(endless), IMAGE_TOPIC)
-    assert ('images' in told) == (results / 'bag' / 'metadata.yaml').exists() == (code > 0)
+    found = summary(results)
+    assert found['complete'] is False
+    assert (found['source'], found['image_topic']) == (str(endless), IMAGE_TOPIC)
+    assert ('images' in found) == (results / 'bag' / 'metadata.yaml').exists() == (code > 0)
     poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
     assert len(poses) > 5
     found = []
@@ -894,9 +896,9 @@ def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_pat
     with TumWriter(poses) as truth:
         for i in range(FRAMES):
             truth.write(round((first + i * apart) * SECOND), np.linalg.matrix_power(STEP, i))
-    said = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
+    printed = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
                 tmp_path / 'r').stderr
-    assert said == f'djet: warning: {why.format(poses)}\n'
+    assert printed == f'djet: warning: {why.format(poses)}\n'
     assert summary(tmp_path / 'r')['compared_pairs'] == 0
     assert summary(tmp_path / 'r')['drift'] is None
 
@@ -935,10 +937,10 @@ def with_speeds(late=0):
 
 
 def test_a_speed_topic_gives_metres(tmp_path):
-    said = djet('replay', record(tmp_path / 'bag', with_speeds()), '--output', tmp_path / 'r',
+    printed = djet('replay', record(tmp_path / 'bag', with_speeds()), '--output', tmp_path / 'r',
                 '--scale', 'speed')
-    assert re.search(r'scale\W+metric', said.stdout)
-    assert said.stderr == ''
+    assert re.search(r'scale\W+metric', printed.stdout)
+    assert printed.stderr == ''
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
     # Speeds are fused with the lengths from landmarks.
     assert np.allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 0.2, rtol=0.01)
@@ -950,14 +952,14 @@ def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
     with TumWriter(poses) as truth:
         for i in range(FRAMES):
             truth.write((5000 + i) * SECOND, np.linalg.matrix_power(STEP, i))
-    for words, why in (
+    for call, why in (
             (('speed',), 'the newest speed is stamped 3600.0 s after the newest image; give speeds'
              ' that are stamped by the clock of the images'),
             (('camera_height', '--camera-height', '1.5'), 'the images show no level ground'),
             (('ground_truth', '--poses', poses), 'the ground truth does not cover the time')):
-        done = djet('replay', source, '--output', tmp_path / words[0], '--scale', *words)
+        done = djet('replay', source, '--output', tmp_path / call[0], '--scale', *call)
         assert ('djet: warning: no metric length: odometry.scale is '
-                f'{words[0]}, and no length was measured: {why}') in done.stderr
+                f'{call[0]}, and no length was measured: {why}') in done.stderr
         assert re.search(r'scale\W+relative, in units of the first step', done.stdout)
 
 
@@ -1012,10 +1014,10 @@ def test_real_frames_are_replayed_within_a_degree(kitti, tmp_path):
     truth = tmp_path / 'truth.txt'
     truth.write_text('\n'.join((kitti / 'poses' / '06.txt').read_text().splitlines()[:8]) + '\n')
     djet('replay', short, '--poses', truth, '--output', tmp_path / 'r')
-    said = summary(tmp_path / 'r')
-    assert said['status'] == {'FIRST_FRAME': 1, 'OK': 7}
-    assert said['rotation_error_deg']['max'] < 0.5
-    assert said['translation_error_deg']['max'] < 2
+    found = summary(tmp_path / 'r')
+    assert found['status'] == {'FIRST_FRAME': 1, 'OK': 7}
+    assert found['rotation_error_deg']['max'] < 0.5
+    assert found['translation_error_deg']['max'] < 2
 
 
 def test_documented_command_is_valid():
@@ -1027,8 +1029,8 @@ def test_documented_command_is_valid():
 
 def test_unused_auxiliary_inputs_give_a_warning(tmp_path):
     folder = render_sequence('road', tmp_path, 8, size=(480, 160))
-    for told in (False, True):
-        if told:
+    for enough in (False, True):
+        if enough:
             (folder / 'imu.csv').write_text('')
         run = djet('replay', folder, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
-        assert ('djet: warning: no imu in time: ' in run.stderr) is told
+        assert ('djet: warning: no imu in time: ' in run.stderr) is enough

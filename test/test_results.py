@@ -38,11 +38,11 @@ def script(name: str) -> ModuleType:
     return module
 
 
-def measure(output: Path, *words: str) -> list[str]:
+def measure(output: Path, *arguments: str) -> list[str]:
     """Measure one scene; returns the parts that were newly measured."""
     done = subprocess.run(
         [sys.executable, ROOT / 'doc' / 'measure.py', '--only', SCENE, '--frames', '3', '--seeds',
-         '0', '--workers', '1', '--output', output, *words], capture_output=True, text=True,
+         '0', '--workers', '1', '--output', output, *arguments], capture_output=True, text=True,
         check=False, env={**os.environ, 'PYTHONPATH': str(ROOT), 'DJET_DATA': ''})
     assert done.returncode == 0, done.stderr
     return [line.partition(':')[0] for line in done.stdout.splitlines()]
@@ -100,9 +100,9 @@ def test_only_adds_a_part_to_complete_results_and_a_full_run_starts_empty(tmp_pa
     path.write_text(json.dumps(whole))
     assert module.previous_results(path, settings, keep=True) == whole
     assert module.previous_results(path, settings)['parts'] == {}
-    with pytest.raises(DjetError, match=r'other settings \(code\)') as said:
+    with pytest.raises(DjetError, match=r'other settings \(code\)') as raised:
         module.previous_results(path, {**settings, 'code': 'of yesterday'}, keep=True)
-    assert '\n' not in str(said.value)
+    assert '\n' not in str(raised.value)
     path.write_text(json.dumps({**whole, 'complete': False}))
     assert list(module.previous_results(path, settings)['parts']) == ['road', 'loop']
     assert module.previous_results(path, {**settings, 'frames': 8})['parts'] == {}
@@ -217,8 +217,8 @@ def test_the_page_compares_the_estimated_distortion_with_others():
         'pages').drift(results)
 
 
-def record(pair: int, rotation: Rotation, way: np.ndarray) -> PairRecord:
+def record(pair: int, rotation: Rotation, translation: np.ndarray) -> PairRecord:
     """Return the record of a method for a pair of sequence 07."""
     return PairRecord('07', pair, pair, pair + 1, 'rpe', 'best', '', Status.OK.value, 99, 90,
                       False, 0.1, 0.1, 20.0, tuple(rotation.as_rotvec().tolist()),
-                      tuple((way / np.linalg.norm(way)).tolist()), 50.0)
+                      tuple((translation / np.linalg.norm(translation)).tolist()), 50.0)

@@ -25,7 +25,7 @@ DJET = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
 
 
 def clean(scene: Scene) -> Scene:
-    """Give the scene without anything that the camera does to the light."""
+    """Return the scene without anything that the camera does to the light."""
     return replace(scene, effects=())
 
 
@@ -187,9 +187,9 @@ def test_under_water_it_is_dim_and_particles_drift_through_the_light() -> None:
 
 
 def test_a_sequence_is_read_back_as_it_was_made(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
+    reports: list[tuple[int, int]] = []
     folder = render_sequence('road', tmp_path, 3, size=TINY,
-                             progress=lambda done, total: told.append((done, total)))
+                             progress=lambda done, total: reports.append((done, total)))
     scene = make_scene('road', size=TINY)
     sequence = KittiSequence(folder)
     assert folder == tmp_path / 'sequences' / '00'
@@ -198,7 +198,7 @@ def test_a_sequence_is_read_back_as_it_was_made(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.poses, scene.trajectory(3), atol=1e-12)
     np.testing.assert_array_equal(np.diff(sequence.stamps_ns), 100_000_000)
     np.testing.assert_array_equal(sequence.image(2), scene.render(scene.trajectory(3)[2], 2))
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reports == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_an_earlier_rendering_is_replaced_only_if_asked(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
 STRAIGHT, TURN = 0.5, 8.0
 
 
-def heard(windows: list[tuple[float, float, float]]) -> SelfCalibration:
+def estimate(windows: list[tuple[float, float, float]]) -> SelfCalibration:
     lens = SelfCalibration.unknown(K, (376, 1241))
     for window in windows:
         lens = lens.update(*window)
@@ -47,14 +47,14 @@ def test_a_priori_there_is_no_distortion() -> None:
 
 
 def test_a_systematic_error_on_straight_roads_is_not_taken_for_distortion() -> None:
-    lens = heard([(0.02, 0.005**2, STRAIGHT)] * 500)
+    lens = estimate([(0.02, 0.005**2, STRAIGHT)] * 500)
     assert abs(lens.k1) < 0.005
     assert lens.sigma > 0.5 * lens.first
 
 
 def test_turns_separate_distortion_from_systematic_errors() -> None:
     roads = [(0.02, 0.005**2, STRAIGHT)] * 50
-    lens = heard(roads + [(0.01, 0.001**2, TURN)] * 20)
+    lens = estimate(roads + [(0.01, 0.001**2, TURN)] * 20)
     assert lens.k1 == pytest.approx(0.01, abs=2 * lens.sigma)
     # 0.01 too much, where a k1 of one leaves half a pixel.
     assert lens.mean[1] == pytest.approx(0.005, abs=2 * np.sqrt(lens.covariance[1, 1]))
@@ -63,13 +63,13 @@ def test_turns_separate_distortion_from_systematic_errors() -> None:
 def test_noise_is_not_taken_for_distortion() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
-        lens = heard([(0.004 * rng.normal(), 0.004**2, TURN) for _ in range(30)])
+        lens = estimate([(0.004 * rng.normal(), 0.004**2, TURN) for _ in range(30)])
         assert abs(lens.k1) < 0.2 * lens.sigma
 
 
 def test_noise_free_windows_do_not_make_k1_certain() -> None:
     # No lens deviates by k1 alone.
-    exact = heard([(0.01, 0.0, TURN)] * 2)
+    exact = estimate([(0.01, 0.0, TURN)] * 2)
     assert exact.sigma > 0.1 * exact.first
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
 
@@ -139,13 +139,13 @@ def bent() -> Bent:
 
 
 @pytest.fixture(scope='module')
-def told(bent: Bent) -> tuple[Tracker, list[OdometryResult]]:
+def tracked_bent(bent: Bent) -> tuple[Tracker, list[OdometryResult]]:
     return bent.tracked()
 
 
 def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
-        bent: Bent, told: tuple[Tracker, list[OdometryResult]]) -> None:
-    tracker, results = told
+        bent: Bent, tracked_bent: tuple[Tracker, list[OdometryResult]]) -> None:
+    tracker, results = tracked_bent
     found, sigma = map(float, tracker.diagnosis().values['distortion left (k1)'].split(' +- '))
     assert found == pytest.approx(0.015, abs=2.5 * sigma)
     assert sigma < 0.003
@@ -163,22 +163,22 @@ def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
 
 
 def test_the_back_end_gets_the_lens_of_each_image(
-        told: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
+        tracked_bent: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
     """Live by messages, later by the results: loops are seen alike."""
-    _, results = told
+    _, results = tracked_bent
     lenses = [one.k1 for one in results]
     assert not any(lenses[:30])
     # The significant part of it.
     assert 0 < lenses[-1] < 0.018
-    make, heard, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []
+    make, estimate, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []
     with ResultsFolder(tmp_path / 'results', Config()) as folder:
         for number, one in enumerate(results):
             folder.add_frame(number, one, 0.0)
-            live += [*heard.status(make.status(one)), *heard.odometry(make.odometry(one))]
+            live += [*estimate.status(make.status(one)), *estimate.odometry(make.odometry(one))]
             if one.status in TRACKED:
                 message = make.relative_pose_cov(one)
                 folder.publish(Outgoing('relative_pose_cov', message), one.stamp_ns)
-                live += heard.relative_pose(message)
+                live += estimate.relative_pose(message)
     assert [step.k1 for step in live] == lenses
     assert [step.k1 for step in read_steps(tmp_path / 'results')] == lenses
 
@@ -198,8 +198,8 @@ def test_the_estimate_is_reset_with_another_camera(bent: Bent) -> None:
 
 
 def test_corrected_images_are_reproducible_to_the_last_bit(
-        bent: Bent, told: tuple[Tracker, list[OdometryResult]]) -> None:
-    (_, first), (one, second) = told, bent.tracked()
+        bent: Bent, tracked_bent: tuple[Tracker, list[OdometryResult]]) -> None:
+    (_, first), (one, second) = tracked_bent, bent.tracked()
     assert all(np.array_equal(a.pose, b.pose) for a, b in zip(first, second))
     # After a reset the lens is unknown.
     one.reset()

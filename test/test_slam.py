@@ -37,9 +37,9 @@ DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; s
 SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
 
 
-def djet(*words, expect=0):
-    done = subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
-                          check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+def djet(*arguments, expect=0):
+    done = subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=120, check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
     assert done.returncode == expect, done.stderr
     assert 'Traceback' not in done.stderr
     return done
@@ -135,20 +135,20 @@ def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps(keyframes):
     rng = np.random.default_rng(0)
     motions, samples = [pose(z=1.0, yaw=0.1)] * 3, []
     for _ in range(4000):
-        way = np.eye(4)
+        metres = np.eye(4)
         for step in motions:
             noise = rng.normal(size=6) * SIGMAS
             wrong = step.copy()
             wrong[:3, 3] += noise[:3]
             wrong[:3, :3] = rotation_exp(noise[3:]) @ wrong[:3, :3]
-            way = way @ wrong
-        samples.append(way)
+            metres = metres @ wrong
+        samples.append(metres)
     poses = np.array([np.linalg.matrix_power(motions[0], i) for i in range(4)])
     kept, _ = keyframes(steps(poses), keyframe_distance=2.5, keyframe_turn=90)
     edge, = kept.edges
-    off = np.array([[*(way[:3, 3] - edge.motion[:3, 3]),
-                     *cv2.Rodrigues(way[:3, :3] @ edge.motion[:3, :3].T)[0].ravel()]
-                    for way in samples])
+    off = np.array([[*(metres[:3, 3] - edge.motion[:3, 3]),
+                     *cv2.Rodrigues(metres[:3, :3] @ edge.motion[:3, :3].T)[0].ravel()]
+                    for metres in samples])
     white = np.linalg.solve(np.linalg.cholesky(edge.covariance), off.T)
     assert np.abs(np.cov(white) - np.eye(6)).max() < 0.1
 
@@ -177,9 +177,9 @@ def test_unknown_length_has_a_bounded_variance():
 
 
 def test_unknown_motion_starts_a_keyframe_with_an_unknown_edge(keyframes):
-    told = steps(np.array([pose(z=0.1 * i) for i in range(4)]))
-    told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, told[2].pose)
-    kept, offsets = keyframes(told)
+    trajectory = steps(np.array([pose(z=0.1 * i) for i in range(4)]))
+    trajectory[2] = Step(trajectory[2].stamp_ns, Status.TIME_JUMP, trajectory[2].pose)
+    kept, offsets = keyframes(trajectory)
     edge, = kept.edges
     assert (edge.kind, edge.scale_known) == ('unknown', False)
     assert [one.keyframe for one in offsets] == [0, 0, 1, 1]
@@ -188,25 +188,25 @@ def test_unknown_motion_starts_a_keyframe_with_an_unknown_edge(keyframes):
 def test_map_keeps_the_rotation_of_the_odometry_over_a_gap(keyframes):
     """A gyro measures the rotation; the odometry's frame and the map stay as they are."""
     before, turned = pose(z=9.0), pose(z=9.0, yaw=np.radians(60))
-    told = steps(np.array([pose(), before, turned, turned @ pose(z=4.0)]))
-    told[2] = Step(told[2].stamp_ns, Status.TIME_JUMP, turned)
-    kept, _ = keyframes(told)
+    trajectory = steps(np.array([pose(), before, turned, turned @ pose(z=4.0)]))
+    trajectory[2] = Step(trajectory[2].stamp_ns, Status.TIME_JUMP, turned)
+    kept, _ = keyframes(trajectory)
     for _ in range(2):
-        assert np.allclose([one.pose for one in kept.keyframes], [one.pose for one in told])
+        assert np.allclose([one.pose for one in kept.keyframes], [one.pose for one in trajectory])
         assert np.allclose(kept.correction, np.eye(4))
         kept.optimise()
 
 
 def test_rotation_covariance_without_a_translation_is_that_of_the_odometry(keyframes):
     before, turned = pose(z=9.0, yaw=0.4), pose(z=9.0, yaw=1.4)
-    told, known, own = steps(np.array([pose(), before, turned])), np.eye(3) * 0.5, np.diag(
+    trajectory, known, own = steps(np.array([pose(), before, turned])), np.eye(3) * 0.5, np.diag(
         [1e-8, 4e-8, 9e-8])
-    told[1] = replace(told[1], rotation_covariance=known)
+    trajectory[1] = replace(trajectory[1], rotation_covariance=known)
 
     def covariance(turn, status=Status.AMBIGUOUS):
-        last = Step(told[2].stamp_ns, status, turned, rotation_covariance=turn)
+        last = Step(trajectory[2].stamp_ns, status, turned, rotation_covariance=turn)
         edges = [edges[1].covariance for edges in (
-            keyframes([*told[:2], last])[0].edges, graph_of([*told[:2], last]).edges)]
+            keyframes([*trajectory[:2], last])[0].edges, graph_of([*trajectory[:2], last]).edges)]
         assert np.allclose(*edges)
         return edges[1]
 
@@ -221,14 +221,14 @@ def test_rotation_covariance_without_a_translation_is_that_of_the_odometry(keyfr
 
 def test_failed_and_stationary_frames_are_not_keyframes(keyframes):
     """The reference of a step may be the frame before the last, with that frame's keyframe."""
-    told = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))
-    told[3] = replace(told[3], previous_stamp_ns=told[1].stamp_ns)
-    kept, offsets = keyframes(told)
+    trajectory = steps(np.array([pose(), pose(z=1.5), pose(z=1.5), pose(z=2.5)]))
+    trajectory[3] = replace(trajectory[3], previous_stamp_ns=trajectory[1].stamp_ns)
+    kept, offsets = keyframes(trajectory)
     edge, = kept.edges
     assert np.allclose(edge.motion, pose(z=2.5))
     assert [one.keyframe for one in offsets] == [0, 0, 0, 1]
-    assert np.allclose(edge.covariance, compose(pose(z=1.5), told[1].covariance, pose(z=1.0),
-                                                told[3].covariance))
+    assert np.allclose(edge.covariance, compose(pose(z=1.5), trajectory[1].covariance, pose(z=1.0),
+                                                trajectory[3].covariance))
 
 
 @pytest.mark.parametrize(('name', 'value'), [
@@ -477,10 +477,10 @@ def test_loop_lengths_are_consistent_with_their_sigma(points):
     step, motion = pose(z=-1.0, yaw=0.02), pose(x=0.3, z=1.2, yaw=0.05)
     true, errors = np.linalg.norm(motion[:3, 3]), []
     for seed in range(100):
-        told = transferred_length(seen(points, step, 0.3, 2 * seed),
+        length = transferred_length(seen(points, step, 0.3, 2 * seed),
                                   seen(points, motion, 0.3, 2 * seed + 1),
                                   Length(1.0, 1e-6, True), K)
-        errors.append((told.value - true) / told.sigma)
+        errors.append((length.value - true) / length.sigma)
     # Points here err independently, which those of images do not; and near ones less than far.
     assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
@@ -605,14 +605,14 @@ def drive(tmp_path_factory):
     (folder / 'image_0').mkdir(parents=True)
     (folder.parents[1] / 'poses').mkdir()
     cards, rows = Cards(), []
-    ways = [0.25 * i for i in (*range(8), *range(8, -1, -1))]
-    for i, way in enumerate(ways):
-        here = pose(x=way, z=0.3 * way**2)
+    positions = [0.25 * i for i in (*range(8), *range(8, -1, -1))]
+    for i, metres in enumerate(positions):
+        here = pose(x=metres, z=0.3 * metres**2)
         cv2.imwrite(str(folder / 'image_0' / f'{i:06d}.png'), cards.gray(here, noise=i))
         rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
     row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
     (folder / 'calib.txt').write_text(f'P0: {row}\n')
-    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(len(ways))))
+    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(len(positions))))
     (folder.parents[1] / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
     return folder
 
@@ -630,18 +630,18 @@ def closed(drive, tmp_path_factory):
 
 
 def test_slam_command_closes_loops_of_a_recording(closed):
-    said = json.loads((closed / 'slam.json').read_text())
-    assert (said['scale'], said['scale_kind'], said['scale_uncertainty']) == (
+    report = json.loads((closed / 'slam.json').read_text())
+    assert (report['scale'], report['scale_kind'], report['scale_uncertainty']) == (
         'ground_truth', 'metric', 0.05)
-    assert said['frames'] == 17
-    assert said['keyframes'] == said['edges']['odometry'] + 1 >= 7
-    assert said['edges']['loop'] >= 3
-    assert said['errors']['after']['ape_m'] < 0.05
+    assert report['frames'] == 17
+    assert report['keyframes'] == report['edges']['odometry'] + 1 >= 7
+    assert report['edges']['loop'] >= 3
+    assert report['errors']['after']['ape_m'] < 0.05
     stamps, poses = read_tum(closed / 'after_tum.txt')
     _, truth = read_tum(closed / 'truth_tum.txt')
     assert len(stamps) == 17
     assert position_rmse(aligned(poses[:, :3, 3], truth[:, :3, 3]),
-                         truth[:, :3, 3]) == pytest.approx(said['errors']['after']['ape_m'])
+                         truth[:, :3, 3]) == pytest.approx(report['errors']['after']['ape_m'])
     size = cv2.imread(str(closed / 'slam.png')).shape
     assert min(size[:2]) > 400
 
@@ -690,20 +690,21 @@ def test_keyframes_agree_between_messages_and_results(closed, tmp_path):
     from djet_ros.posegraph.step_messages import StepMessages
     from djet_ros.recordings.bags import Bag
     from djet_ros.replay.graph_of_results import read_steps
-    results, words = read_steps(closed / 'replay'), StepMessages('optical')
-    take = {'relative_pose_cov': words.relative_pose, 'relative_pose_status': words.status,
-            'odometry': words.odometry}
+    results, parts = read_steps(closed / 'replay'), StepMessages('optical')
+    take = {'relative_pose_cov': parts.relative_pose, 'relative_pose_status': parts.status,
+            'odometry': parts.odometry}
     with Bag(closed / 'replay' / 'bag') as bag:
-        heard = [step for topic, _, message in bag.messages({f'/vo_node/{name}' for name in take})
-                 for step in take[topic.rpartition('/')[2]](message)]
-    assert [(step.stamp_ns, step.keyframe) for step in heard] == [
+        received = [step for topic, _, message in bag.messages(
+            {f'/vo_node/{name}' for name in take})
+            for step in take[topic.rpartition('/')[2]](message)]
+    assert [(step.stamp_ns, step.keyframe) for step in received] == [
         (step.stamp_ns, step.keyframe) for step in results]
     chosen = [step.stamp_ns for step in results if step.keyframe]
     assert 3 <= len(chosen) < len(results)
     djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--keyframes', 'odometry',
          *FLAGS[2:])
-    said = json.loads((tmp_path / 'slam' / 'slam.json').read_text())
-    assert said['keyframes'] == len(chosen)
+    report = json.loads((tmp_path / 'slam' / 'slam.json').read_text())
+    assert report['keyframes'] == len(chosen)
 
 
 def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
@@ -720,14 +721,14 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
     shutil.copytree(closed, tmp_path / 'slam')
     before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
     results = tmp_path / 'slam' / 'replay'
-    for mistake, said in (((tmp_path / 'absent',), 'does not exist'),
+    for mistake, report in (((tmp_path / 'absent',), 'does not exist'),
                           ((drive, '--mask-file', tmp_path / 'absent.png'), 'absent.png'),
                           ((drive, '--loop-gap', '-1'), 'loop_gap is -1'),
                           ((results, '--source', tmp_path / 'absent'), 'absent'),
                           ((results, '--mask-topic', '/mask'), 'does not use it'),
                           ((results, '--imu-topic', '/imu'), 'does not use it')):
         refused = djet('slam', *mistake, '--output', tmp_path / 'slam', '--overwrite', expect=2)
-        assert said in refused.stderr
+        assert report in refused.stderr
         assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
                 if path.is_file()} == before
 

@@ -1,4 +1,4 @@
-"""The soak records what it promises, and its exit code tells of growth."""
+"""The soak records what it promises, and its exit code reports growth."""
 
 from __future__ import annotations
 
@@ -96,15 +96,15 @@ def test_resident_memory_is_what_the_process_has() -> None:
         assert resident_mb() - before == pytest.approx(len(block) / 1e6, rel=0.1)
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (('--frames', 3), '--frames is 3; it must be at least 100'),
     ((), 'exists already; choose another name')])
 def test_what_can_be_mended_is_one_line_and_exit_code_2(
-        tmp_path: Path, arguments: tuple[object, ...], said: str) -> None:
+        tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     output = tmp_path / 'soak.json'
     if not arguments:
         output.write_text('{}')
     run = djet_soak('--output', output, *arguments)
     assert run.returncode == 2
-    assert said in run.stderr
+    assert message in run.stderr
     assert run.stderr.count('\n') == 1

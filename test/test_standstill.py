@@ -78,8 +78,8 @@ def test_a_creeping_camera_is_stationary_only_briefly() -> None:
     """Near features move slightly at first, far ones later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
     stationary = [after_a_stand().detect(
-        seen(WORLD, WORLD + way * shift, np.ones(400, bool)), MOST, at_rest=True)
-        for way in (1, 20, 40, 80)]
+        seen(WORLD, WORLD + pixels * shift, np.ones(400, bool)), MOST, at_rest=True)
+        for pixels in (1, 20, 40, 80)]
     assert stationary == [True, False, False, False]
 
 

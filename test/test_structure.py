@@ -34,7 +34,7 @@ import pytest
 ESTIMATOR = EstimatorConfig(max_features=800)
 
 # A camera that accelerates, brakes and turns: metres and radians in a tenth of a second.
-WAYS = [0.2, 0.2, 0.25, 0.3, 0.36, 0.36, 0.3, 0.22, 0.16, 0.16, 0.2, 0.26]
+LENGTHS = [0.2, 0.2, 0.25, 0.3, 0.36, 0.36, 0.3, 0.22, 0.16, 0.16, 0.2, 0.26]
 
 
 @pytest.fixture(scope='module')
@@ -42,8 +42,8 @@ def cards():
     return Cards()
 
 
-def steps(ways=WAYS):
-    return [pose(x=0.8 * way, z=0.6 * way, yaw=0.01 * (-1)**i) for i, way in enumerate(ways)]
+def steps(metres=LENGTHS):
+    return [pose(x=0.8 * one, z=0.6 * one, yaw=0.01 * (-1)**i) for i, one in enumerate(metres)]
 
 
 class Drive:
@@ -74,7 +74,7 @@ def lengths(results):
 def test_the_first_step_is_the_unit_of_all_that_follow(cards):
     results = Drive(cards).go(steps())
     assert lengths(results)[0] == pytest.approx(1)
-    assert lengths(results) * WAYS[0] == pytest.approx(np.array(WAYS), rel=0.03)
+    assert lengths(results) * LENGTHS[0] == pytest.approx(np.array(LENGTHS), rel=0.03)
     assert all(result.scale_kind is Scale.RELATIVE for result in results)
 
 
@@ -97,7 +97,7 @@ def test_a_speed_of_zero_is_not_believed_while_images_show_motion(cards):
 
 def test_a_shaking_rotation_away_from_landmarks_keeps_the_scale(cards):
     drive = Drive(cards)
-    before = drive.go(steps(WAYS[:4]))
+    before = drive.go(steps(LENGTHS[:4]))
     # Half of the landmarks are out of view for so many frames that, were each one a keyframe, all
     # keyframes of the window would be replaced.
     still = drive.go([pose(yaw=turn) for turn in (
@@ -105,8 +105,8 @@ def test_a_shaking_rotation_away_from_landmarks_keeps_the_scale(cards):
         *[-0.06] * 5)])
     assert all(result.status is Status.NO_PARALLAX for result in still)
     assert not any(result.stationary or result.keyframe for result in still)
-    after = drive.go(steps(WAYS[4:8]))
-    assert lengths(before + after) * WAYS[0] == pytest.approx(np.array(WAYS[:8]), rel=0.03)
+    after = drive.go(steps(LENGTHS[4:8]))
+    assert lengths(before + after) * LENGTHS[0] == pytest.approx(np.array(LENGTHS[:8]), rel=0.03)
 
 
 def test_landmarks_take_over_from_another_scale_while_running(cards):
@@ -115,11 +115,11 @@ def test_landmarks_take_over_from_another_scale_while_running(cards):
     for scale in ('structure', 'none', 'structure'):
         config = OdometryConfig(scale=scale)
         drive.odometry.configure(ESTIMATOR, config, scale_source(config))
-        results = drive.go(steps(WAYS[:4]))
+        results = drive.go(steps(LENGTHS[:4]))
         assert all(result.status in TRACKED for result in results)
         assert all((result.keyframe is None) == (scale == 'none') for result in results)
         if scale == 'structure':
-            ratios = lengths(results) / WAYS[:4]
+            ratios = lengths(results) / LENGTHS[:4]
             assert ratios == pytest.approx(np.full(4, ratios[0]), rel=0.03)
 
 
@@ -132,24 +132,25 @@ def test_the_sigma_of_a_step_is_that_of_its_parallax_and_not_of_the_unit(cards):
         sigmas.append(np.sqrt(along @ result.motion_covariance[:3, :3] @ along) / result.scale)
     assert all(1e-4 < sigma < 0.1 for sigma in sigmas)
     # The error of the first step is in all of them.
-    ratios = np.array(lengths_of) / WAYS[1:]
+    ratios = np.array(lengths_of) / LENGTHS[1:]
     off = ratios / np.average(ratios, weights=np.array(sigmas)**-2) - 1
     assert np.all(np.abs(off) < 3.5 * np.array(sigmas))
 
 
 def test_an_ambiguous_pair_that_agrees_with_the_landmarks_keeps_the_scale(cards):
-    estimator, ways, here = TwoViewEstimator(ESTIMATOR), [*[0.32] * 6, 0.46, 0.46, 0.32], np.eye(4)
+    estimator, here = TwoViewEstimator(ESTIMATOR), np.eye(4)
+    true_lengths = [*[0.32] * 6, 0.46, 0.46, 0.32]
     views, scale = [], TrackScale()
-    for number, way in enumerate([0, *ways]):
+    for number, way in enumerate([0, *true_lengths]):
         here = here @ pose(x=way)
         frame = cards.frame(0.0, here, noise=number)
         views.append(estimator.view(frame.gray, frame.K))
-    pairs = [estimator.estimate(*views[n:n + 2]) for n in range(len(ways))]
+    pairs = [estimator.estimate(*views[n:n + 2]) for n in range(len(true_lengths))]
     doubtful = pairs[-2]
     # Far points move as much as near ones, and the other way round.
     moved = doubtful.y_opt - doubtful.x
-    by_way = np.argsort(moved[:, 0], kind='stable')
-    moved[by_way] = moved[by_way[::-1]]
+    by_shift = np.argsort(moved[:, 0], kind='stable')
+    moved[by_shift] = moved[by_shift[::-1]]
     wrong = replace(doubtful, y_opt=doubtful.x + moved)
     found = []
     for pair in doubtful, wrong:
@@ -206,12 +207,12 @@ def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
 def test_motion_too_slow_for_parallax_from_frame_to_frame_accumulates(cards, way):
     drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
-    start = drive.go(steps(WAYS[:4]))[-1].pose
+    start = drive.go(steps(LENGTHS[:4]))[-1].pose
     results = drive.go(slow)
     assert all(result.status is Status.NO_PARALLAX for result in results)
-    gone = (np.linalg.inv(start) @ results[-1].pose)[:3, 3] * WAYS[0]
+    gone = (np.linalg.inv(start) @ results[-1].pose)[:3, 3] * LENGTHS[0]
     assert np.linalg.norm(gone - [30 * way, 0, 0]) < 0.1 * 30 * way
-    sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1]) * WAYS[0]
+    sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1]) * LENGTHS[0]
     assert np.linalg.norm(gone - [30 * way, 0, 0]) < 4 * sigma
 
 
@@ -261,11 +262,11 @@ def test_a_speed_makes_the_scale_metric_and_landmarks_carry_it_without_speeds(ca
     speeds = SpeedScale()
     drive = Drive(cards, speeds)
     measured = []
-    for move, way in zip(steps()[:6], WAYS):
+    for move, way in zip(steps()[:6], LENGTHS):
         for stamp in (drive.ns + 1, drive.ns + 10**8):
             speeds.add_speed(stamp, way / 0.1)
         measured += drive.go([move])
-    assert lengths(measured)[2:] == pytest.approx(np.array(WAYS[2:6]), rel=0.04)
+    assert lengths(measured)[2:] == pytest.approx(np.array(LENGTHS[2:6]), rel=0.04)
     silent = []
     for move in [*steps()[6:], *[pose(x=0.12, z=0.09)] * 2]:
         drive.here = drive.here @ move
@@ -325,10 +326,10 @@ def test_landmarks_leave_the_window_once_each_at_their_true_position(cards):
 
 def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
     """Sideways any depth fits two frames, as the epipolar lines are horizontal."""
-    ways = [pose(x=0.32)] * 8
-    pair = Drive(cards).go(ways)[-1].relative
+    true_lengths = [pose(x=0.32)] * 8
+    pair = Drive(cards).go(true_lengths)[-1].relative
     drive = Drive(cards)
-    drive.go(ways[:-1])
+    drive.go(true_lengths[:-1])
     scale = drive.odometry._scale  # as it was before the last frame
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     assert scale.agrees(aside, pair.x, pair.y_opt)
@@ -342,10 +343,10 @@ def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
 
 def test_landmarks_seen_between_keyframes_contradict_other_depths_too(cards):
     """In slow motion only the first two frames are kept, though many confirmed their depths."""
-    ways = [pose(x=0.04)] * 7
-    pair = Drive(cards).go(ways)[-1].relative
+    true_lengths = [pose(x=0.04)] * 7
+    pair = Drive(cards).go(true_lengths)[-1].relative
     drive = Drive(cards)
-    drive.go(ways[:-1])
+    drive.go(true_lengths[:-1])
     window = drive.odometry._scale._window
     assert len(window._views) == 3
     aside = Pose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
@@ -355,10 +356,10 @@ def test_landmarks_seen_between_keyframes_contradict_other_depths_too(cards):
 
 def test_parallax_that_depths_do_not_confirm_is_noise(cards):
     """The residual of a blurred rotation has any size and sign, wherever landmarks are."""
-    ways = [pose(x=0.16, z=0.12)] * 8
-    pair = Drive(cards).go(ways)[-1].relative
+    true_lengths = [pose(x=0.16, z=0.12)] * 8
+    pair = Drive(cards).go(true_lengths)[-1].relative
     drive = Drive(cards)
-    drive.go(ways[:-1])
+    drive.go(true_lengths[:-1])
     scale = drive.odometry._scale  # as it was before the last frame
     assert not scale.lacks_parallax(pair)
     length, error = scale._window.pair_length(pair)
@@ -431,11 +432,11 @@ def test_pauses_with_hardly_any_motion_do_not_lose_the_scale(seed: int) -> None:
     """A hand-held camera pauses, and new landmarks have hardly any parallax."""
     scene = make_scene('handheld', seed, (480, 360))
     poses, odometry = scene.trajectory(80), VisualOdometry(EstimatorConfig(max_features=1000))
-    told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
+    found = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
             for i, pose in enumerate(poses)][1:]
-    lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
-    moved = (lengths > 0) & (ways > 0.005)
-    assert np.std(np.log(lengths[moved] / ways[moved])) < np.log(2)
+    lengths, true_lengths = np.linalg.norm([found, np.diff(poses[:, :3, 3], axis=0)], axis=2)
+    moved = (lengths > 0) & (true_lengths > 0.005)
+    assert np.std(np.log(lengths[moved] / true_lengths[moved])) < np.log(2)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 4, 6])
@@ -443,10 +444,10 @@ def test_fast_rotations_keep_the_scale(seed: int) -> None:
     """At 15 degrees a frame landmarks leave the view after a few, at times all at once."""
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
     poses = scene.trajectory(36)
-    told = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
+    found = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
             for i, pose in enumerate(poses)][1:]
-    lengths, ways = np.linalg.norm([told, np.diff(poses[:, :3, 3], axis=0)], axis=2)
-    ratios = lengths / ways
+    lengths, true_lengths = np.linalg.norm([found, np.diff(poses[:, :3, 3], axis=0)], axis=2)
+    ratios = lengths / true_lengths
     assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.1)
 
 
@@ -463,10 +464,10 @@ def test_a_slow_camera_is_metric_at_any_frame_rate(cards, size, frames_per_secon
         results.append(odometry.process(Frame(frame.gray, frame.K, ns, 'camera')))
         here += 2.1 * size / frames_per_second
         ns += 10**9 // frames_per_second if number < 21 else 7 * 10**8
-    told = results[1:]
-    assert all(result.scale_kind is Scale.METRIC for result in told)
-    assert not told[-1].measured
-    assert lengths(told) == pytest.approx(np.full(24, 2.1 * size / frames_per_second), rel=0.05)
+    moved = results[1:]
+    assert all(result.scale_kind is Scale.METRIC for result in moved)
+    assert not moved[-1].measured
+    assert lengths(moved) == pytest.approx(np.full(24, 2.1 * size / frames_per_second), rel=0.05)
 
 
 def test_speeds_of_zero_do_not_observe_the_scale(cards):

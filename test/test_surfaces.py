@@ -153,7 +153,7 @@ WARPS = {'smaller': 0.85 * np.eye(2), 'larger': 1.2 * np.eye(2),
 
 
 def warped(warp):
-    """Give a wall, the wall seen through a warp, and where its points (N, 2) went."""
+    """Return a wall, the wall seen through a warp, and where its points (N, 2) went."""
     image = textured(np.random.default_rng(38), (320, 240))
     middle = np.array([160.0, 120.0])
     M = np.column_stack([warp, middle - warp @ middle])

@@ -14,8 +14,8 @@ VARIABLES = 'OPENCV_THREAD_POOL_ACTIVE_WAIT_MAIN', 'OPENCV_THREAD_POOL_ACTIVE_WA
 TOLD = f'import os; print(*(os.environ[name] for name in {VARIABLES}))'
 
 
-def told(**others: str) -> list[str]:
-    """Give what a program tells OpenCV's threads before it is imported."""
+def settings(**others: str) -> list[str]:
+    """Return the settings of OpenCV's threads that a program makes before its import."""
     environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run(
         [sys.executable, '-c', 'import sys; from djet_ros.threads import sleep_while_waiting; '
@@ -47,5 +47,5 @@ def test_matrices_are_multiplied_in_the_calling_thread_unless_the_environment_sa
 def test_opencv_sleeps_while_it_waits_unless_the_environment_says_otherwise() -> None:
     # What that spares is CPU time; a test of that fails where others want the cores as well. Nor
     # does OpenCV tell what it has read, so that no more than this can be asked.
-    assert told() == ['0', '0']
-    assert told(**{VARIABLES[1]: '2000'}) == ['0', '2000']
+    assert settings() == ['0', '0']
+    assert settings(**{VARIABLES[1]: '2000'}) == ['0', '2000']

@@ -246,8 +246,8 @@ def test_another_calibration_begins_a_new_pair(drive):
 def test_an_uncalibrated_camera_is_an_error_until_it_is_calibrated(drive):
     one = tracker(info=False)
     zeros = camera_info(np.zeros((3, 3)), SIZE, p=np.zeros(12))
-    said = by_topic(one.camera_info(zeros))['/diagnostics'].status[0]
-    assert (said.level, said.message) == (2, 'message rejected: uncalibrated')
+    statuses = by_topic(one.camera_info(zeros))['/diagnostics'].status[0]
+    assert (statuses.level, statuses.message) == (2, 'message rejected: uncalibrated')
     assert 'calibrate' in str(one.problem)
     play(one, drive[:2])
     assert one.counts.rejected_infos == {'uncalibrated': 1}
@@ -273,15 +273,15 @@ def test_distorted_raw_images_are_undistorted_and_rectified_ones_are_not(drive):
 
 
 def test_a_residual_distortion_gives_what_the_same_one_of_the_calibration_gives(drive):
-    told = []
+    sent_bytes = []
     for topic, k1, D in ((RAW, 0.0, [0.05, 0, 0, 0, 0]), (RAW, 0.05, []),
                          ('/camera/image_rect', 0.05, [])):
         one = tracker(info=False, topic=topic, **{'odometry.residual_k1': k1})
         one.camera_info(camera_info(K, SIZE, d=np.array(D)))
-        told.append([serialised(message) for out in play(one, drive[:3])
+        sent_bytes.append([serialised(message) for out in play(one, drive[:3])
                      for name, message in out.items() if name != '/diagnostics'])
-    assert len(told[0]) > 6
-    assert told[0] == told[1] == told[2]
+    assert len(sent_bytes[0]) > 6
+    assert sent_bytes[0] == sent_bytes[1] == sent_bytes[2]
 
 
 # The status for a back end
@@ -292,11 +292,11 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
     black = np.zeros_like(drive[0])
     images = [drive[0], drive[1], drive[1], drive[2], black, drive[3], black, black, drive[4],
               drive[5]]
-    said = [frame_status(out['relative_pose_status']) for out in play(one, images)]
+    statuses = [frame_status(out['relative_pose_status']) for out in play(one, images)]
     stamps = [ns(0.1 * i) for i in range(len(images))]
     bad = Status.TOO_FEW_MATCHES
     scales = {True: Scale.METRIC, False: Scale.UNKNOWN}
-    assert said == [FrameStatus(stamps[i], status, None if start is None else stamps[start],
+    assert statuses == [FrameStatus(stamps[i], status, None if start is None else stamps[start],
                                 scales[known], still) for i, status, start, known, still in [
         (0, Status.FIRST_FRAME, None, False, False),
         (1, Status.OK, 0, True, False),
@@ -438,9 +438,9 @@ def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
 
 def mended(one):
     """Return level and summary of the diagnosis, and its problems."""
-    said = one.diagnosis()
-    return said.level, said.summary, {name.removeprefix('to mend: '): text for name, text
-                                      in said.values.items() if name.startswith('to mend: ')}
+    statuses = one.diagnosis()
+    return statuses.level, statuses.summary, {name.removeprefix('to mend: '): text for name, text
+                                      in statuses.values.items() if name.startswith('to mend: ')}
 
 
 def test_a_healthy_drive_has_no_problems(drive):
@@ -474,14 +474,14 @@ def test_few_gray_levels_of_12_bits_are_reported_and_mended_by_the_range(drive, 
             one.image(message)
         return one.last.pose
 
-    one, eight, told = tracker(), tracker(), tracker(**{'odometry.gray_range': '0 4095'})
+    one, eight, twelve = tracker(), tracker(), tracker(**{'odometry.gray_range': '0 4095'})
     sent(one, 0)
     text = mended(one)[2]['few gray levels']
     assert re.match(r'\d+ images of 16 bits in a row became 1?\d gray levels with odometry'
                     r'.gray_range 0 65535; their values lie between \d+ and \d+: set', text)
     play(eight, drive)
-    assert np.array_equal(sent(told, 0), eight.last.pose)
-    assert mended(told)[2] == {}
+    assert np.array_equal(sent(twelve, 0), eight.last.pose)
+    assert mended(twelve)[2] == {}
     # and while it runs
     one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
     sent(one, len(drive))
@@ -569,16 +569,16 @@ def test_one_camera_that_is_renamed_is_not_taken_for_two(drive):
     assert 'images of two cameras' not in mended(one)[2]
 
 
-@pytest.mark.parametrize(('info', 'images', 'said'), [
+@pytest.mark.parametrize(('info', 'images', 'statuses'), [
     ('left', 'right', True), ('left', '/left', False), ('', 'left', False), ('left', '', False)])
-def test_a_camera_info_of_another_frame_is_a_warning(drive, info, images, said):
+def test_a_camera_info_of_another_frame_is_a_warning(drive, info, images, statuses):
     one = tracker(info=False)
     one.camera_info(camera_info(K, SIZE, header=header(0, info)))
     for i, gray in enumerate(drive[:2]):
         one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=images))
     level, _, found = mended(one)
-    assert ('camera_info of another frame' in found) is said
-    if said:
+    assert ('camera_info of another frame' in found) is statuses
+    if statuses:
         assert level == 'WARN'
         assert "of frame 'left', the images are of 'right'" in found[
             'camera_info of another frame']
@@ -667,8 +667,8 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
     play(one, drive[:2])
     black = np.zeros_like(drive[0])
     out = play(one, [black] * 3, start=0.2)
-    said = [o['/diagnostics'].status[0] for o in out[:2]]
-    assert [(s.level, s.message) for s in said] == [
+    statuses = [o['/diagnostics'].status[0] for o in out[:2]]
+    assert [(s.level, s.message) for s in statuses] == [
         (1, 'bad pair: TOO_FEW_MATCHES'), (2, 'lost: TOO_FEW_MATCHES')]
     # the pose is held, with a large covariance, as is the velocity's
     for message in (o['odometry'] for o in out):
@@ -688,9 +688,9 @@ def test_black_images_end_in_lost_and_a_good_pair_ends_that(drive):
 def test_diagnostics_come_on_a_change_of_state_and_once_per_second_of_stamps(drive):
     one = tracker()
     images = [drive[i % 2] for i in range(24)]
-    said = [i for i, out in enumerate(play(one, images)) if '/diagnostics' in out]
+    statuses = [i for i, out in enumerate(play(one, images)) if '/diagnostics' in out]
     # The first frame, the first pair, then every second.
-    assert said == [0, 1, 11, 21]
+    assert statuses == [0, 1, 11, 21]
 
 
 def test_a_path_continues_with_other_parameters_unless_they_name_other_frames(drive):
@@ -794,10 +794,10 @@ def test_faces_add_their_counts_and_values(drive):
     one.count_dropped('queue_full', 3)
     one.node_values['latency (ms)'] = '7.0'
     out = play(one, drive[:1])[0]
-    said = values(out['/diagnostics'])
-    assert said['frames received'] == '4'
-    assert said['frames dropped: queue_full'] == '3'
-    assert said['latency (ms)'] == '7.0'
+    statuses = values(out['/diagnostics'])
+    assert statuses['frames received'] == '4'
+    assert statuses['frames dropped: queue_full'] == '3'
+    assert statuses['latency (ms)'] == '7.0'
 
 
 SMALL = np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8)
@@ -892,22 +892,22 @@ def test_diagnostics_say_what_was_counted(drive):
     counts.dropped.update(equal_stamp=3)
     counts.rejected.update(short_data=1)
     counts.status.update(OK=4, FIRST_FRAME=1)
-    told = diagnose(State.BAD_PAIR, 'DEGENERATE', counts, one.last, 9.987)
-    assert (told.level, told.summary) == ('WARN', 'bad pair: DEGENERATE')
-    assert told.values['frames received'] == '9'
-    assert told.values['frames dropped: equal_stamp'] == '3'
-    assert told.values['frames rejected: short_data'] == '1'
-    assert told.values['status: OK'] == '4'
-    assert told.values['rate (Hz)'] == '9.99'
-    assert told.values['scale'] == 'relative'
-    assert int(told.values['inliers']) <= int(told.values['matches'])
-    assert float(told.values['median residual (px)']) < 2
-    assert 'time of matching (ms)' in told.values
+    diagnosis = diagnose(State.BAD_PAIR, 'DEGENERATE', counts, one.last, 9.987)
+    assert (diagnosis.level, diagnosis.summary) == ('WARN', 'bad pair: DEGENERATE')
+    assert diagnosis.values['frames received'] == '9'
+    assert diagnosis.values['frames dropped: equal_stamp'] == '3'
+    assert diagnosis.values['frames rejected: short_data'] == '1'
+    assert diagnosis.values['status: OK'] == '4'
+    assert diagnosis.values['rate (Hz)'] == '9.99'
+    assert diagnosis.values['scale'] == 'relative'
+    assert int(diagnosis.values['inliers']) <= int(diagnosis.values['matches'])
+    assert float(diagnosis.values['median residual (px)']) < 2
+    assert 'time of matching (ms)' in diagnosis.values
 
 
 def test_diagnostics_exist_before_any_message():
-    told = Tracker(Config(), message_type).diagnosis()
-    assert (told.level, told.summary) == ('WARN', 'waiting for camera_info')
+    diagnosis = Tracker(Config(), message_type).diagnosis()
+    assert (diagnosis.level, diagnosis.summary) == ('WARN', 'waiting for camera_info')
 
 
 def test_the_rate_comes_from_stamps():

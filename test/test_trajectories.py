@@ -96,16 +96,16 @@ def test_an_existing_file_is_kept(tmp_path):
     assert (tmp_path / 'a.tum').read_text() == 'mine'
 
 
-@pytest.mark.parametrize(('line', 'said'), [
+@pytest.mark.parametrize(('line', 'message'), [
     ('1.0 0 0 0 0 0 0', 'has 7 numbers; it must have 8'),
     ('x 0 0 0 0 0 0 1', "'x' is not a number"),
     ('-3e9 0 0 0 0 0 0 1', "'-3e9' is not a stamp"),
     ('1.0 0 0 inf 0 0 0 1', "'inf' is not a finite number"),
     ('1.0 0 0 0 0 0 0 0', 'quaternion of pose 0 has length 0'),
 ])
-def test_a_wrong_tum_line_is_named(tmp_path, line, said):
+def test_a_wrong_tum_line_is_named(tmp_path, line, message):
     (tmp_path / 'a.tum').write_text(f'# stamp pose\n{line}\n')
-    with pytest.raises(DjetError, match=said):
+    with pytest.raises(DjetError, match=message):
         read_tum(tmp_path / 'a.tum')
 
 

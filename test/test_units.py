@@ -122,14 +122,14 @@ def test_scale_ratio_without_points_in_all_three_pairs():
     K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     points = rng.uniform((-6, -3, 8), (6, 3, 30), (200, 3))
     turn, still = rotation_exp(np.array([0.0, -0.05, 0.01])), np.eye(3)
-    ways = np.array([[0.1, 0, 1.0], [0.4, 0.1, -0.9], [-0.1, 0, 1.2]])
-    lengths = np.linalg.norm(ways, axis=1)
-    loop, there = pair(points, turn, ways[1], K)
+    translations = np.array([[0.1, 0, 1.0], [0.4, 0.1, -0.9], [-0.1, 0, 1.2]])
+    lengths = np.linalg.norm(translations, axis=1)
+    loop, there = pair(points, turn, translations[1], K)
     near, far = 0.5, 0.6
     errors = []
     for noise in (0.0, *[0.2] * 40):
-        step, _ = pair(points[:100], still, ways[0], K)
-        other, _ = pair(there[100:], still, ways[2], K)
+        step, _ = pair(points[:100], still, translations[0], K)
+        other, _ = pair(there[100:], still, translations[2], K)
         noisy = [replace(one, y_opt=one.y + noise * rng.normal(size=one.y.shape))
                  for one in (step, loop, other)]
         ratio, sigma = log_scale_ratio(noisy[0], lengths[0] / near, noisy[1], lengths[1] / near,
@@ -151,7 +151,7 @@ def test_scale_ratio_from_depths():
                        np.array([0.4, 0.1, -0.3]), K)
     other, _ = pair(there, rotation_exp(np.array([0.01, 0, 0])), np.array([-0.1, 0, 1.2]), K)
     near, far = 0.5, 0.6  # metres in a unit
-    lengths = [np.linalg.norm(way) for way in ([0.1, 0, 1.0], [0.4, 0.1, -0.3], [-0.1, 0, 1.2])]
+    lengths = np.linalg.norm([[0.1, 0, 1.0], [0.4, 0.1, -0.3], [-0.1, 0, 1.2]], axis=1)
     ratio, sigma = log_scale_ratio(step, lengths[0] / near, loop, lengths[1] / near, other,
                                    lengths[2] / far, K)
     assert ratio == pytest.approx(np.log(far / near), abs=1e-6)

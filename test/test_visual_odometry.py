@@ -301,12 +301,12 @@ def test_a_step_back_in_time_resets_everything(cards):
     assert vo.process(cards.frame(1.1, STEP)).status is Status.OK
 
 
-def measure(scale, stamp_ns, way):
-    """Give a scale source a measurement: the position along x, or its speed."""
+def measure(scale, stamp_ns, metres):
+    """Return a scale source a measurement: the position along x, or its speed."""
     if isinstance(scale, SpeedScale):
-        scale.add_speed(stamp_ns, 4 * way)
+        scale.add_speed(stamp_ns, 4 * metres)
     else:
-        scale.guess.add(stamp_ns, pose(x=way))
+        scale.guess.add(stamp_ns, pose(x=metres))
 
 
 def by_guess():

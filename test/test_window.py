@@ -77,7 +77,7 @@ class Street:
 
 
 class NumbersWindow(Window):
-    """A window that is told where points are, instead of looking at images."""
+    """A window that is given where points are, instead of measuring them in images."""
 
     def __init__(self, street: Street, unit: float = 1.0) -> None:
         super().__init__(EstimatorConfig())
@@ -86,12 +86,12 @@ class NumbersWindow(Window):
             strengths=lambda seen, points: np.ones(len(points)))
         self._street, self._which = street, dict[tuple[float, ...], int]()
         self._unit = unit
-        self._frame, self.told, self.taken, self.thrown = 0, list[float](), 0, 0
+        self._frame, self.scales, self.taken, self.thrown = 0, list[float](), 0, 0
         self.pairs = list[Numbers]()
         self.start(blank())
 
     def go(self) -> float:
-        """Go on by a frame, and give the length that the window tells of it."""
+        """Advance by a frame, and return the length that the window estimates of it."""
         which, pair = self._street.pair(self._frame)
         self._which.update(zip(map(tuple, pair.x.tolist()), which.tolist()))
         self._frame += 1
@@ -124,7 +124,7 @@ class NumbersWindow(Window):
     def _refine(self) -> Numbers:
         before = int(self._landmarks.seen[:, -1].sum())
         H = super()._refine()
-        self.told.append(self._scale)
+        self.scales.append(self._scale)
         self.taken += before
         self.thrown += before - int(self._landmarks.seen[:, -1].sum())
         return H
@@ -146,7 +146,7 @@ def test_the_window_estimates_its_noise_and_keeps_inliers(
     for _ in range(60):
         window.go()
     # Those of the newest frame too, before poses are refined.
-    assert np.median(window.told) == pytest.approx(noise, rel=0.1)
+    assert np.median(window.scales) == pytest.approx(noise, rel=0.1)
     # Beyond 4 standard deviations in two numbers lie 3 of 10 000, and some leave with the sign of
     # their depth.
     assert window.thrown < 0.015 * window.taken
@@ -193,8 +193,8 @@ def test_the_rotation_drifts_less_than_half_of_that_by_pairs(seed: int) -> None:
         here = here @ window.added.onward
         window.record_published(window.added.onward)
         off.append([np.linalg.norm(rotation_log(R)) for R in (chained, here[:3, :3])])
-    by_pairs, told = np.sqrt(np.square(off).mean(0))
-    assert told < 0.5 * by_pairs
+    by_pairs, scales = np.sqrt(np.square(off).mean(0))
+    assert scales < 0.5 * by_pairs
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -210,15 +210,15 @@ def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) ->
 
 def test_unpublished_motion_is_made_up_for_without_a_jump() -> None:
     window, here = NumbersWindow(Street(0, 40, 0.02)), np.eye(4)
-    ways = []
+    steps = []
     for number in range(40):
         window.go()
         onward = np.eye(4) if number == 10 else window.added.onward
         window.record_published(onward)
         here = here @ onward
-        ways.append(onward[2, 3])
-    assert ways[9] == pytest.approx(1, abs=0.02) and ways[10] == 0
-    assert ways[11] == pytest.approx(1 + WINDOW_TUNING.correction_share, abs=0.02)
+        steps.append(onward[2, 3])
+    assert steps[9] == pytest.approx(1, abs=0.02) and steps[10] == 0
+    assert steps[11] == pytest.approx(1 + WINDOW_TUNING.correction_share, abs=0.02)
     assert here[2, 3] == pytest.approx(40, abs=0.2)
 
 
@@ -239,12 +239,12 @@ def test_a_window_continues_when_images_are_corrected(k1: float) -> None:
     window, lengths = NumbersWindow(Street(0, 120, 0.1, curve=0.02, k1=k1)), []
     while not window.lens.needs_update:
         lengths.append(window.go())
-    noise = np.median(window.told)
+    noise = np.median(window.scales)
     taken, thrown = window.taken, window.thrown
     window.correct_images(blank())
     lengths += [window.go() for _ in range(120 - len(lengths))]
     # Earlier observations agree with the new ones.
-    assert np.median(window.told[-10:]) == pytest.approx(noise, rel=0.1)
+    assert np.median(window.scales[-10:]) == pytest.approx(noise, rel=0.1)
     assert window.thrown - thrown < 0.015 * (window.taken - taken)
     assert window.lens.k1 == pytest.approx(k1, abs=2 * window.lens.sigma)
     assert abs(window.lens.residual_k1) < abs(k1) / 4

@@ -14,13 +14,14 @@ PATHS = [path for path in sys.path if not (Path(path) / 'rclpy').exists()]
 
 
 @pytest.mark.parametrize('node', ['vo_node', 'pose_graph_node'])
-@pytest.mark.parametrize('words', [[], ['--help'], ['--ros-args', '-r', 'image:=/camera/image']])
+@pytest.mark.parametrize('arguments', [
+    [], ['--help'], ['--ros-args', '-r', 'image:=/camera/image']])
 def test_the_nodes_say_in_one_line_what_is_missing(
-        tmp_path: Path, words: list[str], node: str) -> None:
+        tmp_path: Path, arguments: list[str], node: str) -> None:
     program = (f'import sys; sys.path[:] = {json.dumps(PATHS)}; '
                f'from djet_ros.cli.nodes import {node}; sys.exit({node}())')
-    done = subprocess.run([sys.executable, '-c', program, *words], capture_output=True, text=True,
-                          check=False, cwd=tmp_path)
+    done = subprocess.run([sys.executable, '-c', program, *arguments], capture_output=True,
+                          text=True, check=False, cwd=tmp_path)
     assert done.returncode == 2
     line, = done.stderr.splitlines()
     assert line.startswith(f'{node}: error: rclpy is missing: install ROS 2')

@@ -32,7 +32,7 @@ _SHOWN = ('rate (Hz)', 'latency, median (ms)', 'latency, 95 % (ms)', 'frames rec
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
-# Seconds without a message before the user is told which topic is silent.
+# Seconds without a message after which the silent topic is reported.
 _SILENCE_WARNING_S = 2.0
 
 _UNITS = {'metric': 'm', 'relative': 'lengths of the first step'}

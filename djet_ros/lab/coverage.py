@@ -98,7 +98,7 @@ class CoverageRow:
     told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these;
     untold: tracked without a direction, see ``Coverage.missed_direction``; given_up: without a
     pose, needlessly: of these, with a correct best estimate; median: of the NEES, over the median
-    of its distribution; inside: by LEVELS, the share of told pairs inside the ellipsoid, with its
+    of its distribution; inside: by LEVELS, the share of these pairs inside the ellipsoid, with its
     95 % confidence interval (Clopper and Pearson, Biometrika 1934). Each failed pair is counted
     in one of failed, untold and given_up.
     """

@@ -108,7 +108,7 @@ class SequenceRecording(Recording):
             self._poses = truth if stamps is None else None
         self.ground_truth_file = poses
         self._imu = sequence.imu if imu else None
-        # By ROS convention the topic's name tells whether images are rectified.
+        # By ROS convention the topic's name shows whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
         known = self._poses is not None or self._stamped is not None
