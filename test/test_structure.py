@@ -83,16 +83,16 @@ def test_a_speed_of_zero_is_not_believed_while_images_show_motion(cards):
     for ns in range(0, 2 * 10**9, 10**8):
         speeds.add_speed(ns, 0.0)
     drive = Drive(cards, speeds, scale='speed')
-    slipping = drive.go(steps(WAYS[:4]))
+    slipping = drive.go(steps(LENGTHS[:4]))
     assert all(result.scale_kind is Scale.RELATIVE and not result.measured for result in slipping)
     assert 'standstill while the images show motion' in speeds.why_unknown(drive.ns)
     # Metres are known as soon as the wheels turn.
     speeds.reset()
     for ns in range(drive.ns, drive.ns + 10**9, 10**8):
-        speeds.add_speed(ns, WAYS[4] * 10)
-    driving = drive.go(steps(WAYS[:5])[4:])
+        speeds.add_speed(ns, LENGTHS[4] * 10)
+    driving = drive.go(steps(LENGTHS[:5])[4:])
     assert driving[0].scale_kind is Scale.METRIC and driving[0].measured
-    assert lengths(driving)[0] == pytest.approx(WAYS[4], rel=0.1)
+    assert lengths(driving)[0] == pytest.approx(LENGTHS[4], rel=0.1)
 
 
 def test_a_shaking_rotation_away_from_landmarks_keeps_the_scale(cards):
