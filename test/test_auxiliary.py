@@ -328,7 +328,7 @@ def test_queued_images_still_have_their_samples(live: Any, drive: Drive) -> None
     session.configure(one.config)  # let in when the last image is done with
     assert one.counts.processed == 200
     diagnostics = [status.message for topic, message in graph.published if topic == '/diagnostics'
-            for status in message.status]
+                   for status in message.status]
     assert diagnostics
     assert not any('no mask in time' in line for line in diagnostics)
 

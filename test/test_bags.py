@@ -358,7 +358,7 @@ def test_results_of_a_killed_process_are_readable(tmp_path):
 
 def test_the_command_converts(small_kitti, tmp_path, capsys):
     arguments = ['kitti-to-bag', str(small_kitti(frames=6)), str(tmp_path / 'out'), '--storage',
-             'sqlite3', '--start', '1', '--end', '4']
+                 'sqlite3', '--start', '1', '--end', '4']
     assert main(arguments) == 0
     assert capsys.readouterr().out == (
         f'{tmp_path / "out"}: 3 frames of 64x48, 0.2 s, with ground truth\n')

@@ -218,7 +218,7 @@ def test_node_waits_for_a_late_camera_info(live, peer, drive):
     for i in range(3):
         images.publish(image(drive[i], stamp_ns=stamp(i)))
     peer.wait('a complaint', lambda: peer.diagnostics(message='waiting for camera_info',
-                                               frames_received='3'))
+                                                      frames_received='3'))
     infos = peer.advertise(INFO, INFO_TYPE)
     infos.publish(camera_info(K, SIZE))
     peer.spin(0.2)

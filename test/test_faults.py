@@ -204,8 +204,8 @@ COMMANDS = {
 def test_a_second_run_changes_nothing_and_says_how_to(tmp_path, capsys, name):
     sequence = write_small_kitti(tmp_path / 'data', frames=2, size=(160, 120))
     arguments = [word.replace('SEQUENCE', str(sequence)).replace('OUT', str(tmp_path / 'out'))
-             .replace('IMAGE', str(sequence / 'image_0' / '000000.png'))
-             for word in COMMANDS[name]]
+                 .replace('IMAGE', str(sequence / 'image_0' / '000000.png'))
+                 for word in COMMANDS[name]]
     assert main(arguments) == 0
     out = next(tmp_path.glob('out*'))
     before = contents(out)

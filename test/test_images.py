@@ -225,14 +225,15 @@ def test_a_compressed_mosaic_gives_the_gray_of_the_raw_one(pattern, bits):
     data = encoded('.png', pixels.astype(f'u{bits // 8}'))
     expected = gray_image(image(pixels, encoding))
     # formats of compressed_image_transport for PNG, and for JPEG of mosaics
-    for format in (f'{encoding}; png compressed ', f'{encoding}; jpeg compressed {encoding}'):
-        assert np.array_equal(gray_image(compressed(data, format)), expected)
+    for declared in (f'{encoding}; png compressed ', f'{encoding}; jpeg compressed {encoding}'):
+        assert np.array_equal(gray_image(compressed(data, declared)), expected)
 
 
 def test_a_mosaic_converted_before_compression_is_gray():
-    for format in ('bayer_rggb8; jpeg compressed mono8', 'bayer_rggb8; jpeg compressed bgr8',
-                 'bayer_rggb8; jpeg', 'mono8; png compressed ', 'bayer_of_none; png compressed '):
-        assert np.array_equal(gray_image(compressed(encoded('.png'), format)), GRAY)
+    for declared in ('bayer_rggb8; jpeg compressed mono8', 'bayer_rggb8; jpeg compressed bgr8',
+                     'bayer_rggb8; jpeg', 'mono8; png compressed ',
+                     'bayer_of_none; png compressed '):
+        assert np.array_equal(gray_image(compressed(encoded('.png'), declared)), GRAY)
 
 
 def test_trailing_zeros_after_a_jpeg_are_usual():

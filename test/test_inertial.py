@@ -222,7 +222,7 @@ def test_rest_is_distinguished_from_the_slowest_rotation() -> None:
         gyro.bias = feel(np.tile(np.eye(4), (31, 1, 1)), 0.1, Mems(), 4).rate_biases[0].copy()
         gyro.bias_covariance = np.eye(3) * 1e-4**2
     at_rest = [[gyro.at_rest(i * PERIOD, (i + 1) * PERIOD) for i in range(30)]
-            for gyro in (at_rest, turning)]
+               for gyro in (at_rest, turning)]
     assert all(at_rest[0])
     assert not any(at_rest[1])
 

@@ -184,7 +184,7 @@ rclpy.spin(node)
 def test_vo_launch_starts_the_node_on_the_topics_given(
         environment: dict[str, str], tmp_path: Path) -> None:
     output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'image:=/left/image_raw',
-                    until='queue policy')
+                      until='queue policy')
     assert 'images from /left/image_raw, camera_info from /left/camera_info' in output
     assert 'queue policy latest' in output
     assert re.search(r'vo_node-1\]: process has finished cleanly', output)
@@ -196,8 +196,8 @@ def test_vo_launch_names_and_respawns_the_node(
     broken = tmp_path / 'lib' / 'djet_ros' / 'vo_node'
     broken.write_text('#!/bin/sh\necho started with "$@"\nexit 1\n')
     output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'namespace:=left',
-                    'name:=eye', 'respawn:=true', 'log_level:=warn',
-                    until='process started with pid', times=2)
+                      'name:=eye', 'respawn:=true', 'log_level:=warn',
+                      until='process started with pid', times=2)
     assert '__node:=eye' in output
     assert '__ns:=/left' in output
     assert '--log-level warn' in output
@@ -207,7 +207,7 @@ def test_vo_launch_names_and_respawns_the_node(
 def test_missing_parameter_file_ends_the_launch(
         environment: dict[str, str], tmp_path: Path) -> None:
     output = launched(environment, tmp_path / 'out', 'vo.launch.py', 'params_file:=/no/such.yaml',
-                    until='params_file')
+                      until='params_file')
     assert 'params_file:=/no/such.yaml does not exist or is not a file' in output
     assert 'process started' not in output
 
@@ -283,8 +283,8 @@ def test_two_cameras_have_their_own_nodes_and_topics(
         environment: dict[str, str], tmp_path: Path) -> None:
     pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     output = launched(environment, tmp_path / 'out', 'two_cameras.launch.xml',
-                    'base_frame:=base_link',
-                    until='queue policy', times=2)
+                      'base_frame:=base_link',
+                      until='queue policy', times=2)
     for side in ('left', 'right'):
         assert f'[{side}.vo_node]: images from /{side}/camera/image_raw, camera_info from ' \
                f'/{side}/camera/camera_info' in output
@@ -308,7 +308,7 @@ def test_replay_launch_ends_if_the_player_fails(
         place.mkdir()
         begun = monotonic()
         output = launched(with_player(environment, place, f'exit {code}'), place / 'out',
-                        'replay.launch.py', 'bag:=/no/bag', until=until)
+                          'replay.launch.py', 'bag:=/no/bag', until=until)
         assert monotonic() - begun < 20
         assert ('the bag player failed' in output) is bool(code)
     assert re.search(r'vo_node-\d\]: process has finished cleanly', output)
@@ -318,7 +318,7 @@ def test_replay_launch_ends_if_the_player_fails(
 def test_replay_launch_plays_a_bag_into_a_node_that_drops_nothing(
         environment: dict[str, str], tmp_path: Path) -> None:
     output = launched(with_player(environment, tmp_path, 'exec sleep 60'), tmp_path / 'out',
-                    'replay.launch.py', 'bag:=/no/bag', 'loop:=true', until='queue policy')
+                      'replay.launch.py', 'bag:=/no/bag', 'loop:=true', until='queue policy')
     assert 'images from /camera/image_rect, camera_info from /camera/camera_info' in output
     assert 'queue policy every' in output
     assert re.search(r'bag_player-\d\]: process started', output)
@@ -330,7 +330,7 @@ def test_slam_launch_feeds_the_pose_graph_with_the_odometry(
         environment: dict[str, str], tmp_path: Path) -> None:
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     output = launched(environment, tmp_path / 'out', 'slam.launch.py', 'image:=/left/image_raw',
-                    until='odometry from')
+                      until='odometry from')
     assert re.search(r'odometry from /vo_node/odometry, images from /left/image_raw, '
                      'camera_info from /left/camera_info', output)
     assert 'unknown parameter' not in output

@@ -499,7 +499,7 @@ def test_edges_of_a_removed_keyframe_are_transferred_to_its_successor(live, sour
     poses = np.array([pose(), pose(x=0.3, z=2.0, yaw=0.4), pose(x=-1.0, z=3.0, yaw=-0.7)])
     spread = rng.normal(size=(6, 6)) * 0.1
     by_odometry = Edge(source, target, np.linalg.inv(poses[source]) @ poses[target],
-                spread @ spread.T + np.eye(6) * 1e-3, 'loop')
+                       spread @ spread.T + np.eye(6) * 1e-3, 'loop')
     ours = transferred(by_odometry, 0, np.linalg.inv(poses[0]) @ poses[1])
     assert {ours.source, ours.target} == {1, 2}
     for _ in range(5):

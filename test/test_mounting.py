@@ -85,7 +85,7 @@ def test_the_last_transform_counts_and_invalid_ones_are_ignored():
     nonsense = MAKE.frame(0, 'base', 'cam', np.eye(4))
     nonsense.transforms[0].transform.rotation.w = 0.0
     frames = frames_of(('base', 'cam', np.eye(4)), ('base', 'cam', AHEAD), ('a', 'b', np.eye(4)),
-                  ('b', 'a', np.eye(4)))
+                       ('b', 'a', np.eye(4)))
     frames.add(nonsense)
     assert np.array_equal(frames.transform('base', 'cam'), AHEAD)
     assert frames.transform('a', 'cam') is None

@@ -125,7 +125,7 @@ def paired(index: int) -> Callable[[dict[str, list[Any]]], bool]:
 def reported(text: str) -> Callable[[dict[str, list[Any]]], Any]:
     """Return the condition that diagnostics contain a text; its value is their values."""
     return lambda received: next((values(m) for m in reversed(received['/diagnostics'])
-                               if m.status[0].message == text), None)
+                                  if m.status[0].message == text), None)
 
 
 def values(diagnostics: Any) -> dict[str, str]:

@@ -240,7 +240,7 @@ def test_surfaces_without_a_minimum_are_those_with_an_eigenvalue_that_is_not_pos
     A = A + A.transpose(0, 2, 1)
     A[0], A[1], A[2] = np.zeros((2, 2)), np.diag([1.0, 0]), np.eye(2)
     found = indefinite(Paraboloids(np.zeros((500, 2)), A, np.zeros((500, 2)), np.zeros(500),
-                                  np.ones(500, bool)))
+                                   np.ones(500, bool)))
     assert np.array_equal(found, np.linalg.eigvalsh(A)[:, 0] <= 0)
     assert found[:3].tolist() == [True, True, False]
 

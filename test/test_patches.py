@@ -123,7 +123,7 @@ def test_a_patch_without_gradient_is_undetermined(points: np.ndarray) -> None:
     there = image(np.eye(2), np.zeros(2))
     eye = as_seen(np.eye(2), len(points))
     determined, undetermined = (align_patches(one, one, points, points, eye).covariances[:, 0, 0]
-                    for one in (there, flat))
+                                for one in (there, flat))
     assert undetermined.min() > 1e3 * determined.max()
 
 

@@ -284,7 +284,7 @@ def test_invalid_edge_gives_one_line_and_no_output(results, tmp_path):
     folder, out = spoilt(results, tmp_path / 'spoilt', asymmetric), tmp_path / 'out'
     sequence = write_small_kitti(tmp_path / 'dataset')
     for arguments in (('export', folder, '--output', out),
-                  ('slam', folder, '--source', sequence, '--output', tmp_path / 'slam')):
+                      ('slam', folder, '--source', sequence, '--output', tmp_path / 'slam')):
         error_text = djet(*arguments, expect=2).stderr
         assert 'odometry edge 1 -> 2' in error_text
         assert len(error_text.strip().splitlines()) == 1

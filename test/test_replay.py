@@ -33,8 +33,8 @@ from djet_ros.recordings.trajectories import read_tum, TumWriter
 from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
-from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.lookahead import with_next_image
+from djet_ros.replay.pair_errors import pair_errors, statistics
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE
@@ -276,7 +276,7 @@ def test_drift_is_given_for_paths_over_100_metres(replayed, folder, tmp_path):
         done = djet('replay', folder, '--poses', tmp_path / 'far.txt', '--scale', scale,
                     '--output', tmp_path / scale)
         drifts[scale], places[scale] = (summary(tmp_path / scale)[what]
-                                      for what in ('drift', 'positions'))
+                                        for what in ('drift', 'positions'))
         _, estimate = read_tum(tmp_path / scale / 'trajectory_tum.txt')
         expected = drift(truth, estimate)
         assert drifts[scale]['rotation_deg_per_100m'] == pytest.approx(
@@ -485,7 +485,7 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replaye
     before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
     source, *call = mistake
     printed = djet('replay', bag if source == 'bag' else tmp_path / source, *call, '--output',
-                results, '--overwrite', expect=2).stderr
+                   results, '--overwrite', expect=2).stderr
     assert printed.count('\n') == 1
     assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
 
@@ -688,7 +688,7 @@ def test_bad_image_is_named_and_the_rest_is_tracked(
         damage, reason, frames, tmp_path):
     results = tmp_path / 'results'
     printed = djet('replay', record(tmp_path / 'bag', drive(damage)), '--output', results,
-                expect=2).stderr
+                   expect=2).stderr
     assert len(printed.splitlines()) == 1
     assert f'{FRAMES - frames} of {FRAMES} images' in printed
     found = summary(results)
@@ -705,7 +705,7 @@ def test_bad_first_image_is_named_and_does_not_change_the_other_poses(bad, tmp_p
         return image(np.zeros(SIZE[::-1], np.uint8), **bad) if i == 0 else message
 
     printed = djet('replay', record(tmp_path / 'bad', drive(damage)), '--output', tmp_path / 'r',
-                expect=2).stderr
+                   expect=2).stderr
     assert printed.count('\n') == 1
     assert f'1 of {FRAMES} images could not be used; image 0: ' in printed
     djet('replay', record(tmp_path / 'good', drive(lambda i, message: message if i else None)),
@@ -760,7 +760,7 @@ def test_change_of_image_size_is_reported(tmp_path):
         elif i >= 6:
             message.height = 200
     printed = djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
-                expect=2).stderr
+                   expect=2).stderr
     assert 'changes once' in printed
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
 
@@ -793,7 +793,7 @@ def test_stamps_that_go_back_are_reported_with_the_restart(tmp_path):
     path = record(tmp_path / 'bag', shifted(range(3), 10))
     printed = djet('replay', path, '--output', tmp_path / 'r', expect=2).stderr
     assert printed == (f'djet: error: {path}: the stamps go back once; the poses restart at the '
-                    'origin at stamp 1.300000000\n')
+                       'origin at stamp 1.300000000\n')
     assert summary(tmp_path / 'r')['complete'] is True
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')
     assert np.array_equal(poses[3], np.eye(4))
@@ -897,7 +897,7 @@ def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_pat
         for i in range(FRAMES):
             truth.write(round((first + i * apart) * SECOND), np.linalg.matrix_power(STEP, i))
     printed = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
-                tmp_path / 'r').stderr
+                   tmp_path / 'r').stderr
     assert printed == f'djet: warning: {why.format(poses)}\n'
     assert summary(tmp_path / 'r')['compared_pairs'] == 0
     assert summary(tmp_path / 'r')['drift'] is None
@@ -938,7 +938,7 @@ def with_speeds(late=0):
 
 def test_a_speed_topic_gives_metres(tmp_path):
     printed = djet('replay', record(tmp_path / 'bag', with_speeds()), '--output', tmp_path / 'r',
-                '--scale', 'speed')
+                   '--scale', 'speed')
     assert re.search(r'scale\W+metric', printed.stdout)
     assert printed.stderr == ''
     _, poses = read_tum(tmp_path / 'r' / 'trajectory_tum.txt')

@@ -478,8 +478,8 @@ def test_loop_lengths_are_consistent_with_their_sigma(points):
     true, errors = np.linalg.norm(motion[:3, 3]), []
     for seed in range(100):
         length = transferred_length(seen(points, step, 0.3, 2 * seed),
-                                  seen(points, motion, 0.3, 2 * seed + 1),
-                                  Length(1.0, 1e-6, True), K)
+                                    seen(points, motion, 0.3, 2 * seed + 1),
+                                    Length(1.0, 1e-6, True), K)
         errors.append((length.value - true) / length.sigma)
     # Points here err independently, which those of images do not; and near ones less than far.
     assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
@@ -722,11 +722,11 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
     before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
     results = tmp_path / 'slam' / 'replay'
     for mistake, report in (((tmp_path / 'absent',), 'does not exist'),
-                          ((drive, '--mask-file', tmp_path / 'absent.png'), 'absent.png'),
-                          ((drive, '--loop-gap', '-1'), 'loop_gap is -1'),
-                          ((results, '--source', tmp_path / 'absent'), 'absent'),
-                          ((results, '--mask-topic', '/mask'), 'does not use it'),
-                          ((results, '--imu-topic', '/imu'), 'does not use it')):
+                            ((drive, '--mask-file', tmp_path / 'absent.png'), 'absent.png'),
+                            ((drive, '--loop-gap', '-1'), 'loop_gap is -1'),
+                            ((results, '--source', tmp_path / 'absent'), 'absent'),
+                            ((results, '--mask-topic', '/mask'), 'does not use it'),
+                            ((results, '--imu-topic', '/imu'), 'does not use it')):
         refused = djet('slam', *mistake, '--output', tmp_path / 'slam', '--overwrite', expect=2)
         assert report in refused.stderr
         assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')

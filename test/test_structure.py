@@ -433,7 +433,7 @@ def test_pauses_with_hardly_any_motion_do_not_lose_the_scale(seed: int) -> None:
     scene = make_scene('handheld', seed, (480, 360))
     poses, odometry = scene.trajectory(80), VisualOdometry(EstimatorConfig(max_features=1000))
     found = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
-            for i, pose in enumerate(poses)][1:]
+             for i, pose in enumerate(poses)][1:]
     lengths, true_lengths = np.linalg.norm([found, np.diff(poses[:, :3, 3], axis=0)], axis=2)
     moved = (lengths > 0) & (true_lengths > 0.005)
     assert np.std(np.log(lengths[moved] / true_lengths[moved])) < np.log(2)
@@ -445,7 +445,7 @@ def test_fast_rotations_keep_the_scale(seed: int) -> None:
     scene, odometry = make_scene('whip', seed, (480, 360)), VisualOdometry()
     poses = scene.trajectory(36)
     found = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 10**8)).motion[:3, 3]
-            for i, pose in enumerate(poses)][1:]
+             for i, pose in enumerate(poses)][1:]
     lengths, true_lengths = np.linalg.norm([found, np.diff(poses[:, :3, 3], axis=0)], axis=2)
     ratios = lengths / true_lengths
     assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.1)

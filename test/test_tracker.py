@@ -279,7 +279,7 @@ def test_a_residual_distortion_gives_what_the_same_one_of_the_calibration_gives(
         one = tracker(info=False, topic=topic, **{'odometry.residual_k1': k1})
         one.camera_info(camera_info(K, SIZE, d=np.array(D)))
         sent_bytes.append([serialised(message) for out in play(one, drive[:3])
-                     for name, message in out.items() if name != '/diagnostics'])
+                           for name, message in out.items() if name != '/diagnostics'])
     assert len(sent_bytes[0]) > 6
     assert sent_bytes[0] == sent_bytes[1] == sent_bytes[2]
 
@@ -297,7 +297,7 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
     bad = Status.TOO_FEW_MATCHES
     scales = {True: Scale.METRIC, False: Scale.UNKNOWN}
     assert statuses == [FrameStatus(stamps[i], status, None if start is None else stamps[start],
-                                scales[known], still) for i, status, start, known, still in [
+                                    scales[known], still) for i, status, start, known, still in [
         (0, Status.FIRST_FRAME, None, False, False),
         (1, Status.OK, 0, True, False),
         (2, Status.NO_PARALLAX, 1, True, True),
@@ -438,9 +438,10 @@ def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
 
 def mended(one):
     """Return level and summary of the diagnosis, and its problems."""
-    statuses = one.diagnosis()
-    return statuses.level, statuses.summary, {name.removeprefix('to mend: '): text for name, text
-                                      in statuses.values.items() if name.startswith('to mend: ')}
+    status = one.diagnosis()
+    problems = {name.removeprefix('to mend: '): text for name, text in status.values.items()
+                if name.startswith('to mend: ')}
+    return status.level, status.summary, problems
 
 
 def test_a_healthy_drive_has_no_problems(drive):

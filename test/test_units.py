@@ -6,8 +6,8 @@ from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.frame import Frame
-from djet_ros.posegraph.shared_points import log_scale_ratio
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
+from djet_ros.posegraph.shared_points import log_scale_ratio
 from djet_ros.posegraph.steps import Step
 from djet_ros.posegraph.units import log_units, rescaled_edge, to_common_unit
 import numpy as np

@@ -105,7 +105,7 @@ def opened_replay(args: argparse.Namespace, config: Config, recording: Path, fol
     check_topics(args, wanted)
     with open_recording(recording, args.image_topic, args.info_topic, args.poses,
                         auxiliary={what: getattr(args, f'{what}_topic', None)
-                                for what in wanted}, damaged=True) as source:
+                                   for what in wanted}, damaged=True) as source:
         replay = Replay(source, config, str(recording))
         with ResultsFolder(folder, config, args.overwrite) as results, \
                 progress_bar('replay', len(source)) as advance:

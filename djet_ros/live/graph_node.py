@@ -8,7 +8,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.topics import graph_input_type, GRAPH_INPUTS, graph_outputs, AUXILIARY_TYPES
+from djet_ros.live.topics import AUXILIARY_TYPES, graph_input_type, GRAPH_INPUTS, graph_outputs
 from djet_ros.posegraph.live_slam import LiveSlam
 from djet_ros.recordings.mask_files import static_mask
 

@@ -8,7 +8,7 @@ from djet_ros.config.sections import Config
 from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.middleware import Middleware, Profile
 from djet_ros.live.session import Session
-from djet_ros.live.topics import odometry_outputs, AUXILIARY_TYPES, SPEED_TYPES
+from djet_ros.live.topics import AUXILIARY_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
 from djet_ros.odometry.static_frames import TOPIC as TF_STATIC, TYPE as TF_TYPE
 from djet_ros.odometry.tracker import Tracker

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 from djet_ros.config.flat import flat
 from djet_ros.config.sections import Config
+from djet_ros.live.auxiliary_queue import AuxiliaryQueue
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.rate_limit import RateLimit
 from djet_ros.live.reporting import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
-from djet_ros.live.auxiliary_queue import AuxiliaryQueue
 from djet_ros.odometry.health import Complaint, REDUCE_LOAD
 from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.odometry.state import LEVELS, State

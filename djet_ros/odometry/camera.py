@@ -153,7 +153,7 @@ class Camera:
         model, D = self.distortion
         points = np.column_stack([places, np.ones(len(places))])[:, None]
         project, first = ((cv2.fisheye.projectPoints, 11) if model == 'equidistant'
-                           else (cv2.projectPoints, 3))
+                          else (cv2.projectPoints, 3))
         pixels, slopes = project(points, np.zeros(3), np.zeros(3), self.raw_K,
                                  np.append(k1, D[1:]))
         # At a depth of one the Jacobian by the camera's translation is that by the point.

@@ -114,7 +114,7 @@ class SequenceRecording(Recording):
         known = self._poses is not None or self._stamped is not None
         self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
         self.auxiliary = {} if self._imu is None else {'imu': IMU_TOPIC,
-                                                    'frames': STATIC_FRAMES_TOPIC}
+                                                       'frames': STATIC_FRAMES_TOPIC}
 
     def __len__(self) -> int:
         """Count the images."""
