@@ -30,14 +30,14 @@ def scene(rng, frames=4, landmarks=40, k1=0.05):
     found = Landmarks.at(rng.uniform((100, 80), (540, 400), (landmarks, 2)),
                          1 / rng.uniform(4, 20, landmarks), 0, frames)
     found.anchors[landmarks // 2:] = 1
-    found.points = undistort(K, found.found, k1)
+    found.points = undistort(K, found.anchor_pixels, k1)
     for frame in range(frames):
         found.minima[:, frame] = projected(K, points_in_frame(K, poses, found, frame), k1)
         later = found.anchors < frame
         found.seen[later, frame] = True
         A = rng.normal(size=(landmarks, 2, 2))
         found.roots[:, frame] = A + 2 * np.eye(2)
-    found.held[:] = rng.normal(size=(landmarks, 2, 2)) + 2 * np.eye(2)
+    found.anchor_roots[:] = rng.normal(size=(landmarks, 2, 2)) + 2 * np.eye(2)
     return poses, found
 
 
@@ -62,7 +62,7 @@ def test_exact_observations_leave_no_residual():
     poses, landmarks = scene(np.random.default_rng(1))
     observed = observe(K, poses, landmarks)
     assert np.abs(observed.residuals).max() < 1e-9
-    assert np.abs(observed.off).max() < 0.1
+    assert np.abs(observed.anchor_residuals).max() < 0.1
 
 
 def test_jacobians_are_those_of_finite_differences():
@@ -79,7 +79,7 @@ def test_jacobians_are_those_of_finite_differences():
     ahead, back = (observe(K, replace(poses.moved(sign * step.ravel()), k1=0.05 + sign * bent),
                            landmarks.moved(sign * own)) for sign in (1, -1))
     assert (ahead.residuals - back.residuals) / 2 == pytest.approx(expected, rel=1e-5, abs=1e-9)
-    assert (ahead.off - back.off) / 2 == pytest.approx(
+    assert (ahead.anchor_residuals - back.anchor_residuals) / 2 == pytest.approx(
         np.einsum('nij,nj->ni', by.points_by_own, own[:, 1:]) + by.points_by_k1 * bent, rel=1e-5,
         abs=1e-9)
 
@@ -107,7 +107,7 @@ def test_elimination_equals_solving_the_full_system():
     for landmark in range(40):
         J[len(weights) + landmark, :, 25 + 3 * landmark:][:, :2] = by.points_by_own[landmark]
     W = np.repeat([*weights, *[0.7] * 40], 2)[:, None]
-    e = np.concatenate([observed.residuals, observed.off]).ravel()
+    e = np.concatenate([observed.residuals, observed.anchor_residuals]).ravel()
     J = J.reshape(-1, 144)
     # The seven gauge freedoms are fixed by a little information on each pose.
     held = np.diag([*[1.0] * 24, *[0.0] * 120])
@@ -157,7 +157,7 @@ def test_noise_of_the_anchor_patch_does_not_bias_steps():
     poses, landmarks = scene(rng, 3, 16_000)
     length = np.linalg.norm(poses.t[2] - poses.R[2] @ poses.R[1].T @ poses.t[1])
     landmarks = landmarks.of(landmarks.anchors == 0)
-    landmarks.roots[:], landmarks.held[:] = np.eye(2), np.eye(2)
+    landmarks.roots[:], landmarks.anchor_roots[:] = np.eye(2), np.eye(2)
     landmarks.minima += rng.normal(size=(8000, 1, 2))
     held = np.diag([*[1e12] * 12, *[0.0] * 6])
     for _ in range(6):
@@ -174,8 +174,8 @@ def test_the_noise_estimate_accounts_for_degrees_of_freedom(frames):
     rng = np.random.default_rng(15)
     poses, landmarks = scene(rng, frames, 3000)
     landmarks = landmarks.of(landmarks.anchors == 0)
-    landmarks.roots[:], landmarks.held[:] = np.eye(2), np.eye(2)
-    landmarks.found = landmarks.found + rng.normal(size=(1500, 2)) * 0.3
+    landmarks.roots[:], landmarks.anchor_roots[:] = np.eye(2), np.eye(2)
+    landmarks.anchor_pixels = landmarks.anchor_pixels + rng.normal(size=(1500, 2)) * 0.3
     landmarks.minima += rng.normal(size=landmarks.minima.shape) * 0.3
     for _ in range(4):
         observed = observe(K, poses, landmarks)

@@ -364,7 +364,7 @@ def test_landmarks_are_eliminated_as_numpy_does(lens: bool) -> None:
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
     # One without observations, and one whose anchor has no precision.
     landmarks.seen[11] = False
-    landmarks.held[12] = 0
+    landmarks.anchor_roots[12] = 0
     observed = observe(BUNDLE_K, poses, landmarks)
     weights = rng.uniform(0, 2, len(observed.residuals))
     ours, numpys = both(lambda: eliminate(observed, weights, 1.7, 6, lens))

@@ -85,7 +85,7 @@ def test_two_measurements_are_fused_as_gaussians() -> None:
     joined_at = (joined.rays_y.T @ K.T)[:, :2]
     assert np.abs(joined_at - expected[..., 0]).max() < 1e-6
     # Covariances, but for their common unit, and for how much the noise seems to differ.
-    C = K[:2, :2] @ joined.spread[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
+    C = K[:2, :2] @ joined.covariances[[0, 1, 1, 2]].T.reshape(-1, 2, 2) @ K[:2, :2].T
     apart = y_star - found
     squared = (apart * np.linalg.solve(S + T, apart[..., None])[..., 0]).sum(1)
     ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.inv(precision), C))
@@ -136,7 +136,7 @@ def test_agreeing_measurements_have_more_weight_if_the_noise_varies() -> None:
     found = y + noise[:, None] * rng.normal(0, 0.2, y.shape)
     alone = jet_problem(K, x, surfaces(y + noise[:, None] * off, S))
     joined = fuse_alignment(alone, at(alone, R, t), K, alike(found))
-    grown = np.median(joined.spread[::2], axis=0) / np.median(alone.spread[::2], axis=0)
+    grown = np.median(joined.covariances[::2], axis=0) / np.median(alone.covariances[::2], axis=0)
     assert np.median(grown[noise == 0.3]) < 0.5 * np.median(grown[noise == 2.0])
 
 
@@ -165,12 +165,12 @@ def test_matches_without_a_minimum_are_not_fused() -> None:
     S[1::3, 0, 0] *= -1
     problem = jet_problem(K, x, surfaces(y_star, S))
     joined = fuse_alignment(problem, at(problem, R, t), K, alike(y))
-    saddles = problem.spread[0] * problem.spread[2] <= problem.spread[1]**2
-    saddles |= problem.spread[0] <= 0
+    saddles = problem.covariances[0] * problem.covariances[2] <= problem.covariances[1]**2
+    saddles |= problem.covariances[0] <= 0
     assert saddles.sum() > 10
     assert np.array_equal(joined.rays_y[:, saddles], problem.rays_y[:, saddles])
     assert not np.array_equal(joined.rays_y[:, ~saddles], problem.rays_y[:, ~saddles])
-    assert np.isfinite(joined.spread).all() and np.isfinite(joined.blur).all()
+    assert np.isfinite(joined.covariances).all() and np.isfinite(joined.blur).all()
 
 
 def test_without_a_pose_the_differences_calibrate_the_covariances() -> None:
@@ -201,5 +201,5 @@ def test_exact_matches_stay_exact() -> None:
     views = two_views(np.random.default_rng(24), 60)
     problem = jet_problem(K, views.x, surfaces(views.y, np.tile(np.eye(2), (60, 1, 1))))
     joined = fuse_alignment(problem, at(problem, views.R, views.t), K, alike(views.y))
-    assert np.isfinite(joined.spread).all()
+    assert np.isfinite(joined.covariances).all()
     assert np.abs(epipolar_residuals(joined, views.R, views.t).r).max() < 1e-9

@@ -49,7 +49,7 @@ def test_a_priori_there_is_no_distortion() -> None:
 def test_a_systematic_error_on_straight_roads_is_not_taken_for_distortion() -> None:
     lens = estimate([(0.02, 0.005**2, STRAIGHT)] * 500)
     assert abs(lens.k1) < 0.005
-    assert lens.sigma > 0.5 * lens.first
+    assert lens.sigma > 0.5 * lens.prior_sigma
 
 
 def test_turns_separate_distortion_from_systematic_errors() -> None:
@@ -70,7 +70,7 @@ def test_noise_is_not_taken_for_distortion() -> None:
 def test_noise_free_windows_do_not_make_k1_certain() -> None:
     # No lens deviates by k1 alone.
     exact = estimate([(0.01, 0.0, TURN)] * 2)
-    assert exact.sigma > 0.1 * exact.first
+    assert exact.sigma > 0.1 * exact.prior_sigma
     assert np.linalg.eigvalsh(exact.covariance)[0] > 0
 
 

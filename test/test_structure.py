@@ -411,7 +411,7 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     window._append(views[1], wrong, 1.0)
     window._create_landmarks(wrong, 1.0)
     at = {tuple(x): factor for x, factor in zip(pair.x, factors)}
-    chosen = np.log([at[tuple(x)] for x in window._landmarks.found])
+    chosen = np.log([at[tuple(x)] for x in window._landmarks.anchor_pixels])
     assert len(chosen) == 40
     assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)
 

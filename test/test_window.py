@@ -101,7 +101,7 @@ class NumbersWindow(Window):
 
     def correct_images(self, newest: Any) -> None:
         """Go on with a lens that has so much less of k1, and points where that shows them."""
-        before, undone = self._landmarks.found, self.lens.corrected_k1
+        before, undone = self._landmarks.anchor_pixels, self.lens.corrected_k1
         super().correct_images(newest)
         moved = undistort(K, distort(K, before, undone), self.lens.corrected_k1)
         for old, new in zip(before.tolist(), moved.tolist()):
@@ -114,7 +114,7 @@ class NumbersWindow(Window):
     def _observe_landmarks(self) -> None:
         found, newest = self._landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
-        mine = np.array([self._which[tuple(point)] for point in found.found.tolist()], int)
+        mine = np.array([self._which[tuple(point)] for point in found.anchor_pixels.tolist()], int)
         pixels = self._projected(points_in_frame(K, self._poses, found, newest))
         wanted = seen[mine] & inside(pixels)
         wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
@@ -190,11 +190,11 @@ def test_the_rotation_drifts_less_than_half_of_that_by_pairs(seed: int) -> None:
     for _ in range(60):
         window.go()
         chained = window.pairs[-1] @ chained
-        here = here @ window.added.onward
-        window.record_published(window.added.onward)
+        here = here @ window.added.corrected_motion
+        window.record_published(window.added.corrected_motion)
         off.append([np.linalg.norm(rotation_log(R)) for R in (chained, here[:3, :3])])
-    by_pairs, scales = np.sqrt(np.square(off).mean(0))
-    assert scales < 0.5 * by_pairs
+    by_pairs, by_window = np.sqrt(np.square(off).mean(0))
+    assert by_window < 0.5 * by_pairs
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -202,8 +202,8 @@ def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) ->
     window, off, sigmas = NumbersWindow(Street(seed, 160, 0.2, turned=1e-3)), [], []
     for _ in range(160):
         window.go()
-        window.record_published(window.added.onward)
-        off.append(np.linalg.norm(window.added.onward[:3, 3]) - window.added.length)
+        window.record_published(window.added.corrected_motion)
+        off.append(np.linalg.norm(window.added.corrected_motion[:3, 3]) - window.added.length)
         sigmas.append(window.added.sigma)
     assert np.std(off[-50:]) < np.median(sigmas)
 
@@ -213,10 +213,10 @@ def test_unpublished_motion_is_made_up_for_without_a_jump() -> None:
     steps = []
     for number in range(40):
         window.go()
-        onward = np.eye(4) if number == 10 else window.added.onward
-        window.record_published(onward)
-        here = here @ onward
-        steps.append(onward[2, 3])
+        motion = np.eye(4) if number == 10 else window.added.corrected_motion
+        window.record_published(motion)
+        here = here @ motion
+        steps.append(motion[2, 3])
     assert steps[9] == pytest.approx(1, abs=0.02) and steps[10] == 0
     assert steps[11] == pytest.approx(1 + WINDOW_TUNING.correction_share, abs=0.02)
     assert here[2, 3] == pytest.approx(40, abs=0.2)

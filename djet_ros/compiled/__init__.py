@@ -372,10 +372,10 @@ def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[
     Return residuals of M observations of N landmarks by F frames: `core.bundle.observe`.
 
     seen: landmark and frame of each (M,); anchors: (N,); between: R (F, F, 3, 3) and t (F, F, 3);
-    landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), held (N, 2, 2) and
-    found (N, 2); K: (3, 3) and its inverse; tuning: k1, least depth, largest relative displacement
-    by k1, and bound of pixels. Returns anchors (M,), and an Observed's residuals, off, straight,
-    R, t, ray, rho, place and root.
+    landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), anchor_roots (N, 2,
+    2) and anchor_pixels (N, 2); K: (3, 3) and its inverse; tuning: k1, least depth, largest
+    relative displacement by k1, and bound of pixels. Returns anchors (M,), and an Observed's
+    residuals, anchor_residuals, normalised, R, t, ray, rho, place and root.
     """
     m, n, frames = len(seen[0]), len(anchors), len(between[0])
     anchor = np.empty(m, np.int64)
@@ -397,9 +397,9 @@ def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int6
 
     which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
     R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); points:
-    straight (N, 2), held (N, 2, 2), off (N, 2) and their weight; with_k1: whether k1 is a
-    parameter; K, tuning: as in `observe`; trace: information added to a landmark; frames: F.
-    Returns the arrays of a Reduced.
+    normalised (N, 2), anchor_roots (N, 2, 2), anchor_residuals (N, 2) and their weight; with_k1:
+    whether k1 is a parameter; K, tuning: as in `observe`; trace: information added to a landmark;
+    frames: F. Returns the arrays of a Reduced.
     """
     *of_points, weight = points
     n, size = len(of_points[0]), with_k1 + 6 * frames

@@ -204,7 +204,7 @@ def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
     rotated = rays_x @ fit_rotation(rays_x, rays_y).T
     offsets = np.linalg.norm(rotated[:, :2] / rotated[:, 2:] - rays_y[:, :2], axis=1)
     # Size of a pixel in viewing-ray units, as for a surface of typical sharpness.
-    pixel = np.sqrt(median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
+    pixel = np.sqrt(median(np.abs(problem.covariances[0] + problem.covariances[2])) / 2)
     return bool(quantile(offsets, 0.75) < parallax * pixel)
 
 

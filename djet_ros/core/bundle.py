@@ -84,21 +84,21 @@ class Poses:
     def moved(self, step: Array) -> Poses:
         """Return the poses perturbed by a step (6 F,)."""
         step = step.reshape(-1, 6)
-        turns = rotation_exp(step[:, :3])
-        return Poses(turns @ self.R, times(turns, self.t) + step[:, 3:], self.k1)
+        rotations = rotation_exp(step[:, :3])
+        return Poses(rotations @ self.R, times(rotations, self.t) + step[:, 3:], self.k1)
 
     def step_from(self, other: Poses) -> Array:
         """Return the step (6 F,) that takes other poses to these, to first order."""
-        turns = self.R @ other.R.transpose(0, 2, 1)
-        shifts = self.t - np.einsum('fij,fj->fi', turns, other.t)
-        return np.concatenate([rotation_log(turns), shifts], axis=1).ravel()
+        rotations = self.R @ other.R.transpose(0, 2, 1)
+        shifts = self.t - np.einsum('fij,fj->fi', rotations, other.t)
+        return np.concatenate([rotation_log(rotations), shifts], axis=1).ravel()
 
 
 class PriorCost(NamedTuple):
     """Cost of poses under a prior, and its gradient (6 F,)."""
 
     cost: float
-    slope: Array
+    gradient: Array
 
 
 @dataclass
@@ -151,23 +151,23 @@ class Landmarks:
     """
     N landmarks, and their observations by F frames.
 
-    anchors: (N,) frames that created them; found: (N, 2) pixels there, the centres of their
-    patches; held: (N, 2, 2) roots of the precision of these; points: (N, 2) estimated pixels
-    there, undistorted; rho: (N,) inverse depths there; slopes: (N, 2) relative slopes of the
-    inverse depth around them, per pixel; strengths: (N,) texture strengths of their patches;
-    sightings: (N,) numbers of observations, also by frames since removed; minima: (N, F, 2) pixels
-    y*; roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F)
+    anchors: (N,) frames that created them; anchor_pixels: (N, 2) observed there, the centres of
+    their patches; anchor_roots: (N, 2, 2) roots of the precision of these; points: (N, 2)
+    estimated pixels there, undistorted; rho: (N,) inverse depths there; slopes: (N, 2) relative
+    slopes of the inverse depth around them, per pixel; strengths: (N,) texture strengths of their
+    patches; observation_counts: (N,) also by frames since removed; minima: (N, F, 2) pixels y*;
+    roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F)
     whether the last two are valid.
     """
 
     anchors: NDArray[np.int64]
-    found: Array
-    held: Array
+    anchor_pixels: Array
+    anchor_roots: Array
     points: Array
     rho: Array
     slopes: Array
     strengths: Array
-    sightings: NDArray[np.int64]
+    observation_counts: NDArray[np.int64]
     minima: Array
     roots: Array
     seen: NDArray[np.bool_]
@@ -176,16 +176,17 @@ class Landmarks:
         return len(self.rho)
 
     @classmethod
-    def at(cls, found: Array, rho: Array, anchor: int, frames: int, points: Array | None = None,
-           slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
+    def at(cls, anchor_pixels: Array, rho: Array, anchor: int, frames: int,
+           points: Array | None = None, slopes: Array | None = None,
+           strengths: Array | None = None) -> Landmarks:
         """
         Create landmarks without observations.
 
         Without points there is no k1; without slopes the surfaces are fronto-parallel.
         """
         n = len(rho)
-        return cls(np.full(n, anchor, np.int64), found, np.zeros((n, 2, 2)),
-                   found if points is None else points, rho,
+        return cls(np.full(n, anchor, np.int64), anchor_pixels, np.zeros((n, 2, 2)),
+                   anchor_pixels if points is None else points, rho,
                    np.zeros((n, 2)) if slopes is None else slopes,
                    np.ones(n) if strengths is None else strengths, np.zeros(n, np.int64),
                    np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),
@@ -210,9 +211,9 @@ class Landmarks:
 
     def without_frame(self, frame: int) -> Landmarks:
         """Return the landmarks with other anchors, without the observations of a frame."""
-        left = self.of(self.anchors != frame)
-        return Landmarks(left.anchors - (left.anchors > frame), *left._by_anchor()[1:],
-                         *(np.delete(array, frame, axis=1) for array in left._by_frame()))
+        others = self.of(self.anchors != frame)
+        return Landmarks(others.anchors - (others.anchors > frame), *others._by_anchor()[1:],
+                         *(np.delete(array, frame, axis=1) for array in others._by_frame()))
 
     def moved(self, step: Array) -> Landmarks:
         """Return the landmarks moved by a step (N, 3) of their inverse depths and points."""
@@ -226,23 +227,23 @@ class Landmarks:
         """
         def moved(pixels: Array) -> tuple[Array, Array]:
             """Return pixels (N, 2) in the new image, and Jacobians of the old by the new ones."""
-            straight = undistort(K, distort(K, pixels, before), after)
-            u = rays(K, straight)[:, :2]
+            corrected = undistort(K, distort(K, pixels, before), after)
+            u = rays(K, corrected)[:, :2]
             back = distortion_jacobian(K, rays(K, pixels)[:, :2], before)
             by_new = np.linalg.solve(back, distortion_jacobian(K, u, after))
-            return straight, np.asarray(by_new, float)
+            return corrected, np.asarray(by_new, float)
 
-        found, by_found = moved(self.found)
+        anchor_pixels, by_anchor = moved(self.anchor_pixels)
         minima, by_minima = moved(self.minima.reshape(-1, 2))
         return replace(
-            self, found=found, held=self.held @ by_found,
-            slopes=times(by_found.transpose(0, 2, 1), self.slopes),
+            self, anchor_pixels=anchor_pixels, anchor_roots=self.anchor_roots @ by_anchor,
+            slopes=times(by_anchor.transpose(0, 2, 1), self.slopes),
             minima=minima.reshape(self.minima.shape),
             roots=self.roots @ by_minima.reshape(self.roots.shape))
 
     def _by_anchor(self) -> tuple[Any, ...]:
-        return self.anchors, self.found, self.held, self.points, self.rho, self.slopes, \
-            self.strengths, self.sightings
+        return self.anchors, self.anchor_pixels, self.anchor_roots, self.points, self.rho, \
+            self.slopes, self.strengths, self.observation_counts
 
     def _by_frame(self) -> tuple[Any, ...]:
         return self.minima, self.roots, self.seen
@@ -267,22 +268,22 @@ class Observed:
     """
     M observations of N landmarks: see ``observe``.
 
-    landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); off: (N, 2) residuals of
-    the points in their anchors, held: (N, 2, 2) roots of their precision. R (M, 3, 3), t (M, 3),
-    ray (M, 3), rho (M,): motion from the anchor to the frame, and the landmark in the anchor;
-    place (M, 3): R ray + rho t; root: (M, 2, 2) of the precision; straight: (N, 2) X/Z, Y/Z of the
-    points.
+    landmark, frame, anchor: (M,), sorted by landmark; residuals: (M, 2); anchor_residuals: (N, 2)
+    of the points in their anchors, anchor_roots: (N, 2, 2) of their precision. R (M, 3, 3), t (M,
+    3), ray (M, 3), rho (M,): motion from the anchor to the frame, and the landmark in the anchor;
+    place (M, 3): R ray + rho t; root: (M, 2, 2) of the precision; normalised: (N, 2) X/Z, Y/Z of
+    the points.
     """
 
     landmark: NDArray[np.int64]
     frame: NDArray[np.int64]
     anchor: NDArray[np.int64]
     residuals: Array
-    off: Array
-    held: Array
+    anchor_residuals: Array
+    anchor_roots: Array
     K: Array
     k1: float
-    straight: Array
+    normalised: Array
     R: Array
     t: Array
     ray: Array
@@ -295,12 +296,13 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     """Return the residuals of all observations, whitened by their roots of precision."""
     landmark, frame = np.nonzero(landmarks.seen)
     if compiled.library is not None:
-        anchor, (residuals, off, straight, *at_places) = compiled.observe(
+        anchor, (residuals, anchor_residuals, normalised, *at_places) = compiled.observe(
             (landmark, frame), landmarks.anchors, poses.relative_motions,
-            (landmarks.points, landmarks.rho, landmarks.minima, landmarks.roots, landmarks.held,
-             landmarks.found), (K, inverse_intrinsics(K)), _tuning(poses.k1))
-        return Observed(landmark, frame, anchor, residuals, off, landmarks.held, K, poses.k1,
-                        straight, *at_places)
+            (landmarks.points, landmarks.rho, landmarks.minima, landmarks.roots,
+             landmarks.anchor_roots, landmarks.anchor_pixels),
+            (K, inverse_intrinsics(K)), _tuning(poses.k1))
+        return Observed(landmark, frame, anchor, residuals, anchor_residuals,
+                        landmarks.anchor_roots, K, poses.k1, normalised, *at_places)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     R, t = (motions[frame, anchor] for motions in poses.relative_motions)
     rays_of_points = rays(K, landmarks.points)
@@ -310,8 +312,9 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     return Observed(
         landmark, frame, anchor,
         times(root, projected(K, place, poses.k1) - landmarks.minima[landmark, frame]),
-        times(landmarks.held, projected(K, rays_of_points, poses.k1) - landmarks.found),
-        landmarks.held, K, poses.k1, rays_of_points[:, :2], R, t, ray, rho, place, root)
+        times(landmarks.anchor_roots,
+              projected(K, rays_of_points, poses.k1) - landmarks.anchor_pixels),
+        landmarks.anchor_roots, K, poses.k1, rays_of_points[:, :2], R, t, ray, rho, place, root)
 
 
 def _tuning(k1: float) -> tuple[float, ...]:
@@ -340,12 +343,12 @@ class Jacobians:
 def _undistorted(observed: Observed) -> Array:
     """Return the undistorted X/Z, Y/Z (M + N, 2) of observations and points."""
     ahead = np.maximum(observed.place[:, 2:], _MIN_DEPTH)
-    return np.concatenate([observed.place[:, :2] / ahead, observed.straight])
+    return np.concatenate([observed.place[:, :2] / ahead, observed.normalised])
 
 
 def _by_undistorted(observed: Observed) -> tuple[Array, Array]:
     """Return the Jacobians of residuals (M, 2, 2) and (N, 2, 2) by undistorted pixels."""
-    roots = np.concatenate([observed.root, observed.held])
+    roots = np.concatenate([observed.root, observed.anchor_roots])
     turned = roots @ distortion_jacobian(observed.K, _undistorted(observed), observed.k1)
     return turned[:len(observed.root)], turned[len(observed.root):]
 
@@ -355,7 +358,7 @@ def _by_k1(observed: Observed) -> tuple[Array, Array]:
     u = _undistorted(observed)
     moved = (u * (u * u).sum(1, keepdims=True)) @ observed.K[:2, :2].T
     count = len(observed.root)
-    return times(observed.root, moved[:count]), times(observed.held, moved[count:])
+    return times(observed.root, moved[:count]), times(observed.anchor_roots, moved[count:])
 
 
 def jacobians(observed: Observed) -> Jacobians:
@@ -399,9 +402,10 @@ def noise_scale(observed: Observed) -> float:
     errors would be rejected as outliers. The parameters of poses are neglected. Needs at least one
     observation.
     """
-    count = np.bincount(observed.landmark, minlength=len(observed.off))
-    squares = (observed.off**2).sum(1) + np.bincount(
-        observed.landmark, (observed.residuals**2).sum(1), minlength=len(observed.off))
+    n = len(observed.anchor_residuals)
+    count = np.bincount(observed.landmark, minlength=n)
+    squares = (observed.anchor_residuals**2).sum(1) + np.bincount(
+        observed.landmark, (observed.residuals**2).sum(1), minlength=n)
     seen = count > 0
     # Wilson and Hilferty's median of the chi-square distribution.
     freedom = 2 * count[seen] - 1
@@ -473,9 +477,9 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
-            (o.straight, o.held, o.off, weight), lens, (o.K, inverse_intrinsics(o.K)),
-            _tuning(o.k1), _DEPTH_INFORMATION, frames), lens)
-    count, n, linear = len(weights), len(observed.off), jacobians(observed)
+            (o.normalised, o.anchor_roots, o.anchor_residuals, weight), lens,
+            (o.K, inverse_intrinsics(o.K)), _tuning(o.k1), _DEPTH_INFORMATION, frames), lens)
+    count, n, linear = len(weights), len(observed.anchor_residuals), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
@@ -492,12 +496,12 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     information, slopes = np.tile(np.eye(3) * _DEPTH_INFORMATION, (n, 1, 1)), np.zeros((n, 3))
     transposed = own.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ own
-    slopes[:, 1:] = times(transposed, observed.off)
+    slopes[:, 1:] = times(transposed, observed.anchor_residuals)
     with_k1, coupling = np.zeros((n, 3, 1)), np.zeros((n, frames, 3, 6))
     with_k1[:, 1:, 0] = times(transposed, by_lens)
     if lens:
         H[0, 0] += weight * (by_lens * by_lens).sum()
-        g[0] += weight * (by_lens * observed.off).sum()
+        g[0] += weight * (by_lens * observed.anchor_residuals).sum()
     if count:
         # Each frame observes a landmark once, and each landmark has one anchor.
         coupling[observed.landmark, observed.frame] = back @ by_frame

@@ -62,15 +62,15 @@ class JetProblem:
     """
     Matches as the optimiser sees them; the last axis runs over the N matches.
 
-    rays_x, rays_y: (3, N) viewing rays of x and of the minima y* of the paraboloids; spread: (3,
-    N) entries 11, 12, 22 of K^-1 A'^-1 K^-T, the covariance of y* up to scale, in units of rays.
-    Residuals are in pixels for a surface of median curvature. blur: (N,) variance added to g^T
-    A'^-1 g, which down-weights matches near the epipole.
+    rays_x, rays_y: (3, N) viewing rays of x and of the minima y* of the paraboloids; covariances:
+    (3, N) entries 11, 12, 22 of K^-1 A'^-1 K^-T, the covariance of y* up to scale, in units of
+    rays. Residuals are in pixels for a surface of median curvature. blur: (N,) variance added to
+    g^T A'^-1 g, which down-weights matches near the epipole.
     """
 
     rays_x: Array
     rays_y: Array
-    spread: Array
+    covariances: Array
     blur: Array
 
     def subset(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice) -> JetProblem:
@@ -84,13 +84,13 @@ class JetProblem:
         """Return the problem with the same pixels under another camera matrix than K."""
         A = inverse_intrinsics(other) @ K
         return JetProblem(A @ self.rays_x, A @ self.rays_y,
-                          ray_covariances(inverse_intrinsics(K) @ other, self.spread),
+                          ray_covariances(inverse_intrinsics(K) @ other, self.covariances),
                           np.linalg.det(A) * self.blur)
 
     @property
     def matches(self) -> tuple[Array, Array, Array, Array]:
         """Return all arrays of the problem."""
-        return self.rays_x, self.rays_y, self.spread, self.blur
+        return self.rays_x, self.rays_y, self.covariances, self.blur
 
 
 @dataclass(frozen=True)
@@ -170,16 +170,16 @@ def jet_problem(K: Array, x: Array, paraboloids: Paraboloids, epipole_blur: floa
     the epipole, in pixels, within which epipolar lines are uncertain; 0 is the paper's loss.
     by_fit: scale the variance of each match by the value of its surface at the minimum.
     """
-    minima, spread = paraboloids.minima(), entries(paraboloids.inverses)
+    minima, covariances = paraboloids.minima(), entries(paraboloids.inverses)
     if by_fit and len(minima):
-        spread *= _floored_minimum_values(paraboloids, minima)
-    widths = np.abs(spread[0] + spread[2]) / 2
-    spread /= max(median(widths), 1e-12) if len(minima) else 1.0
-    spread = ray_covariances(K, spread)
+        covariances *= _floored_minimum_values(paraboloids, minima)
+    widths = np.abs(covariances[0] + covariances[2]) / 2
+    covariances /= max(median(widths), 1e-12) if len(minima) else 1.0
+    covariances = ray_covariances(K, covariances)
     # |g| grows with the sine of the angle from the epipole, so that a distance there is an angle.
     pixel = np.linalg.det(inverse_intrinsics(K)[:2, :2])
-    blur = epipole_blur**2 * pixel * np.abs(spread[0] + spread[2]) / 2
-    return JetProblem(rays(K, x).T, rays(K, minima).T, spread, blur)
+    blur = epipole_blur**2 * pixel * np.abs(covariances[0] + covariances[2]) / 2
+    return JetProblem(rays(K, x).T, rays(K, minima).T, covariances, blur)
 
 
 def entries(S: Array) -> Array:
@@ -187,11 +187,11 @@ def entries(S: Array) -> Array:
     return np.array([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
 
 
-def ray_covariances(K: Array, spread: Array) -> Array:
+def ray_covariances(K: Array, covariances: Array) -> Array:
     """Convert covariances of pixels to covariances of rays, both as entries 11, 12, 22 (3, N)."""
     (a, b), (c, d) = inverse_intrinsics(K)[:2, :2]
     return np.asarray(np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
-                                [c * c, 2 * c * d, d * d]]) @ spread)
+                                [c * c, 2 * c * d, d * d]]) @ covariances)
 
 
 def _floored_minimum_values(paraboloids: Paraboloids, minima: Array) -> Array:
@@ -215,11 +215,11 @@ def epipolar_residuals(problem: JetProblem, R: Array, t: Array) -> Residuals:
     frame = np.empty((3, 3))
     frame[0], frame[1:] = t, tangents.T
     by_direction = skew(frame) @ R
-    x, y, spread = problem.rays_x, problem.rays_y, problem.spread
+    x, y, covariances = problem.rays_x, problem.rays_y, problem.covariances
     lines = by_direction[0] @ x
     e = (y * lines).sum(0)
     # Covariance of y* times the line's normal g.
-    M = spread[:2] * lines[0] + spread[1:] * lines[1]
+    M = covariances[:2] * lines[0] + covariances[1:] * lines[1]
     variance = (lines[:2] * M).sum(0)  # g^T A'^-1 g
     sign = np.where(variance < 0, -1.0, 1.0)
     size = np.abs(variance)

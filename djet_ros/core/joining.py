@@ -52,25 +52,24 @@ def fuse_alignment(problem: JetProblem, solution: Solution, K: Array, placed: Al
     estimates the noise of each match: at the edge of near objects they see different things. See
     `_relative_noise`. Matches without a minimum stay unchanged.
     """
-    found = replace(problem, rays_y=rays(K, placed.places).T,
-                    spread=ray_covariances(K, entries(placed.covariances)),
-                    blur=np.zeros(len(placed.places)))
-    off = epipolar_residuals(found, solution.R, solution.t).r
-    S, T = (clipped_scale(r)**2 * measured.spread
-            for measured, r in ((problem, solution.residuals.r), (found, off)))
-    has_minimum = (S[0] > 0) & (S[0] * S[2] > S[1]**2)
-    there = np.flatnonzero(has_minimum)
-    rays_y, joined = problem.rays_y.copy(), S.copy()
-    way, joined[:, there] = fuse(*(values.take(there, axis=1) for values in (
-        found.rays_y[:2] - rays_y[:2], S, T)))
-    rays_y[:2, there] += way
+    aligned = replace(problem, rays_y=rays(K, placed.places).T,
+                      covariances=ray_covariances(K, entries(placed.covariances)),
+                      blur=np.zeros(len(placed.places)))
+    residuals = epipolar_residuals(aligned, solution.R, solution.t).r
+    S, T = (clipped_scale(r)**2 * measured.covariances
+            for measured, r in ((problem, solution.residuals.r), (aligned, residuals)))
+    which = np.flatnonzero((S[0] > 0) & (S[0] * S[2] > S[1]**2))  # matches with a minimum
+    rays_y, fused = problem.rays_y.copy(), S.copy()
+    shifts, fused[:, which] = fuse(*(values.take(which, axis=1) for values in (
+        aligned.rays_y[:2] - rays_y[:2], S, T)))
+    rays_y[:2, which] += shifts
     # Residuals are in pixels for a match of median curvature again.
     G = inverse_intrinsics(K)[:2, :2]
     width = np.trace(G @ G.T)
-    spread = joined * (width / max(median(np.abs(joined[0] + joined[2])), 1e-300))
-    blur = problem.blur * (np.abs(spread[0] + spread[2])
-                           / np.maximum(np.abs(problem.spread[0] + problem.spread[2]), 1e-300))
-    return replace(problem, rays_y=rays_y, spread=spread, blur=blur)
+    covariances = fused * (width / max(median(np.abs(fused[0] + fused[2])), 1e-300))
+    before, after = (np.abs(S[0] + S[2]) for S in (problem.covariances, covariances))
+    blur = problem.blur * (after / np.maximum(before, 1e-300))
+    return replace(problem, rays_y=rays_y, covariances=covariances, blur=blur)
 
 
 def fuse(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
@@ -85,29 +84,29 @@ def fuse(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
         return apart, S
     S = _CORRELATION_INFLATION * S
     inverse = _inverse(S + T)
-    way = _multiply(inverse, apart)
-    left = S - np.array([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
+    pull = _multiply(inverse, apart)
+    fused = S - np.array([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
                          _form(S[1:], inverse, S[1:])])
-    return _multiply(S, way), left * _relative_noise((apart * way).sum(0))
+    return _multiply(S, pull), fused * _relative_noise((apart * pull).sum(0))
 
 
-def fuse_positions(minima: Array, spread: Array, placed: Aligned) -> tuple[Array, Array]:
+def fuse_positions(minima: Array, covariances: Array, placed: Aligned) -> tuple[Array, Array]:
     """
     Fuse minima (N, 2) of surfaces with aligned positions, without a pose to calibrate them by.
 
-    spread: (N, 2, 2) covariances of the minima up to a common factor, which is estimated from the
-    differences of both positions. These contain the alignment's errors, but not those common to
-    both; the two are taken to cancel. Minima are not taken for more accurate than alignment.
+    covariances: (N, 2, 2) covariances of the minima up to a common factor, which is estimated from
+    the differences of both positions. These contain the alignment's errors, but not those common
+    to both; the two are taken to cancel. Minima are not taken for more accurate than alignment.
     Returns positions (N, 2) and covariances (N, 2, 2) in square pixels.
     """
-    S, T = entries(spread), _ALIGNMENT_INFLATION * entries(placed.covariances)
+    S, T = entries(covariances), _ALIGNMENT_INFLATION * entries(placed.covariances)
     apart = (placed.places - minima).T
     if len(minima):
         squared = (apart * _multiply(_inverse(S), apart)).sum(0)
         S = S * max(median(squared) / (2 * np.log(2)),
                     median(T[0] + T[2]) / median(S[0] + S[2]))
-    way, joined = fuse(apart, S, T)
-    return minima + way.T, joined[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
+    shifts, fused = fuse(apart, S, T)
+    return minima + shifts.T, fused[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
 
 
 def _inverse(S: Array) -> Array:

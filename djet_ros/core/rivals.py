@@ -321,7 +321,7 @@ def _flatness(problem: JetProblem, pose: Pose) -> float:
     noise = robust_scale(refine_all(problem, [pose], Loss(), 0).r[0])
     rho, sigma = inverse_depths(pose.R, pose.t, problem.rays_x.T, problem.rays_y.T)
     # One unit of the residuals in viewing-ray units, for a match of typical sharpness.
-    pixel = np.sqrt(np.median(np.abs(problem.spread[0] + problem.spread[2])) / 2)
+    pixel = np.sqrt(np.median(np.abs(problem.covariances[0] + problem.covariances[2])) / 2)
     far, near = np.quantile(rho, (_FAR_QUANTILE, _NEAR_QUANTILE))
     blurred = near <= 0 or noise * pixel * np.median(sigma) > _MAX_DEPTH_NOISE * near
     return float('nan') if blurred else float(max(far / near, 0.0))

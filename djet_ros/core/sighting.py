@@ -71,10 +71,10 @@ class Sighting:
             return None
         minima = fits.minima()
         # The residual of a least-squares fit estimates its noise variance.
-        left = np.maximum(fits.values(minima), 1e-3)
-        places, spread = fuse_positions(minima, fits.inverses * left[:, None, None],
-                                        self._aligned(mine, warps[mine], minima))
-        halves = np.asarray(np.linalg.cholesky(inverses(spread)), float)
+        residual = np.maximum(fits.values(minima), 1e-3)
+        places, covariances = fuse_positions(minima, fits.inverses * residual[:, None, None],
+                                             self._aligned(mine, warps[mine], minima))
+        halves = np.asarray(np.linalg.cholesky(inverses(covariances)), float)
         return LandmarkObservations(mine, places, halves.transpose(0, 2, 1))
 
     def _predict(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
@@ -117,7 +117,7 @@ class Sighting:
         contrasts = contrast_ratios(strengths, self.landmarks.strengths[mine], counts)
         references = self.distances.shifted_references(
             [(self.views[anchor].surface_gray, count) for anchor, count in zip(anchors, counts)],
-            self.landmarks.found[mine], places, warps, contrasts)
+            self.landmarks.anchor_pixels[mine], places, warps, contrasts)
         fits = self.distances.fit_around(references, here, places, radius)
         fits, _ = resolve_indefinite(fits, 'drop')
         good = fits.usable & fits.minimum_within(radius)
@@ -127,7 +127,8 @@ class Sighting:
         """Align patches of landmarks (M,), ordered by their anchors, from places (M, 2)."""
         images = [(self.views[anchor].gray, count)
                   for anchor, count in zip(*self._anchor_counts(mine))]
-        return align_all(images, self.landmarks.found[mine], warps, self.views[-1].gray, places)
+        return align_all(images, self.landmarks.anchor_pixels[mine], warps, self.views[-1].gray,
+                         places)
 
     def _anchor_counts(self, mine: NDArray[np.int64]
                        ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -139,7 +139,7 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     infinite = m[:, :2] / np.where(ahead, m[:, 2], 1.0)[:, None]
     along = t[:, :2] - infinite * t[:, 2:]
     a1, a2 = along[:, 0], along[:, 1]
-    s11, s12, s22 = problem.spread
+    s11, s12, s22 = problem.covariances
     variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
     way = ((problem.rays_y[:2] - infinite) * along).sum(1) / np.sqrt(np.maximum(variance, 1e-24))
     squared = sketch.r**2
@@ -164,7 +164,7 @@ def _evaluate(problem: JetProblem, products: Array, R: Array, t: Array, loss: Lo
     E = skew(t) @ R
     e = E.reshape(-1, 9) @ products
     l1, l2 = (E[:, :2].transpose(1, 0, 2).reshape(-1, 3) @ problem.rays_x).reshape(2, len(R), -1)
-    s11, s12, s22 = problem.spread
+    s11, s12, s22 = problem.covariances
     variance = (s11 * l1 + 2 * s12 * l2) * l1 + s22 * l2 * l2
     sign = np.where(variance < 0, -1.0, 1.0)
     roots = np.sqrt(np.maximum(np.abs(variance) + problem.blur, 1e-24))

@@ -39,6 +39,7 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.jet import Loss
+from djet_ros.core.known_depths import KnownDepths, Lengths
 from djet_ros.core.landmark_choice import choose_landmarks
 from djet_ros.core.paraboloid import median
 from djet_ros.core.radial import undistort, undistort_image, undistorted_rays
@@ -49,7 +50,6 @@ from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, Pose, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,6 @@ class WindowTuning:
     loss_scale: float = 3.0
     # pixels; chosen, below the noise on rendered streets, which is 0.04
     least_scale: float = 0.02
-    # chosen: pixels between a landmark and a match of a pair up to which they are the same point
-    match_radius: float = 1.5
-    # pixels; chosen: largest error of an inlier match; and largest relative error of a landmark's
-    # depth
-    match_error: float = 0.4
-    depth_error: float = 0.15
     # pixels; chosen: error of inliers that slants are fitted to
     slant_noise: float = 0.1
     # rad; chosen: negative parallax of a step that noise may give to a point at infinity
@@ -115,8 +109,8 @@ class WindowStep:
 
     R (3, 3), t (3,) in the unit of the track: x_new = R x_before + t; sigma: standard deviation of
     the length, given the poses of the frames before, and covariance (6, 6) of the motion, over R
-    -> exp([w]_x) R and t + dt. onward: (4, 4) pose of the newest camera in the previous one as
-    that was published: it includes a share of the refinement of the previous pose since.
+    -> exp([w]_x) R and t + dt. corrected_motion: (4, 4) pose of the newest camera in the previous
+    one as that was published: it includes a share of the refinement of the previous pose since.
     """
 
     R: Array
@@ -124,7 +118,7 @@ class WindowStep:
     length: float
     sigma: float
     covariance: Array
-    onward: Array
+    corrected_motion: Array
 
 
 class Window:
@@ -155,8 +149,8 @@ class Window:
         self._published = np.eye(4)
         # The newest pair and its length, if it has a direction.
         self._latest: tuple[RelativePose, float] | None = None
-        # The pair whose length was last asked for, and the ratios by landmarks.
-        self._cached_ratios: tuple[RelativePose, tuple[Array, Array]] | None = None
+        # The pair whose length was last requested, and its lengths by landmarks.
+        self._cached_lengths: tuple[RelativePose, Lengths] | None = None
         self.final_landmarks = np.empty((0, 3))
 
     @property
@@ -179,19 +173,19 @@ class Window:
         # Predict by the pair, with a length from known depths.
         first = self.is_new
         length, share = (guess, _UNIT_SIGMA) if first else self._length(relative, guess)
-        self._cached_ratios = None
+        self._cached_lengths = None
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
         # Observe old and new landmarks in the frame; then refine all.
         if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
             self._create_landmarks(relative, length)
         self._observe_landmarks()
-        stood = self._poses.camera(0)[:3, 3]
+        before = self._poses.camera(0)[:3, 3]
         H = self._refine()
         # A shift of the window as a whole is no motion of the step. Its position is a gauge
         # freedom; the prior of marginalised frames is only first-order, and its remainder moves
         # the window, the more, the farther it is from its start and the less it is held there.
-        self._published[:3, 3] += self._poses.camera(0)[:3, 3] - stood
+        self._published[:3, 3] += self._poses.camera(0)[:3, 3] - before
         addition = self._newest_motion(H)
         if first:  # by definition
             addition = replace(addition, length=length)
@@ -224,7 +218,7 @@ class Window:
         self._views = [*(self._corrected(view, before) for view in self._views[:-1]), newest]
         moved = self._landmarks.with_corrected_images(self._K, before, self.lens.corrected_k1)
         # Patches that leave the image are dropped.
-        inside = self._distances.describable(moved.found, newest.surface_gray.shape)
+        inside = self._distances.describable(moved.anchor_pixels, newest.surface_gray.shape)
         self._landmarks = moved.of(inside)
         self._poses = replace(self._poses, k1=self.lens.residual_k1)
         self._latest = None
@@ -261,19 +255,18 @@ class Window:
         """
         Return the length of the pair and its relative standard deviation.
 
-        A weighted median over landmarks with a match nearby; if too few of them are in view, over
-        the matches of the previous pair.
+        By landmarks with a match nearby; if too few of them are in view, by the matches of the
+        previous pair.
         """
         unknown = guess, self._tuning.guess_sigma
         if not relative.t.any():
             return unknown
-        ratios, weights = self._ratios(relative)
-        if len(ratios) < self._tuning.min_landmarks and self._latest is not None:
-            ratios, weights = self._ratios_by(relative, *self._nearest(
-                relative.x[relative.inliers], *self._depths_of(*self._latest)))
-        if len(ratios) < self._tuning.min_landmarks:
+        lengths = self._lengths_by_landmarks(relative)
+        if len(lengths.values) < self._tuning.min_landmarks and self._latest is not None:
+            lengths = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest).lengths(relative)
+        if len(lengths.values) < self._tuning.min_landmarks:
             return unknown
-        length = _weighted_median(ratios, weights)
+        length = lengths.median()
         return (length, self._tuning.length_sigma) if length > 0 else unknown
 
     def pair_length(self, relative: RelativePose) -> tuple[float, float] | None:
@@ -283,61 +276,10 @@ class Window:
         For a translation of zero the depths of the pair are noise, and the length is zero within
         its standard error.
         """
-        ratios, weights = self._ratios(relative)
-        if len(ratios) < self._tuning.min_landmarks:
+        lengths = self._lengths_by_landmarks(relative)
+        if len(lengths.values) < self._tuning.min_landmarks:
             return None
-        length = _weighted_median(ratios, weights)
-        # Standard error of the median, for the effective number of weights.
-        spread = 1.25 * 1.4826 * _weighted_median(np.abs(ratios - length), weights)
-        return length, spread * float(np.sqrt((weights**2).sum()) / weights.sum())
-
-    def _ratios(self, relative: RelativePose) -> tuple[Array, Array]:
-        """Return the lengths (M,) of a pair by each landmark with a match, and their weights."""
-        # Asked twice for a pair: whether the camera moved, and how far.
-        if self._cached_ratios is None or self._cached_ratios[0] is not relative:
-            x = relative.x[relative.inliers]
-            self._cached_ratios = relative, self._ratios_by(
-                relative, *self._matched(x, self._landmarks.seen[:, -1]))
-        return self._cached_ratios[1]
-
-    def _ratios_by(self, relative: RelativePose, rho: Array, match: NDArray[np.int64]
-                   ) -> tuple[Array, Array]:
-        """Return lengths and weights by inverse depths rho (M,) of the inliers `match` (M,)."""
-        x, y = relative.x[relative.inliers][match], relative.y_opt[relative.inliers][match]
-        in_units, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
-        return in_units / rho, rho / sigma
-
-    def _depths_of(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
-        """Return pixels (N, 2) and inverse depths (N,) of a pair's inliers in its second frame."""
-        y = relative.y_opt[relative.inliers]
-        rays_x = self._rays(relative.x[relative.inliers])
-        rho, _ = inverse_depths(relative.R, relative.t, rays_x, self._rays(y))
-        depths = (rays_x @ relative.R.T + rho[:, None] * relative.t)[:, 2]
-        ahead = (rho > 0) & (depths > 0)
-        return y[ahead], rho[ahead] / (depths[ahead] * length)
-
-    def _matched(self, x: Array, chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
-        """
-        Match pixels x (N, 2) of the newest frame with the nearest of the chosen landmarks.
-
-        Returns the inverse depths (M,) in the newest frame of matched landmarks, and indices (M,)
-        into x.
-        """
-        before = self._landmarks.of(np.asarray(chosen & (self._landmarks.rho > 0)))
-        places = points_in_frame(self._K, self._poses, before, len(self._views) - 1)
-        ahead = places[:, 2] > 0
-        return self._nearest(x, self._projected(places[ahead]),
-                             before.rho[ahead] / places[ahead, 2])
-
-    def _nearest(self, x: Array, points: Array, rho: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Match pixels x with the nearest points (P, 2) of inverse depths (P,), as `_matched`."""
-        if not len(points) or not len(x):
-            return np.empty(0), np.empty(0, np.int64)
-        # Built in half the time of a balanced one, and as fast to query.
-        tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-        away, match = tree.query(points, distance_upper_bound=self._tuning.match_radius)
-        near = np.isfinite(away)
-        return rho[near], match[near]
+        return lengths.median(), lengths.standard_error()
 
     def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
@@ -345,26 +287,25 @@ class Window:
 
         pose: from the newest frame to another one, the sign of t is free; x, y: (N, 2) matched
         pixels of the two. Landmarks are tested that have a match and more than two observations,
-        so that their depths do not come from one pair. The length of the motion is the one that
-        most of them agree with.
+        so that their depths do not come from one pair.
         """
-        newest = self._landmarks.seen[:, -1] & (self._landmarks.sightings > 2)
         finite = np.isfinite(y).all(1)
-        x, y = x[finite], y[finite]
-        known, match = self._matched(x, newest)
-        if not len(known):
-            return 0, 0
-        in_units, sigma = inverse_depths(pose.R, pose.t, self._rays(x[match]),
-                                         self._rays(y[match]))
-        ratios = in_units / known
-        # By near landmarks, which have most parallax but may be another body, or by all with equal
-        # weight.
-        lengths = np.array([[_weighted_median(ratios, known / sigma)], [median(ratios)]])
-        noise = self._tuning.match_error / self._K[0, 0] * sigma
-        off = np.abs(in_units - lengths * known)
-        agree = off < (self._tuning.outlier * noise
-                       + self._tuning.depth_error * np.abs(lengths) * known)
-        return int(agree.sum(1).max()), len(known)
+        return self._known_depths(self._landmarks.observation_counts > 2).count_agreeing(
+            pose, x[finite], y[finite])
+
+    def _lengths_by_landmarks(self, relative: RelativePose) -> Lengths:
+        """Return the lengths of a pair by each landmark with a match."""
+        # Needed twice for a pair: whether the camera moved, and how far.
+        if self._cached_lengths is None or self._cached_lengths[0] is not relative:
+            self._cached_lengths = relative, self._known_depths().lengths(relative)
+        return self._cached_lengths[1]
+
+    def _known_depths(self, chosen: NDArray[np.bool_] | None = None) -> KnownDepths:
+        """Return the landmarks that the newest frame observes, or the chosen (N,) ones of them."""
+        seen = self._landmarks.seen[:, -1]
+        return KnownDepths.of_landmarks(
+            self._K, self._poses, self._landmarks.of(seen if chosen is None else seen & chosen),
+            len(self._views) - 1)
 
     def _choose_keyframe(self) -> None:
         """
@@ -377,15 +318,15 @@ class Window:
             return
         newest = len(self._views) - 1
         last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
-        here = self._landmarks.of(self._landmarks.seen[:, newest])
-        few = len(here) < (1 - self._tuning.lost) * self._tuning.landmarks
-        if not few:
-            turn = self._poses.R[newest] @ self._poses.R[last].T
-            turned, moved = (self._projected(places) for places in (
-                points_in_frame(self._K, self._poses, here, last) @ turn.T,
-                points_in_frame(self._K, self._poses, here, newest)))
-            few = median(np.linalg.norm(moved - turned, axis=1)) > self._tuning.parallax
-        self._is_keyframe[-1] = few
+        visible = self._landmarks.of(self._landmarks.seen[:, newest])
+        due = len(visible) < (1 - self._tuning.lost) * self._tuning.landmarks
+        if not due:
+            R = self._poses.R[newest] @ self._poses.R[last].T
+            rotated, moved = (self._projected(places) for places in (
+                points_in_frame(self._K, self._poses, visible, last) @ R.T,
+                points_in_frame(self._K, self._poses, visible, newest)))
+            due = median(np.linalg.norm(moved - rotated, axis=1)) > self._tuning.parallax
+        self._is_keyframe[-1] = due
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
         R, t = self._poses.R[-1], self._poses.t[-1]
@@ -428,14 +369,14 @@ class Window:
         self._has_landmarks[anchor] = True
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
         rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
-        ahead, off = rho > 0, tuning.slant_noise / self._K[0, 0] * sigma
-        surfaces = x[ahead], rho[ahead], off[ahead]
+        ahead, noise = rho > 0, tuning.slant_noise / self._K[0, 0] * sigma
+        surfaces = x[ahead], rho[ahead], noise[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].surface_gray.shape)
         x, rho = x[usable], rho[usable]
-        here = self._landmarks.of(self._landmarks.seen[:, anchor])
-        present = self._projected(points_in_frame(self._K, self._poses, here, anchor))
+        visible = self._landmarks.of(self._landmarks.seen[:, anchor])
+        present = self._projected(points_in_frame(self._K, self._poses, visible, anchor))
         side = tuning.cell * np.sqrt(self._views[anchor].surface_gray.size / tuning.landmarks)
-        chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(here))
+        chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(visible))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
             x, rho / length, anchor, len(self._views),
@@ -451,7 +392,7 @@ class Window:
             self._landmarks.minima[sighted.which, -1] = sighted.places
             self._landmarks.roots[sighted.which, -1] = sighted.roots
             self._landmarks.seen[sighted.which, -1] = True
-            self._landmarks.sightings[sighted.which] += 1
+            self._landmarks.observation_counts[sighted.which] += 1
 
     def _refine(self) -> Array:
         """Refine poses and depths by Gauss-Newton; returns the Hessian over the poses."""
@@ -459,12 +400,12 @@ class Window:
         observed, prior = self._observed(), self._prior.at(self._poses)
         for _ in range(self._tuning.steps):
             reduced = self._reduced(observed)
-            H, g = self._prior.H + reduced.H, prior.slope + reduced.g
+            H, g = self._prior.H + reduced.H, prior.gradient + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
             observed, prior = self._line_search(observed, prior, step, reduced.change(step))
         false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
         self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
-        np.subtract.at(self._landmarks.sightings, observed.landmark[false], 1)
+        np.subtract.at(self._landmarks.observation_counts, observed.landmark[false], 1)
         # Relative to the newest step: the unit may be much longer or shorter.
         length = float(np.linalg.norm(self._poses.relative_motions[1][-1, -2]))
         in_front = self._landmarks.rho * length > -self._tuning.negative_parallax
@@ -478,9 +419,9 @@ class Window:
         cost = self._cost(observed, scale) + prior.cost
         for _ in range(self._tuning.max_halvings + 1):
             self._poses, self._landmarks = poses.moved(step), landmarks.moved(change)
-            moved, there = self._observed(), self._prior.at(self._poses)
-            if self._cost(moved, scale) + there.cost <= cost:
-                return moved, there
+            moved, moved_prior = self._observed(), self._prior.at(self._poses)
+            if self._cost(moved, scale) + moved_prior.cost <= cost:
+                return moved, moved_prior
             step, change = step / 2, change / 2
         self._poses, self._landmarks, self._scale = poses, landmarks, scale
         return observed, prior
@@ -488,7 +429,7 @@ class Window:
     def _cost(self, observed: Observed, scale: float) -> float:
         """Return the robust cost of observations with a noise `scale`."""
         losses, _ = self._robust_losses(observed, scale)
-        return float((losses.sum() + (observed.off**2).sum()) / (2 * scale**2))
+        return float((losses.sum() + (observed.anchor_residuals**2).sum()) / (2 * scale**2))
 
     def _robust_losses(self, observed: Observed, scale: float) -> tuple[Array, Array]:
         """Return the losses (M,) of observations with a noise `scale`, and their weights."""
@@ -503,8 +444,8 @@ class Window:
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
             self._landmarks.roots[seen, -1] = roots / median(sizes)
             # The anchor's patch is as noisy as the first one that observes it.
-            new = seen & ~self._landmarks.held.any((1, 2))
-            self._landmarks.held[new] = self._landmarks.roots[new, -1]
+            new = seen & ~self._landmarks.anchor_roots.any((1, 2))
+            self._landmarks.anchor_roots[new] = self._landmarks.roots[new, -1]
 
     def _observed(self) -> Observed:
         """Return all observations, and update the noise scale."""
@@ -534,9 +475,9 @@ class Window:
         J[3:, :3] = -skew(t)
         # Rounding may leave no positive variance.
         return WindowStep(R, t, length, np.sqrt(variance) if variance > 0 else np.inf,
-                          J @ covariance @ J.T, self._corrected_step())
+                          J @ covariance @ J.T, self._corrected_motion())
 
-    def _corrected_step(self) -> Array:
+    def _corrected_motion(self) -> Array:
         """
         Return the newest camera (4, 4) relative to the previous one as it was published.
 
@@ -545,10 +486,10 @@ class Window:
         """
         before, newest = self._poses.camera(-2), self._poses.camera(-1)
         refined = np.linalg.inv(self._published) @ before
-        mended, share = np.eye(4), self._tuning.correction_share
-        mended[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
-        mended[:3, 3] = share * refined[:3, 3]
-        return np.asarray(mended @ np.linalg.inv(before) @ newest)
+        correction, share = np.eye(4), self._tuning.correction_share
+        correction[:3, :3] = rotation_exp(share * rotation_log(refined[:3, :3]))
+        correction[:3, 3] = share * refined[:3, 3]
+        return np.asarray(correction @ np.linalg.inv(before) @ newest)
 
     def _update_lens(self) -> None:
         """
@@ -585,9 +526,3 @@ class Window:
             self._views, self._is_keyframe, self._has_landmarks)
         for things in lists:
             del things[frame]
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values, kind='stable')
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])

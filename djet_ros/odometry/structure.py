@@ -44,13 +44,14 @@ class Step(NamedTuple):
     """
     A step of the track.
 
-    relative: the estimated motion; length: of its translation; onward: (4, 4) the current camera
-    in the previous one by the sliding window, whose landmarks outlast pairs; None without it.
+    relative: the estimated motion; length: of its translation; window_motion: (4, 4) the current
+    camera in the previous one by the sliding window, whose landmarks outlast pairs; None without
+    it.
     """
 
     relative: RelativePose
     length: Length
-    onward: Array | None = None
+    window_motion: Array | None = None
 
 
 class TrackScale:
@@ -182,24 +183,25 @@ class TrackScale:
                                 self._source.correlation_length, self._source.exact)
             # Until the factor is known, a length is as sure as its measurement.
             if usable and (self._source.exact or not self._filter.metric):
-                return self._onward(relative, self._filter.as_measured(measured), addition, True)
+                return self._continued(relative, self._filter.as_measured(measured), addition,
+                                       as_measured=True)
         length = self._filter.scaled(addition.length, sigma, usable)
-        return self._onward(relative, length, addition)
+        return self._continued(relative, length, addition)
 
-    def _onward(self, relative: RelativePose, length: Length, addition: WindowStep,
-                as_measured: bool = False) -> Step:
+    def _continued(self, relative: RelativePose, length: Length, addition: WindowStep,
+                   as_measured: bool = False) -> Step:
         """
         Return a step that continues the track as the window has it.
 
         Its translation is that of the pair if its length is as_measured, or if the window does not
         determine it.
         """
-        onward = addition.onward.copy()
+        motion = addition.corrected_motion.copy()
         if as_measured or not relative.t.any():
-            onward[:3, 3] = -addition.length * relative.R.T @ relative.t
-        self._window.record_published(onward)
-        onward[:3, 3] *= length.value / addition.length
-        return Step(relative, length, onward)
+            motion[:3, 3] = -addition.length * relative.R.T @ relative.t
+        self._window.record_published(motion)
+        motion[:3, 3] *= length.value / addition.length
+        return Step(relative, length, motion)
 
     def bridge(self, span_ns: tuple[int, int], current: View, relative: RelativePose,
                motion: Array) -> None:

@@ -29,10 +29,10 @@ class Trajectory:
     def moved_by_step(self, step: Step) -> Trajectory:
         """Return the trajectory after an estimated step."""
         covariance, common = motion_covariance(step.relative, step.length.own), step.length.common
-        if step.onward is not None:
+        if step.window_motion is not None:
             # Landmarks that are seen in both of two pairs correct the errors that these share.
-            return Trajectory(self.pose @ step.onward, self.path.moved(
-                self.pose, step.onward, covariance, common))
+            return Trajectory(self.pose @ step.window_motion, self.path.moved(
+                self.pose, step.window_motion, covariance, common))
         motion = camera_motion(step.relative, step.length.value)
         return Trajectory(self.pose @ motion, self.path.moved_by_pair(
             self.pose, motion, covariance, common))

@@ -1,0 +1,129 @@
+"""
+Length of a pair's translation, by points of known depth.
+
+A pair triangulates inverse depths in units of its own translation. The ratio of such a depth to
+the known one of the same point is the length of the translation in the unit of the track.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
+from djet_ros.core.geometry import inverse_depths
+from djet_ros.core.paraboloid import median
+from djet_ros.core.radial import undistorted_rays
+from djet_ros.core.types import Array, Pose, RelativePose
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+# chosen: pixels between a known point and a match of a pair up to which they are the same point.
+_MATCH_RADIUS = 1.5
+
+# Robust standard deviations beyond which a depth disagrees; chosen: largest error of an inlier
+# match, in pixels; and largest relative error of a landmark's depth.
+_OUTLIER, _MATCH_ERROR, _DEPTH_ERROR = 4.0, 0.4, 0.15
+
+
+class Lengths(NamedTuple):
+    """Lengths (M,) of a pair by each of some points, and their weights (M,)."""
+
+    values: Array
+    weights: Array
+
+    def median(self) -> float:
+        """Return the weighted median."""
+        return _weighted_median(*self)
+
+    def standard_error(self) -> float:
+        """Return the standard error of the median, for the effective number of weights."""
+        deviations = np.abs(self.values - self.median())
+        sigma = 1.25 * 1.4826 * _weighted_median(deviations, self.weights)
+        return sigma * float(np.sqrt((self.weights**2).sum()) / self.weights.sum())
+
+
+@dataclass(frozen=True)
+class KnownDepths:
+    """
+    Points of a frame: distorted pixels (P, 2), and inverse depths rho (P,) in the track's unit.
+
+    K: (3, 3) and k1 of the lens.
+    """
+
+    pixels: Array
+    rho: Array
+    K: Array
+    k1: float
+
+    @classmethod
+    def of_landmarks(cls, K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> KnownDepths:
+        """Return landmarks as points of a frame, if they are in front of it."""
+        landmarks = landmarks.of(landmarks.rho > 0)
+        points = points_in_frame(K, poses, landmarks, frame)
+        ahead = points[:, 2] > 0
+        return cls(projected(K, points[ahead], poses.k1), landmarks.rho[ahead] / points[ahead, 2],
+                   K, poses.k1)
+
+    @classmethod
+    def of_pair(cls, K: Array, k1: float, pair: RelativePose, length: float) -> KnownDepths:
+        """Return the inliers of a pair of known length as points of its second frame."""
+        y = pair.y_opt[pair.inliers]
+        rays_x = undistorted_rays(K, pair.x[pair.inliers], k1)
+        rho, _ = inverse_depths(pair.R, pair.t, rays_x, undistorted_rays(K, y, k1))
+        depths = (rays_x @ pair.R.T + rho[:, None] * pair.t)[:, 2]
+        ahead = (rho > 0) & (depths > 0)
+        return cls(y[ahead], rho[ahead] / (depths[ahead] * length), K, k1)
+
+    def lengths(self, pair: RelativePose) -> Lengths:
+        """Return the lengths of a pair that starts at the frame, by points with an inlier."""
+        rho, scaled, sigma = self._triangulated(Pose(pair.R, pair.t), pair.x[pair.inliers],
+                                                pair.y_opt[pair.inliers])
+        return Lengths(scaled / rho, rho / sigma)
+
+    def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
+        """
+        Count the points that agree with a motion, and those that have a match.
+
+        pose: from the frame to another one, the sign of t is free; x, y: (N, 2) matched pixels of
+        the two. The length of the motion is the one that most of the points agree with.
+        """
+        rho, scaled, sigma = self._triangulated(pose, x, y)
+        if not len(rho):
+            return 0, 0
+        ratios = scaled / rho
+        # By near points, which have most parallax but may be of another body, or by all with equal
+        # weight.
+        lengths = np.array([[_weighted_median(ratios, rho / sigma)], [median(ratios)]])
+        noise = _MATCH_ERROR / self.K[0, 0] * sigma
+        agree = np.abs(scaled - lengths * rho) < (
+            _OUTLIER * noise + _DEPTH_ERROR * np.abs(lengths) * rho)
+        return int(agree.sum(1).max()), len(rho)
+
+    def _triangulated(self, pose: Pose, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """
+        Return the inverse depths (M,) of points with a match in x, y (N, 2): known and by a pose.
+
+        The latter are in units of its translation, and come with their standard deviations (M,)
+        for matches with an error of one in X/Z, Y/Z.
+        """
+        rho, match = self._matched(x)
+        rays_x, rays_y = (undistorted_rays(self.K, pixels[match], self.k1) for pixels in (x, y))
+        return rho, *inverse_depths(pose.R, pose.t, rays_x, rays_y)
+
+    def _matched(self, x: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Match pixels x (N, 2) with the nearest points: inverse depths and indices into x."""
+        if not len(self.pixels) or not len(x):
+            return np.empty(0), np.empty(0, np.int64)
+        # Built in half the time of a balanced one, and as fast to query.
+        tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
+        distances, match = tree.query(self.pixels, distance_upper_bound=_MATCH_RADIUS)
+        near = np.isfinite(distances)
+        return self.rho[near], match[near]
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values, kind='stable')
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
