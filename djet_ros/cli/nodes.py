@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import sys
 
 from djet_ros.cli.graph_options import stop_by_signal
-from djet_ros.libraries import how_to_get
+from djet_ros.libraries import gtsam_problem, how_to_get
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
@@ -47,6 +47,8 @@ def _run(name: str, description: str, *, without_ros: str,
                            f"/opt/ros/jazzy/setup.bash'; {without_ros}")
     if library and find_spec(library) is None:
         return _fail(name, f'{library} is missing: {how_to_get(library)}')
+    if library == 'gtsam' and (problem := gtsam_problem()):
+        return _fail(name, problem)
 
     from djet_ros.errors import DjetError, one_line
     try:

@@ -16,6 +16,7 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
+from djet_ros.libraries import gtsam_problem
 from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import check_room, make_folder, make_room
@@ -53,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Close loops, with progress on stderr, and print a summary."""
+    if problem := gtsam_problem():
+        raise DjetError(problem)
     given = flag_values(args)
     slam_values = {name: given.pop(name) for name in PARAMETERS if name in given}
     config = configuration(args, NODE_NAME, GRAPH_NAME)
@@ -83,6 +86,9 @@ def run(args: argparse.Namespace) -> int:
     make_room(args.output, FILES, args.overwrite)
     summary = write_report(args.output, slam, truth, name, config)
     console().print(_table(summary))
+    if summary['edges'].get('loop', 0) == summary['rejected'].get('loop', 0):
+        print('no loop was closed: prefer before_tum.txt, the odometry, since the graph does '
+              'not have its landmarks')
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
 

@@ -96,10 +96,10 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
             axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
         for which, way in ways.items():
             axes.plot(way[:, 0], way[:, 2], label=which, **_LINES[which])
-        axes.plot(*_closed(slam, ways['after'])[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4,
-                  label='loop closed')
+        if len(closed := _closed(slam, ways['after'])):
+            axes.plot(*closed[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4, label='loop closed')
         unit = 'm' if slam.metric or truth is not None else 'units'
-        axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, ahead ({unit})', title=title)
+        axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, forward ({unit})', title=title)
         axes.legend()
         if truth is not None:
             errors = page.add_subplot(1, 2, 2)
