@@ -436,7 +436,7 @@ def test_a_gap_begins_a_new_pair_and_keeps_the_pose(drive):
 
 # Problems that would go unnoticed
 
-def mended(one):
+def problems_of(one):
     """Return level and summary of the diagnosis, and its problems."""
     status = one.diagnosis()
     problems = {name.removeprefix('to mend: '): text for name, text in status.values.items()
@@ -447,21 +447,21 @@ def mended(one):
 def test_a_healthy_drive_has_no_problems(drive):
     one = tracker()
     play(one, drive)
-    assert mended(one) == ('OK', 'tracking', {})
+    assert problems_of(one) == ('OK', 'tracking', {})
 
 
 @pytest.mark.parametrize('stamp', [0, ns(12.5)])
 def test_constant_stamps_are_reported_as_an_error(drive, stamp):
     one = tracker()
     out = [by_topic(one.image(image(gray, stamp_ns=stamp))) for gray in drive]
-    level, summary, found = mended(one)
+    level, summary, found = problems_of(one)
     assert (level, summary) == ('ERROR', 'started; stamps stand still')
     assert f'have the stamp {stamp // 10**9}.{stamp % 10**9:09d}' in found['stamps stand still']
     assert 'the camera driver has to stamp each image' in found['stamps stand still']
     # reported once, not with each image
     assert sum('/diagnostics' in messages for messages in out) == 2
     play(one, drive[:2], start=20.0)
-    assert mended(one)[2] == {}
+    assert problems_of(one)[2] == {}
 
 
 @pytest.mark.parametrize('prepared', [False, True])
@@ -477,16 +477,16 @@ def test_few_gray_levels_of_12_bits_are_reported_and_mended_by_the_range(drive, 
 
     one, eight, twelve = tracker(), tracker(), tracker(**{'odometry.gray_range': '0 4095'})
     sent(one, 0)
-    text = mended(one)[2]['few gray levels']
+    text = problems_of(one)[2]['few gray levels']
     assert re.match(r'\d+ images of 16 bits in a row became 1?\d gray levels with odometry'
                     r'.gray_range 0 65535; their values lie between \d+ and \d+: set', text)
     play(eight, drive)
     assert np.array_equal(sent(twelve, 0), eight.last.pose)
-    assert mended(twelve)[2] == {}
+    assert problems_of(twelve)[2] == {}
     # and while it runs
     one.configure(from_flat({**FAST, 'odometry.gray_range': '0 4095'}))
     sent(one, len(drive))
-    assert mended(one)[2] == {}
+    assert problems_of(one)[2] == {}
 
 
 def test_a_change_of_the_gray_range_applies_to_an_image_prepared_before(drive):
@@ -503,7 +503,7 @@ def test_one_repeated_image_is_no_problem(drive):
     for i, gray in enumerate(drive):
         play(one, [gray, gray], start=0.1 * i, period=0.0)
     assert one.counts.dropped == {'equal_stamp': 12}
-    assert mended(one) == ('OK', 'tracking', {})
+    assert problems_of(one) == ('OK', 'tracking', {})
 
 
 def speed(seconds, metres_per_second=3.0):
@@ -524,28 +524,28 @@ def test_a_speed_that_is_missing_or_of_another_clock_is_reported_with_the_remedy
         if off is not None:
             one.speed(speed(200 + 0.1 * i + off))
         play(one, [gray], start=200 + 0.1 * i)
-    level, summary, found = mended(one)
+    level, summary, found = problems_of(one)
     assert (level, summary) == ('WARN', 'tracking; no metric length')
     assert re.search(seen, found['no metric length'])
     for i, gray in enumerate(drive):
         one.speed(speed(201.2 + 0.1 * i if off != 100.0 else 301.2 + 0.1 * i))
         play(one, [gray], start=201.2 + 0.1 * i if off != 100.0 else 301.2 + 0.1 * i)
-    assert mended(one) == ('OK', 'tracking', {})
+    assert problems_of(one) == ('OK', 'tracking', {})
 
 
 def test_ground_that_is_never_seen_is_reported(drive):
     one = tracker(**{'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0})
     play(one, [np.rot90(gray, 2) for gray in drive])
-    assert 'no level ground' in mended(one)[2]['no metric length']
+    assert 'no level ground' in problems_of(one)[2]['no metric length']
 
 
 def test_many_images_dropped_under_load_are_a_warning_and_few_are_none(drive):
     one = tracker()
     play(one, drive)
     one.count_dropped('queue_full', 1)
-    assert mended(one) == ('OK', 'tracking', {})
+    assert problems_of(one) == ('OK', 'tracking', {})
     one.count_dropped('queue_full', 8)
-    level, summary, found = mended(one)
+    level, summary, found = problems_of(one)
     assert (level, summary) == ('WARN', 'tracking; images dropped under load')
     assert '43% of the newest 21 images' in found['images dropped under load']
 
@@ -558,7 +558,7 @@ def test_two_cameras_on_one_topic_are_a_warning_whatever_their_stamps_are(drive,
         for gray, frame, later in zip(drive, ('left', 'right'), (0.0, apart)):
             one.image(image(gray, stamp_ns=ns(5 + 0.1 * i + later), frame_id=frame))
     assert {reason: n for reason, n in one.counts.dropped.items() if n > 2} == dropped
-    level, _, found = mended(one)
+    level, _, found = problems_of(one)
     assert level != 'OK'
     assert '23 of the newest 24 images had another frame_id' in found['images of two cameras']
 
@@ -567,7 +567,7 @@ def test_one_camera_that_is_renamed_is_not_taken_for_two(drive):
     one = tracker()
     for i in range(24):
         one.image(image(drive[i % 2], stamp_ns=ns(0.1 * i), frame_id='a' if i < 12 else 'b'))
-    assert 'images of two cameras' not in mended(one)[2]
+    assert 'images of two cameras' not in problems_of(one)[2]
 
 
 @pytest.mark.parametrize(('info', 'images', 'statuses'), [
@@ -577,7 +577,7 @@ def test_a_camera_info_of_another_frame_is_a_warning(drive, info, images, status
     one.camera_info(camera_info(K, SIZE, header=header(0, info)))
     for i, gray in enumerate(drive[:2]):
         one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=images))
-    level, _, found = mended(one)
+    level, _, found = problems_of(one)
     assert ('camera_info of another frame' in found) is statuses
     if statuses:
         assert level == 'WARN'
@@ -597,13 +597,13 @@ def test_a_frame_that_is_invalid_on_tf_is_reported_and_not_published(
     out = [by_topic(one.image(image(gray, stamp_ns=ns(0.1 * i), frame_id=frame)))
            for i, gray in enumerate(drive[:3])]
     assert not any('/tf' in messages for messages in out)
-    level, _, found = mended(one)
+    level, _, found = problems_of(one)
     assert level in ('WARN', 'ERROR')
     assert remedy in found[name]
     one.configure(with_values(one.config, {'odometry.camera_frame': 'cam'}))
     named = by_topic(one.image(image(drive[3], stamp_ns=ns(0.3), frame_id=frame)))
     assert named['/tf'].transforms[0].child_frame_id == 'cam'
-    assert mended(one)[2] == {}
+    assert problems_of(one)[2] == {}
 
 
 @pytest.mark.parametrize('parameters, parent, child', [
@@ -625,7 +625,7 @@ def test_leading_slashes_of_frame_names_are_removed(
     assert (there.header.frame_id, there.child_frame_id) == (parent, child)
     assert (out['odometry'].header.frame_id, out['odometry'].child_frame_id) == (parent, child)
     assert not any(frame.startswith('/') for frames in asked for frame in frames)
-    assert mended(one) == ('OK', 'tracking', {})
+    assert problems_of(one) == ('OK', 'tracking', {})
 
 
 # Bad images
