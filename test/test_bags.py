@@ -787,7 +787,7 @@ def test_a_wrong_database_is_refused(whole, tmp_path, statement, problem):
     ('[', 'is not valid YAML'),
     pytest.param('[' * 5000, 'is not valid YAML', id='deep'),
     ('!!python/object/apply:os.system [exit]', 'is not valid YAML'),
-    pytest.param('bag.mcap' * 400_000, 'at most 2097152 are read', id='large'),
+    pytest.param('bag.mcap' * 400_000, 'more than the limit of 2097152', id='large'),
 ])
 def test_wrong_metadata_is_refused(tmp_path, metadata, problem):
     path = record(tmp_path / 'bag', camera_messages(2))
