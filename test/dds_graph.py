@@ -67,7 +67,7 @@ class Peer:
         end = monotonic() + seconds
         while not (value := condition()):
             counts = {topic: len(messages) for topic, messages in self.received.items()}
-            assert monotonic() < end, f'{what} did not come; heard {counts}'
+            assert monotonic() < end, f'{what} did not come; received {counts}'
             self.graph.spin(0.05)
         return value
 

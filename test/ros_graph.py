@@ -97,7 +97,7 @@ class Peer:
             value = self._changed.wait_for(lambda: condition(self.received), seconds)
             counts = {topic: len(messages) for topic, messages in self.received.items()}
             said = self.received.get('/diagnostics', [])[-1:]
-            assert value, f'{what} did not come; heard {counts}, last {said}'
+            assert value, f'{what} did not come; received {counts}, last {said}'
         return value
 
     def call(self, service: str, node: str = NODE) -> Any:

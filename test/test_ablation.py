@@ -82,9 +82,9 @@ def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
         variant('', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0], 'rpe')]}
     verdict_text = page.verdict(part)
     assert verdict_text == (
-        'By means. Worse in both: squares. Worse in one, and not told apart in the other: alone. '
-        'Better in one, and not told apart in the other: slow. Not told from `best`, whose '
-        'intervals hold 1: wide.')
+        'By the means: Worse in both: squares. Worse in one, not significant in the other: alone. '
+        'Better in one, not significant in the other: slow. Not significant (both intervals '
+        'contain 1): wide.')
     part['variants'].append(variant('surfaces alone', [1.3, 1.1, 1.5], [1.4, 1.2, 1.6]))
     joined = page.joined({'parts': {'ablation': part}})
     assert f'| RP-E | {ON_PLACES} |' in joined and '1.20 (0.90 to 1.50)' in joined
@@ -103,8 +103,7 @@ def pages() -> ModuleType:
 
 
 def test_scenes_without_parallax_have_no_direction_in_the_readme():
-    no_way = pages().NO_WAY
-    assert no_way == {'rotation', 'standstill', 'traffic'}
+    assert pages().WITHOUT_TRANSLATION == {'rotation', 'standstill', 'traffic'}
 
 
 def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():

@@ -192,4 +192,4 @@ def test_the_gradient_of_a_prior_is_that_of_its_cost():
     poses = since.moved(1e-4 * rng.normal(size=12))
     slopes = [(prior.at(poses.moved(step)).cost - prior.at(poses.moved(-step)).cost) / 2e-6
               for step in 1e-6 * np.eye(12)]
-    assert slopes == pytest.approx(prior.at(poses).slope, abs=1e-2)
+    assert slopes == pytest.approx(prior.at(poses).gradient, abs=1e-2)

@@ -95,7 +95,7 @@ def live(start: Callable[..., Command], graph_peer: Peer) -> Iterator[Callable[.
         return one
 
     def gone() -> bool:
-        return not any(map(graph_peer.graph.offers, TYPES))
+        return not any(map(graph_peer.graph.publishers_of, TYPES))
 
     graph_peer.wait('the end of the last node', gone)
     yield run
@@ -308,8 +308,8 @@ def test_request_from_another_middleware_is_logged_and_ignored(live, peer):
         f'rq{NODE}/pauseRequest', 'std_srvs::srv::dds_::Trigger_Request_', Profile(), '')
     peer.wait('the service', lambda: requests.listeners)
     requests.send(b'\0\1\0\0\0')
-    peer.wait('the log', lambda: 'a request for /vo_node/pause came in the form of another '
-              'middleware' in one.log)
+    peer.wait('the log', lambda: 'a request for /vo_node/pause came from another middleware'
+              in one.log)
     assert not peer.diagnostics(message='paused')
 
 

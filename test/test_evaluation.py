@@ -201,7 +201,7 @@ def test_drift_is_told_of_ways_of_over_100_metres(road, tmp_path):
             expected.rotation_deg_per_100m, rel=1e-3)
     least = f"{float(found['djet']['rotation_deg_per_100m']):.3f}"
     assert f'<b>{least}</b>' in (output / 'index.html').read_text()
-    for part in ('t_rel', 'Lengths are those of the ground truth', least):
+    for part in ('t_rel', 'Step lengths are those of the ground truth', least):
         assert part in ' '.join(answer.stdout.split())
 
 
@@ -444,11 +444,11 @@ UNHEARD = """
 from concurrent.futures import Future
 from signal import pthread_kill, SIGINT
 from threading import get_ident, Timer
-from djet_ros.lab.runner import _as_they_end
+from djet_ros.lab.runner import _as_completed
 
 Timer(0.5, lambda: pthread_kill(get_ident(), SIGINT)).start()
 try:
-    list(_as_they_end([Future()]))
+    list(_as_completed([Future()]))
 except KeyboardInterrupt:
     print('heard')
 """
@@ -492,7 +492,7 @@ def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     before = (tmp_path / 'records.jsonl').read_bytes()
     answer = djet(*run, '--methods', 'rpe')
     assert answer.returncode == 2
-    assert 'other settings (methods); choose another folder, or --overwrite' in answer.stderr
+    assert 'other settings (methods); choose another --output, or pass --overwrite' in answer.stderr
     assert (tmp_path / 'records.jsonl').read_bytes() == before
     assert djet(*run, '--methods', 'rpe', '--overwrite').returncode == 0
     assert {row['method'] for row in rows(tmp_path / 'table1.csv')} == {'rpe'}
@@ -509,7 +509,7 @@ def test_results_of_other_code_or_libraries_are_not_mixed(other, tmp_path):
     assert {'numpy', 'opencv', 'poselib', 'scipy'} == set(settings['libraries'])
     earlier = json.dumps({**settings, other: 'of yesterday'}) + '\n'
     (tmp_path / 'records.jsonl').write_text(earlier + ''.join(rest))
-    with pytest.raises(DjetError, match=f'other settings .{other}.; choose another folder'):
+    with pytest.raises(DjetError, match=f'other settings .{other}.; choose another --output'):
         RecordStore(tmp_path, PairRecord, {'methods': ['djet']})
 
 

@@ -45,8 +45,8 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
     T, pose, velocity = random_pose(rng), random_pose(rng, 5.0), rng.normal(size=6)
     root = rng.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
-    here, frames_of = pose_of_base(pose, covariance, T)
-    moving, told_of_twist = twist_of_base(velocity, covariance, T)
+    here, pose_covariance = pose_of_base(pose, covariance, T)
+    moving, twist_covariance = twist_of_base(velocity, covariance, T)
     off, off_of_twist = [], []
     for error in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
         disturbed = pose.copy()
@@ -56,7 +56,7 @@ def test_covariances_are_those_of_sampled_poses_and_velocities():
         off.append([*(there - here)[:3, 3], *Rotation.from_matrix(
             there[:3, :3] @ here[:3, :3].T).as_rotvec()])
         off_of_twist.append(twist_of_base(velocity + error, covariance, T)[0] - moving)
-    for samples, expected in ((off, frames_of), (off_of_twist, told_of_twist)):
+    for samples, expected in ((off, pose_covariance), (off_of_twist, twist_covariance)):
         assert np.allclose(np.cov(np.transpose(samples)), expected,
                            atol=0.05 * np.diag(expected).max())
 
