@@ -103,7 +103,7 @@ def pages() -> ModuleType:
 
 
 def test_scenes_without_parallax_have_no_direction_in_the_readme():
-    assert pages().WITHOUT_TRANSLATION == {'rotation', 'standstill', 'traffic'}
+    assert {'rotation', 'standstill', 'traffic'} == pages().WITHOUT_TRANSLATION
 
 
 def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
