@@ -751,3 +751,23 @@ def test_links_to_more_keyframes_are_edges_of_unknown_length(closed, tmp_path):
     links = [row for row in rows if row[2] == 'link']
     assert len(links) >= 4
     assert all(row[3] == '0' for row in links)
+
+
+def test_gtsam_built_for_another_numpy_is_refused_before_it_crashes(tmp_path, monkeypatch, capsys):
+    pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
+    from djet_ros import libraries
+    from djet_ros.cli.main import main
+    versions = {'gtsam': '4.2.2', 'numpy': '2.4.6'}
+    monkeypatch.setattr(libraries, 'version', versions.__getitem__)
+    assert main(['slam', str(tmp_path), '--output', str(tmp_path / 'slam')]) == 2
+    assert 'gtsam 4.2.2 does not work' in capsys.readouterr().err
+    assert libraries.problem_of('gtsam').startswith(
+        'gtsam 4.2.2 does not work with NumPy 2.4.6: ')
+    for versions['gtsam'], versions['numpy'] in (('4.2.2', '1.26.4'), ('4.3.0', '2.4.6')):
+        assert libraries.problem_of('gtsam') == ''
+
+
+def test_the_odometry_is_recommended_if_no_loop_was_closed(drive, tmp_path):
+    printed = djet('slam', drive, '--output', tmp_path / 'slam', '--scale', 'ground_truth',
+                   *FLAGS[:4], '--loop-gap', 1000).stdout
+    assert 'no loop was closed: prefer before_tum.txt' in printed

@@ -123,6 +123,12 @@ def test_landmarks_take_over_from_another_scale_while_running(cards):
             assert ratios == pytest.approx(np.full(4, ratios[0]), rel=0.03)
 
 
+def test_an_odometry_that_never_had_a_window_tracks(cards):
+    for scale in ('none', 'constant'):
+        results = Drive(cards, scale=scale, scale_value=1.0).go(steps()[:3])
+        assert all(result.status in TRACKED for result in results[1:])
+
+
 def test_the_sigma_of_a_step_is_that_of_its_parallax_and_not_of_the_unit(cards):
     results = Drive(cards).go(steps())[1:]
     lengths_of, sigmas = [], []

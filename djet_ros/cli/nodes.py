@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import sys
 
 from djet_ros.cli.graph_options import stop_by_signal
-from djet_ros.libraries import gtsam_problem, how_to_get
+from djet_ros.libraries import problem_of
 from djet_ros.threads import one_blas_thread, sleep_while_waiting
 
 _EPILOG = """\
@@ -45,9 +45,7 @@ def _run(name: str, description: str, *, without_ros: str,
     if find_spec('rclpy') is None:
         return _fail(name, "rclpy is missing: install ROS 2 and 'source "
                            f"/opt/ros/jazzy/setup.bash'; {without_ros}")
-    if library and find_spec(library) is None:
-        return _fail(name, f'{library} is missing: {how_to_get(library)}')
-    if library == 'gtsam' and (problem := gtsam_problem()):
+    if library and (problem := problem_of(library)):
         return _fail(name, problem)
 
     from djet_ros.errors import DjetError, one_line

@@ -16,7 +16,7 @@ from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.lab.slam_report import FILES, PLOT, write_report
-from djet_ros.libraries import gtsam_problem
+from djet_ros.libraries import problem_of
 from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import check_room, make_folder, make_room
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Close loops, with progress on stderr, and print a summary."""
-    if problem := gtsam_problem():
+    if problem := problem_of('gtsam'):
         raise DjetError(problem)
     given = flag_values(args)
     slam_values = {name: given.pop(name) for name in PARAMETERS if name in given}
