@@ -203,6 +203,8 @@ def test_an_equally_likely_motion_makes_a_pose_ambiguous() -> None:
     # other.
     assert result.t.any()
     assert np.sqrt(np.trace(result.covariance_5[3:, 3:])) > 0.1
+    assert min(abs(rival.t @ result.t) for rival in result.rivals) < 0.9
+    assert np.sqrt(np.trace(result.own_covariance_5[3:, 3:])) < 0.1
 
 
 def test_as_pure_rotation_fits_the_rotation_and_widens_the_covariance() -> None:
@@ -392,8 +394,8 @@ def test_an_improbable_distant_rival_does_not_widen_the_covariance(
     rival = Rival(Pose(seen.R, rotation_exp(aside * unit(around)) @ seen.t), preference)
     track = SimpleNamespace(rivals=(rival,), nearby=(), body_ambiguous=two_bodies)
     own = np.radians(0.2)**2 * np.eye(5)
-    _, covariance = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
-                                         sign_open=False)
+    _, covariance, _ = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
+                                            sign_open=False)
     claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
     # The squared distance times its probability; otherwise only the covariance of the pose.
     probable = norm.cdf(-preference / 2) if spanned else 0.0

@@ -129,3 +129,29 @@ def _view_of_a_plane(rng: np.random.Generator, texture: np.ndarray, turned: np.n
     seen = cv2.resize(cv2.warpPerspective(texture, H, (2 * SMALL[0], 2 * SMALL[1])), SMALL,
                       interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(seen + rng.normal(0, 1.5, seen.shape)), 0, 255).astype(np.uint8)
+
+
+def flight_over_a_plane(rng: np.random.Generator, count: int
+                        ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """
+    Return the K (3, 3), pictures (H, W) and poses (4, 4) of a camera over flat ground.
+
+    It is one unit above it, looks down by 45 degrees or more through a narrow lens, and flies
+    irregularly, by about a twentieth of that height per picture.
+    """
+    lens = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
+    ground = textured(rng, (2000, 2000))
+    on_ground = np.linalg.inv([[200.0, 0, 1000], [0, 200, 1000], [0, 0, 1]])
+    R = Rotation.from_euler('zx', (rng.uniform(-np.pi, np.pi), rng.uniform(0, np.pi / 4)))
+    place, turn = np.array([0, 0, -1.0]), rng.normal(size=3)
+    step = 0.06 * unit(rng.normal(size=3) * (1, 1, 0.3))
+    pictures, poses = [], []
+    for _ in range(count):
+        poses.append(np.block([[R.as_matrix(), place[:, None]], [np.zeros(3), 1]]))
+        into = np.linalg.inv(poses[-1])
+        seen = cv2.warpPerspective(ground, lens @ into[:3, [0, 1, 3]] @ on_ground, (320, 240),
+                                   flags=cv2.INTER_AREA) + rng.normal(0, 1.5, (240, 320))
+        pictures.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
+        step, turn = step + rng.normal(0, 0.01, 3), turn + rng.normal(0, 0.2, 3)
+        place, R = place + step, R * Rotation.from_rotvec(0.01 * turn)
+    return lens, pictures, poses

@@ -151,6 +151,18 @@ class TwoViewEstimator:
         return self.estimate_pair(Pair(previous, current, x, y, _prior_pose(prior),
                                        observe=observe, covariances=covariances))
 
+    def estimate_near(self, previous: View, current: View, relative: RelativePose, start: Pose,
+                      known: KnownMotion | None = None) -> RelativePose:
+        """
+        Estimate the motion again from the matches of a result, in the basin of one motion alone.
+
+        start: that motion, such as a rival that other evidence has decided for; known: as for
+        ``estimate``.
+        """
+        return self.estimate_pair(Pair(
+            previous, current, relative.x, relative.y, start, known or KnownMotion(), start=start,
+            sought=relative.sought, timings=relative.timings))
+
     def estimate_pair(self, pair: Pair) -> RelativePose:
         """Estimate the motion of a ``Pair``: its matches and all prior knowledge."""
         if len(pair.x) < self.config.min_matches:
@@ -203,6 +215,8 @@ class TwoViewEstimator:
             start, agree = found
             pair = pair.without(~agree)
             return pair, [start], self._sampled_surface(pair)
+        if pair.start is not None:
+            return pair, [pair.start], self._sampled_surface(pair)
         if pair.predicted is not None:
             with _timed(pair.timings, 'jet'):
                 return pair, [], self._surface(pair)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
 from djet_ros.core.geometry import inverse_depths
-from djet_ros.core.paraboloid import median
+from djet_ros.core.paraboloid import median, weighted_median
 from djet_ros.core.radial import undistorted_rays
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
@@ -35,12 +35,12 @@ class Lengths(NamedTuple):
 
     def median(self) -> float:
         """Return the weighted median."""
-        return _weighted_median(*self)
+        return weighted_median(*self)
 
     def standard_error(self) -> float:
         """Return the standard error of the median, for the effective number of weights."""
         deviations = np.abs(self.values - self.median())
-        sigma = 1.25 * 1.4826 * _weighted_median(deviations, self.weights)
+        sigma = 1.25 * 1.4826 * weighted_median(deviations, self.weights)
         return sigma * float(np.sqrt((self.weights**2).sum()) / self.weights.sum())
 
 
@@ -95,7 +95,7 @@ class KnownDepths:
         ratios = scaled / rho
         # By near points, which have most parallax but may be of another body, or by all with equal
         # weight.
-        lengths = np.array([[_weighted_median(ratios, rho / sigma)], [median(ratios)]])
+        lengths = np.array([[weighted_median(ratios, rho / sigma)], [median(ratios)]])
         noise = _MATCH_ERROR / self.K[0, 0] * sigma
         agree = np.abs(scaled - lengths * rho) < (
             _OUTLIER * noise + _DEPTH_ERROR * np.abs(lengths) * rho)
@@ -121,9 +121,3 @@ class KnownDepths:
         distances, match = tree.query(self.pixels, distance_upper_bound=_MATCH_RADIUS)
         near = np.isfinite(distances)
         return self.rho[near], match[near]
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values, kind='stable')
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])

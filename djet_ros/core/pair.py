@@ -57,8 +57,8 @@ class Pair:
     descriptor distances at x and y, if known already; covariances: (N, 2, 2) of y up to a common
     factor, which weight re-projection errors, all alike if None; sought: number of features that
     were searched, see ``RelativePose``; outliers: number of matches removed before as outliers of
-    a starting pose; observe: called with each round of Algorithm 1; timings: receives the seconds
-    of each stage.
+    a starting pose; start: the only one to start from, if the basin is known; observe: called with
+    each round of Algorithm 1; timings: receives the seconds of each stage.
     """
 
     previous: View
@@ -73,6 +73,7 @@ class Pair:
     covariances: Array | None = None
     sought: int = 0
     outliers: int = 0
+    start: Pose | None = None
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)
 

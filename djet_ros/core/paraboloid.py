@@ -114,6 +114,13 @@ def medians_of_parts(values: Array, counts: NDArray[np.int64]) -> Array:
     return np.asarray((ordered[first + (counts - 1) // 2] + ordered[first + counts // 2]) / 2)
 
 
+def weighted_median(values: Array, weights: Array) -> float:
+    """Return the weighted median of (N,) values."""
+    order = np.argsort(values, kind='stable')
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
 def quantile(values: Array, share: float) -> float:
     """Return a quantile of (N,) values, as `np.quantile` does, three times as fast."""
     place = share * (len(values) - 1)

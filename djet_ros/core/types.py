@@ -163,8 +163,10 @@ class RelativePose:
     off the image); losses: (N,) loss of each match on its surface, the last one if it was culled;
     culled: number of matches without a usable surface in the end; indefinite: number of surfaces
     without a minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other
-    motions that were considered, up to the sign of t; sought: number of features of the previous
-    image that were searched, 0 if matches were given.
+    motions, up to the sign of t and beyond own_covariance_5, that the matches do not exclude
+    beyond doubt, and the pose with -t if they do not exclude that;
+    own_covariance_5: (5, 5) covariance_5 as it is without any rival; sought: number of features of
+    the previous image that were searched, 0 if matches were given.
     """
 
     status: Status
@@ -187,4 +189,5 @@ class RelativePose:
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)
     rivals: tuple[Pose, ...] = ()
+    own_covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
     sought: int = 0

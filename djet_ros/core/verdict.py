@@ -80,6 +80,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
                               None if pair.bits is None else (pair.y, pair.bits))
 
     status, R, t, count = Status.OK, pose.R, pose.t, int(inliers.sum())
+    own_covariance, rivals = covariance, list[Pose]()
     if (count < config.min_matches or not np.isfinite(covariance).all()
             or _random_descriptors(hamming[inliers])):
         status, t = Status.DEGENERATE, np.zeros(3)
@@ -91,12 +92,14 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         if alone.is_biased:
             covariance = _widened_by_rotation(covariance, pose.R, R)
     else:
-        status, covariance = _compare_with_rivals(pose, covariance, track, pair.x, pair.prior,
-                                                  sign_open)
+        status, covariance, rivals = _compare_with_rivals(
+            pose, covariance, track, pair.x, pair.prior, sign_open)
     determined = bool(np.isfinite(covariance).all())
     if config.calibration_sigma and determined:
-        covariance = widened(covariance, pose.t, calibration_covariance(
-            track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma))
+        calibration = calibration_covariance(
+            track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma)
+        covariance, own_covariance = (widened(each, pose.t, calibration)
+                                      for each in (covariance, own_covariance))
     covariance_6 = lifted_covariance(covariance, pose.t) if determined else UNDETERMINED[1]
 
     lines = epipolar_lines(fundamental(K, R, track.pose.t), pair.x)
@@ -108,7 +111,15 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
-        sought=pair.sought, rivals=(*(rival.pose for rival in track.rivals), *opposite))
+        sought=pair.sought, rivals=(*rivals, *opposite),
+        own_covariance_5=own_covariance)
+
+
+def as_decided(relative: RelativePose) -> RelativePose:
+    """Return a pair as OK without rivals, as other evidence than its images excludes them."""
+    own = relative.own_covariance_5
+    return replace(relative, status=Status.OK, rivals=(), covariance_5=own,
+                   covariance_6=lifted_covariance(own, relative.t))
 
 
 def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
@@ -179,10 +190,12 @@ def _covariance(track: Track, pose: Pose, x: Array, flipped: bool) -> Array:
 
 
 def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
-                         prior: Pose | None, sign_open: bool) -> tuple[Status, Array]:
+                         prior: Pose | None, sign_open: bool
+                         ) -> tuple[Status, Array, list[Pose]]:
     """
-    Compare a pose with its rivals: return its status, and its covariance (5, 5) that spans them.
+    Compare a pose with its rivals.
 
+    Returns its status, its covariance (5, 5) that spans them, and the rivals that are possible.
     x: (N, 2) pixels of the matches in the previous image; sign_open: whether -t remains possible,
     which is a rival too. Rivals within the covariance are covered already. Any other is the true
     motion with the probability that the preference is due to noise. If that is negligible, the
@@ -191,6 +204,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
     undecided_covariances: list[Array] = []
+    possible: list[Pose] = []
     for rival in (*track.rivals, *track.nearby):
         offset = pose_difference(pose.R, pose.t, rival.pose)
         if squared_distance(covariance, offset) < CHI2_999:
@@ -202,6 +216,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
         if track.body_ambiguous or rival.preference < _NEGLIGIBLE_PREFERENCE:
             probability = float(ndtr(-rival.preference / _OVERSTATEMENT))
             covariance = widened_to_span(covariance, offset, probability)
+            possible.append(rival.pose)
         if undecided:
             undecided_covariances.append(_covariance_of(rival.pose, track, x))
     # Only after all rivals were compared: the uncertainty of one rival must not make another one
@@ -213,7 +228,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
         # -t is at chord 2, in no particular tangent direction.
         for offset in np.sqrt(2) * np.eye(5)[3:]:
             covariance = widened_to_span(covariance, offset, 0.5)
-    return status, covariance
+    return status, covariance, possible
 
 
 def _covariance_of(pose: Pose, track: Track, x: Array) -> Array:

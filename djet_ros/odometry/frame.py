@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.types import Array, of_same_camera, Status, View
+from djet_ros.core.types import Array, of_same_camera, RelativePose, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,18 +36,20 @@ class Reference:
     """
     The reference frame, and the newest stamp at which the camera was still at its pose.
 
-    view: of the frame; since_ns: stamp of the frame, or of a later one in a standstill;
-    since_covariance: (6, 6) of the camera's pose at that stamp in the reference frame.
+    view: of the frame; pair: the one that ends with it, None if there is none; since_ns: stamp of
+    the frame, or of a later one in a standstill; since_covariance: (6, 6) of the camera's pose at
+    that stamp in the reference frame.
     """
 
     frame: Frame
     view: View
+    pair: RelativePose | None
     since_ns: int
     since_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def seen_by(self, estimator: TwoViewEstimator) -> Reference:
-        """Return the same with the view that another estimator prepares."""
-        return replace(self, view=self.frame.view(estimator))
+        """Return the same with the view that another estimator prepares, without its pair."""
+        return replace(self, view=self.frame.view(estimator), pair=None)
 
 
 def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:

@@ -9,6 +9,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.starts import KnownMotion
+from djet_ros.core.three_views import consistent_motion
 from djet_ros.core.types import (
     Array,
     of_same_camera,
@@ -18,6 +19,7 @@ from djet_ros.core.types import (
     UNDECIDED,
     View,
 )
+from djet_ros.core.verdict import as_decided
 from djet_ros.odometry.frame import continuity, Frame, Reference
 from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.inertial import Gyro
@@ -157,6 +159,9 @@ class VisualOdometry:
         span = reference.since_ns, frame.stamp_ns
         priors = self._priors.of(span)
         pair = self._estimator.estimate(reference.view, view, self._last_pair, priors)
+        # If several motions are possible, the pair before may decide.
+        if pair.rivals and pair.status in (Status.OK, Status.AMBIGUOUS):
+            pair = self._decided(view, pair, priors)
         self._scale_source.observe(*span, reference.view, view, pair)
         # Detect a standstill.
         at_rest = self._priors.at_rest(span)
@@ -168,6 +173,18 @@ class VisualOdometry:
             return self._lost(frame, view, pair, span)
         # Estimate the length of its translation, and integrate it.
         return self._tracked(frame, view, pair, span)
+
+    def _decided(self, view: View, pair: RelativePose, priors: KnownMotion) -> RelativePose:
+        """Return the pair with the motion that is consistent with the pair before it, if any."""
+        reference = self._reference
+        if reference.pair is None:
+            return pair
+        motion = consistent_motion(reference.pair, pair, view.K)
+        if motion is None:
+            return pair
+        if np.array_equal(motion.R, pair.R) and np.array_equal(motion.t, pair.t):
+            return as_decided(pair)
+        return self._estimator.estimate_near(reference.view, view, pair, motion, priors)
 
     def _verified(self, view: View, pair: RelativePose, priors: KnownMotion,
                   span: Span) -> RelativePose:
@@ -202,7 +219,7 @@ class VisualOdometry:
                 (self._reference.since_ns, frame.stamp_ns)) or unknown))
         if backwards or status is Status.FIRST_FRAME:
             self._priors.known_ns = frame.stamp_ns
-        self._refer_to(frame, view)
+        self._refer_to(frame, view, None)
         self._scale.begin(view)
         self._last_pair, self._bad_pairs = None, 0
         return OdometryResult.without_pair(
@@ -244,7 +261,7 @@ class VisualOdometry:
             else:
                 self._scale.bridge(span, view, pair, motion)
             self._trajectory = trajectory
-            self._refer_to(frame, view)
+            self._refer_to(frame, view, pair)
             self._last_pair = None if given_up else _motion_alone(self._last_pair)
         return result
 
@@ -261,7 +278,7 @@ class VisualOdometry:
             keyframe=not waits and self._scale.keyframe)
         if not waits:
             self._trajectory = trajectory
-            self._refer_to(frame, view)
+            self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
         self._standstill.moved()
         if (k1 := self._scale.k1_due) is not None:
@@ -275,9 +292,9 @@ class VisualOdometry:
         displacements = np.linalg.norm(pair.y - pair.x, axis=1)
         return bool(np.median(displacements) < _IN_VIEW * max(self._reference.view.gray.shape))
 
-    def _refer_to(self, frame: Frame, view: View) -> None:
-        """Make a frame the reference."""
-        self._reference = Reference(frame, view, frame.stamp_ns)
+    def _refer_to(self, frame: Frame, view: View, pair: RelativePose | None) -> None:
+        """Make a frame the reference; pair: the one that ends with it."""
+        self._reference = Reference(frame, view, pair, frame.stamp_ns)
         self._priors.refer(frame.stamp_ns)
         self._priors.forget_before(frame.stamp_ns)
         self._standstill.refer()

@@ -1,0 +1,99 @@
+"""
+Which of the motions that explain each of two consecutive pairs is that of one rigid scene.
+
+Two views of a plane fit two motions (see `core.rivals.planar_twin`), and no match tells which is
+true. The two give the points different depths, and the next pair triangulates the same points
+again: only the true motions of both pairs give depths in one ratio.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+from djet_ros.core.geometry import inverse_depths, rays
+from djet_ros.core.jet import Loss, robust_scale
+from djet_ros.core.paraboloid import weighted_median
+from djet_ros.core.rivals import preferences, SIGNIFICANT_PREFERENCE
+from djet_ros.core.types import Array, Pose, RelativePose
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+# Pixels; chosen: distance of a match of one pair from one of the other up to which they are of the
+# same point.
+_SAME_POINT = 1.5
+
+# chosen: fewer shared points do not decide.
+_MIN_POINTS = 30
+
+# chosen: largest noise of the displacements along epipolar lines, relative to that of the matches
+# across them, at which depths agree. With the true motions it is 0.6 to 1.2, as either is that of
+# the same matches; it is 2 and more if the shutter rolls.
+_MAX_NOISE = 1.5
+
+# Robust standard deviations beyond which a point is an outlier.
+_OUTLIER = 4.0
+
+
+def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> Pose | None:
+    """
+    Return the motion of a pair, its pose or one of its rivals, that agrees with the pair before.
+
+    before: the pair that ends where the other begins, with rivals of its own; K: (3, 3). Compares
+    all combinations of their motions by Vuong's test, see `rivals.preferences`. None if it does
+    not decide, if the best combination does not agree either, or if the pairs share too few
+    points.
+    """
+    if not before.t.any() or not current.t.any():
+        return None
+    x, y = (places[current.inliers] for places in (current.x, current.y))
+    tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
+    distances, match = tree.query(before.y[before.inliers], distance_upper_bound=_SAME_POINT)
+    shared = np.isfinite(distances)
+    x, y = x[match[shared]], y[match[shared]]
+    if len(x) < _MIN_POINTS:
+        return None
+    motions = [Pose(current.R, current.t), *current.rivals]
+    known = [_depths_after(before, motion, K, shared)
+             for motion in (Pose(before.R, before.t), *before.rivals)]
+    seen = [inverse_depths(motion.R, motion.t, rays(K, x), rays(K, y)) for motion in motions]
+    errors = K[0, 0] * np.stack([_disagreement(depths, triangulated)
+                                 for depths, triangulated in product(known, seen)])
+    noise = min(map(robust_scale, errors))
+    losses, _ = Loss('geman_mcclure', _OUTLIER * noise)(errors**2)
+    best = int(losses.sum(1).argmin())
+    allowed = _MAX_NOISE * robust_scale(current.residuals[current.inliers])
+    if robust_scale(errors[best]) > allowed:
+        return None
+    chosen = best % len(motions)
+    others = np.arange(len(errors)) % len(motions) != chosen
+    if (preferences(losses, x, best)[others] < SIGNIFICANT_PREFERENCE).any():
+        return None
+    return motions[chosen]
+
+
+def _depths_after(pair: RelativePose, motion: Pose, K: Array, shared: NDArray[np.bool_]
+                  ) -> tuple[Array, Array]:
+    """
+    Return inverse depths (N,) of points of a pair in its second view, by one of its motions.
+
+    shared: the mask of these points among the inliers. In units of the translation, and with their
+    standard deviations (N,) as `inverse_depths`. The sign of t is the one with more points in
+    front.
+    """
+    rays_x, rays_y = (rays(K, places[pair.inliers][shared]) for places in (pair.x, pair.y))
+    rho, sigma = inverse_depths(motion.R, motion.t, rays_x, rays_y)
+    depths = (rays_x @ motion.R.T)[:, 2] + rho * motion.t[2]
+    return np.sign(np.median(rho)) * rho / depths, sigma / np.abs(depths)
+
+
+def _disagreement(known: tuple[Array, Array], triangulated: tuple[Array, Array]) -> Array:
+    """
+    Return the differences (N,) of inverse depths from known ones, in errors of a ray.
+
+    known, triangulated: with their standard deviations, (N,) each. They are in different units,
+    whose ratio is their weighted median.
+    """
+    (known_rho, known_sigma), (rho, sigma) = known, triangulated
+    ratio = weighted_median(rho / known_rho, np.abs(known_rho) / sigma)
+    return np.asarray((rho - ratio * known_rho) / np.hypot(sigma, ratio * known_sigma))

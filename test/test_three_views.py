@@ -1,0 +1,108 @@
+"""Two pairs of one rigid scene decide between motions that each pair alone leaves open."""
+
+from itertools import pairwise
+
+import cv2
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import direction_angle, rotation_angle, unit
+from djet_ros.core.three_views import consistent_motion
+from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.visual_odometry import VisualOdometry
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from two_view import flight_over_a_plane, K, project, SIZE
+
+NOISE = 0.1
+
+
+def three_views_of_a_plane(seed: int) -> list[tuple[RelativePose, Pose, Pose]]:
+    """Return two pairs that follow one another, each with its true motion, and with its twin."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform((20, 20), np.array(SIZE) - 20, (400, 2))
+    normal = unit(np.array([0.3, 0.5, 1]) + 0.1 * rng.normal(size=3)) / 10
+    rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
+    points = rays / (rays @ normal)[:, None]
+    pixels, pairs, noise = x, [], rng.normal(0, NOISE, (3, *x.shape))
+    for number in (1, 2):
+        R = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
+        t = rng.normal(size=3) * (0.5, 0.5, 0.3)
+        H = R + np.outer(t, normal)
+        points = points @ R.T + t
+        # n.X = 1 before, so that X' = H X, and n' = H^-T n.
+        normal = np.linalg.inv(H).T @ normal
+        seen, _ = project(K, points)
+        _, turns, ways, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+        motions = [Pose(turn, unit(way.ravel())) for turn, way in zip(turns, ways)]
+        twin = max(motions, key=lambda pose: rotation_angle(pose.R, R) + min(
+            direction_angle(sign * pose.t, t) for sign in (1, -1)))
+        pair = RelativePose(
+            Status.AMBIGUOUS, R, unit(t), x=pixels + noise[number - 1],
+            y=seen + noise[number], inliers=np.ones(len(x), bool),
+            residuals=rng.normal(0, np.sqrt(2) * NOISE, len(x)))
+        pairs.append((pair, Pose(R, unit(t)), twin))
+        pixels = seen
+    return pairs
+
+
+def of_motions(pair: RelativePose, *motions: Pose) -> RelativePose:
+    """Return the pair with the first of some motions as its pose, and the others as rivals."""
+    first, *rivals = motions
+    return RelativePose(Status.AMBIGUOUS, first.R, first.t, x=pair.x, y=pair.y,
+                        inliers=pair.inliers, residuals=pair.residuals, rivals=tuple(rivals))
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_the_true_motion_of_a_plane_is_found_whichever_was_taken_first(seed: int):
+    (before, *earlier), (current, *later) = three_views_of_a_plane(seed)
+    for one in (earlier, earlier[::-1]):
+        for other in (later, later[::-1]):
+            found = consistent_motion(of_motions(before, *one), of_motions(current, *other), K)
+            assert found is not None
+            assert np.array_equal(found.R, later[0].R) and np.array_equal(found.t, later[0].t)
+
+
+def test_nothing_is_decided_if_the_matches_of_the_two_pairs_do_not_agree():
+    (before, *earlier), (current, *later) = three_views_of_a_plane(3)
+    assert consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K)
+    # Rows of a rolling shutter see other poses.
+    shift = np.outer(np.sin(current.y[:, 1] / 60), (3.0, 0.0))
+    rolling = of_motions(current, *later)
+    rolling.y[:] += shift
+    assert consistent_motion(of_motions(before, *earlier), rolling, K) is None
+
+
+def test_a_wrong_motion_before_decides_nothing():
+    (before, _, wrong), (current, *later) = three_views_of_a_plane(3)
+    assert consistent_motion(of_motions(before, wrong), of_motions(current, *later), K) is None
+
+
+def test_few_shared_points_decide_nothing():
+    (before, *earlier), (current, *later) = three_views_of_a_plane(3)
+    current.inliers[20:] = False
+    assert consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K) is None
+
+
+def test_the_sign_of_t_alone_is_not_decided():
+    (before, *earlier), (current, true, _) = three_views_of_a_plane(3)
+    both = of_motions(current, true, Pose(true.R, -true.t))
+    assert consistent_motion(of_motions(before, *earlier), both, K) is None
+
+
+def test_over_flat_ground_pairs_after_the_first_ones_have_the_true_motion():
+    """By themselves a third of them are ambiguous: the lens is too narrow for chirality."""
+    estimator, alone, in_a_row = TwoViewEstimator(), [], []
+    for seed in range(6):
+        lens, pictures, poses = flight_over_a_plane(np.random.default_rng(seed), 8)
+        views = [estimator.view(gray, lens) for gray in pictures]
+        alone += [estimator.estimate(one, other).status for one, other in pairwise(views[2:])]
+        odometry = VisualOdometry()
+        results = [odometry.process(Frame(gray, lens, (number + 1) * 10**8))
+                   for number, gray in enumerate(pictures)]
+        in_a_row += [result.status for result in results[3:]]
+        for result, before, after in zip(results[3:], poses[2:], poses[3:]):
+            true_motion = np.linalg.inv(before) @ after
+            assert np.degrees(direction_angle(result.motion[:3, 3], true_motion[:3, 3])) < 2
+    assert alone.count(Status.AMBIGUOUS) > len(alone) / 3
+    assert set(in_a_row) == {Status.OK}
