@@ -34,7 +34,7 @@ def scene(rng, frames=4, landmarks=40, k1=0.05):
     for frame in range(frames):
         found.minima[:, frame] = projected(K, points_in_frame(K, poses, found, frame), k1)
         later = found.anchors < frame
-        found.seen[later, frame] = True
+        found.observed[later, frame] = True
         A = rng.normal(size=(landmarks, 2, 2))
         found.roots[:, frame] = A + 2 * np.eye(2)
     found.anchor_roots[:] = rng.normal(size=(landmarks, 2, 2)) + 2 * np.eye(2)
@@ -147,7 +147,7 @@ def test_removing_a_frame_removes_the_landmarks_anchored_in_it():
     assert len(left) == 20
     assert not left.anchors.any()
     assert np.array_equal(left.minima, landmarks.minima[20:, 1:])
-    assert landmarks.with_frame().seen.shape == (40, 5)
+    assert landmarks.with_frame().observed.shape == (40, 5)
 
 
 def test_noise_of_the_anchor_patch_does_not_bias_steps():

@@ -349,7 +349,7 @@ def test_residuals_of_a_window_are_those_of_numpy(seen: bool) -> None:
     landmarks.rho[:9] = -3.0
     landmarks.rho[9:12] = 1e9
     landmarks.points[12:20] *= 9
-    landmarks.seen &= seen
+    landmarks.observed &= seen
     ours, numpys = both(lambda: observe(BUNDLE_K, poses, landmarks))
     for name, mine in vars(ours).items():
         others = getattr(numpys, name)
@@ -363,7 +363,7 @@ def test_landmarks_are_eliminated_as_numpy_does(lens: bool) -> None:
     poses, landmarks = scene(rng, frames=6, landmarks=57)
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
     # One without observations, and one whose anchor has no precision.
-    landmarks.seen[11] = False
+    landmarks.observed[11] = False
     landmarks.anchor_roots[12] = 0
     observed = observe(BUNDLE_K, poses, landmarks)
     weights = rng.uniform(0, 2, len(observed.residuals))

@@ -393,13 +393,13 @@ def test_the_measurement_of_a_landmark_does_not_depend_on_its_prediction(cards):
     drive.go([pose(x=0.16, z=0.03)] * 4)
     window = drive.odometry._scale._window
     found = window._landmarks
-    before, seen = found.minima[:, -1].copy(), found.seen[:, -1].copy()
+    before, seen = found.minima[:, -1].copy(), found.observed[:, -1].copy()
     focal, R = window._K[0, 0], window._poses.R.copy()
     for pixels in (-1.0, -0.5, 0.5, 1.0):
         window._poses.R[-1] = rotation_exp(np.array([0.0, pixels / focal, 0.0])) @ R[-1]
-        found.seen[:, -1] = False
+        found.observed[:, -1] = False
         window._observe_landmarks()
-        both = seen & found.seen[:, -1]
+        both = seen & found.observed[:, -1]
         assert both.sum() > 0.5 * seen.sum()
         moved = (found.minima[both, -1] - before[both])[:, 0]
         assert abs(np.median(moved)) < 0.06 * abs(pixels)

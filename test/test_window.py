@@ -117,16 +117,16 @@ class NumbersWindow(Window):
         mine = np.array([self._which[tuple(point)] for point in found.anchor_pixels.tolist()], int)
         pixels = self._projected(points_in_frame(K, self._poses, found, newest))
         wanted = seen[mine] & inside(pixels)
-        wanted &= found.seen[:, -3:-1].any(1) | (found.anchors == newest - 1)
-        found.minima[wanted, -1], found.seen[wanted, -1] = places[mine[wanted]], True
+        wanted &= found.observed[:, -3:-1].any(1) | (found.anchors == newest - 1)
+        found.minima[wanted, -1], found.observed[wanted, -1] = places[mine[wanted]], True
         found.roots[wanted, -1] = np.eye(2)
 
     def _refine(self) -> Numbers:
-        before = int(self._landmarks.seen[:, -1].sum())
+        before = int(self._landmarks.observed[:, -1].sum())
         H = super()._refine()
         self.scales.append(self._scale)
         self.taken += before
-        self.thrown += before - int(self._landmarks.seen[:, -1].sum())
+        self.thrown += before - int(self._landmarks.observed[:, -1].sum())
         return H
 
 

@@ -214,13 +214,13 @@ class Algorithm:
                     or voting.sum() <= limits.min_agreeing * len(voting)):
                 return None
             # Step 2: global pose optimisation.
-            found = self._optimised(paraboloids, voting, poses, predicted, by_points)
+            optimised = self._optimised(paraboloids, voting, poses, predicted, by_points)
             if not rounds:
-                self.first = found
-            if ((found.converged and self._is_warped)
+                self.first = optimised
+            if ((optimised.converged and self._is_warped)
                     or len(rounds) + 1 == self.config.max_iterations):
                 break
-            pose = found.solution.pose
+            pose = optimised.solution.pose
             if by_points and (self._match_noise(pose)
                               > ALGORITHM_TUNING.first_round_noise * limits.max_noise):
                 return None
@@ -228,15 +228,16 @@ class Algorithm:
             rounds.append(self._round(fits, paraboloids, pose))
             self._advance(pose, rounds[-1].optimum)
             poses, by_points = [pose], False
-        surface_noise = _scale(found.solution.residuals.r)
-        found, placed = self._with_alignment(found)
-        found, rivals, nearby = self._at_best_minimum(found)
-        rounds.append(self._round(fits, paraboloids, found.solution.pose))
+        surface_noise = _scale(optimised.solution.residuals.r)
+        optimised, placed = self._with_alignment(optimised)
+        optimised, rivals, nearby = self._at_best_minimum(optimised)
+        rounds.append(self._round(fits, paraboloids, optimised.solution.pose))
         minima = paraboloids.minima()
-        minima[voting] = (self._K @ found.problem.rays_y)[:2].T
-        return Track(found.solution.pose, found.problem, found.loss, found.solution.residuals,
-                     voting, minima, placed, rounds[-1].optimum, self._losses, indefinite,
-                     surface_noise, tuple(rounds), rivals, nearby)
+        minima[voting] = (self._K @ optimised.problem.rays_y)[:2].T
+        solution = optimised.solution
+        return Track(solution.pose, optimised.problem, optimised.loss, solution.residuals, voting,
+                     minima, placed, rounds[-1].optimum, self._losses, indefinite, surface_noise,
+                     tuple(rounds), rivals, nearby)
 
     @property
     def _is_warped(self) -> bool:
@@ -311,42 +312,42 @@ class Algorithm:
         if self.config.warp_reference:
             self._warp, self._plausible = _warps(pose, self._K, self.surface.x, optimum)
 
-    def _with_alignment(self, found: OptimisedPose) -> tuple[OptimisedPose, Aligned]:
+    def _with_alignment(self, optimised: OptimisedPose) -> tuple[OptimisedPose, Aligned]:
         """Make step 2 once more with photometric alignment, a measurement of its own."""
-        pair, voting, placed = self.pair, found.voting, unaligned(self.pair.y)
+        pair, voting, placed = self.pair, optimised.voting, unaligned(self.pair.y)
         if not self.config.join_matches or self.config.method == 'rpe':
-            return found, placed
+            return optimised, placed
         aligned = self.surface.aligned(pair.y, self._warp, voting)
         placed.places[voting], placed.covariances[voting] = aligned
-        return _with_photometric(found, self._K, aligned, self.config), placed
+        return _with_photometric(optimised, self._K, aligned, self.config), placed
 
-    def _at_best_minimum(self, found: OptimisedPose
+    def _at_best_minimum(self, optimised: OptimisedPose
                          ) -> tuple[OptimisedPose, tuple[Rival, ...], tuple[Rival, ...]]:
         """
         Choose once more among the basins of the first round, and among the minima of the best one.
 
         With all measurements. Returns the other basins and the other minima as rivals.
         """
-        solution = found.solution
+        problem, solution, loss = optimised.problem, optimised.solution, optimised.loss
         rivals: tuple[Rival, ...] = ()
         nearby: tuple[Rival, ...] = ()
         if self.first.rivals:
             solution, rivals = choose_among_rivals(
-                found.problem, found.x, solution, self.first.rivals, found.loss, self.pair.prior)
+                problem, optimised.x, solution, self.first.rivals, loss, self.pair.prior)
         if self.config.loss != 'none':
-            solution, nearby = lowest_nearby_minimum(found.problem, found.x, solution, found.loss)
-        return replace(found, solution=solution), rivals, nearby
+            solution, nearby = lowest_nearby_minimum(problem, optimised.x, solution, loss)
+        return replace(optimised, solution=solution), rivals, nearby
 
 
-def _with_photometric(found: OptimisedPose, K: Array, placed: Aligned, config: EstimatorConfig
+def _with_photometric(optimised: OptimisedPose, K: Array, placed: Aligned, config: EstimatorConfig
                       ) -> OptimisedPose:
     """Optimise the pose by surfaces and photometric alignment together."""
-    solution = found.solution
-    problem = fuse_alignment(found.problem, solution, K, placed)
-    agreeing = np.abs(solution.residuals.r) < found.loss.scale
+    solution = optimised.solution
+    problem = fuse_alignment(optimised.problem, solution, K, placed)
+    agreeing = np.abs(solution.residuals.r) < optimised.loss.scale
     residuals = epipolar_residuals(problem, solution.R, solution.t)
-    loss = replace(found.loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
-    return replace(found, problem=problem, loss=loss, solution=minimise(
+    loss = replace(optimised.loss, scale=config.loss_scale * _scale(residuals.r[agreeing]))
+    return replace(optimised, problem=problem, loss=loss, solution=minimise(
         problem, solution.R, solution.t, loss, MAX_STEPS, residuals))
 
 
@@ -399,11 +400,11 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     plausible = (ratio > 0) & has_moderate_stretch(warp)
     warp = np.where(plausible[:, None, None], warp, np.eye(3, 2))
     # The slant of a patch is estimated from the depths of its neighbours.
-    which = np.flatnonzero(plausible)
-    x, y, rays_x, rays_y = (places.take(which, axis=0) for places in (x, y, rays_x, rays_y))
+    indices = np.flatnonzero(plausible)
+    x, y, rays_x, rays_y = (places.take(indices, axis=0) for places in (x, y, rays_x, rays_y))
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
     slopes = slopes_of_all(x, rho, ALGORITHM_TUNING.depth_noise / K[0, 0] * sigma)
-    slanted = warp.take(which, axis=0) + slant_warp(K, pose.t, y, ratio[which], slopes)
+    slanted = warp.take(indices, axis=0) + slant_warp(K, pose.t, y, ratio[indices], slopes)
     slant_ok = has_moderate_stretch(slanted)
-    warp[which[slant_ok]] = slanted[slant_ok]
+    warp[indices[slant_ok]] = slanted[slant_ok]
     return warp, plausible

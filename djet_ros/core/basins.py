@@ -123,22 +123,22 @@ def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
     places: (N, 2) pixels of the matches; prior: the previous motion, which decides if the matches
     do not; measured: a measured rotation, with which the pose has to be consistent.
     """
-    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_to_sketch))
-    scale = max(refine_all(some, starts, Loss(), 0).scales().min(), MIN_SCALE)
+    subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_to_sketch))
+    scale = max(refine_all(subset, starts, Loss(), 0).scales().min(), MIN_SCALE)
     tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
     if measured is not None:
         # The majority of the matches gives the noise, and what fits the measured rotation fits it
         # well.
-        scale = max(refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch).scales().min(),
+        scale = max(refine_all(subset, starts, tight, BASIN_TUNING.steps_to_sketch).scales().min(),
                     MIN_SCALE)
         tight = replace(tight, scale=min(config.loss_scale, BASIN_TUNING.tight) * scale)
-        sketch = refine_all(some, starts, tight, BASIN_TUNING.steps_to_compare,
+        sketch = refine_all(subset, starts, tight, BASIN_TUNING.steps_to_compare,
                             _rotation_prior(measured, scale))
-        starts = _cheapest_basins(some, sketch, tight, BASIN_TUNING.rotation_starts)
+        starts = _cheapest_basins(subset, sketch, tight, BASIN_TUNING.rotation_starts)
     elif len(problem.blur) > BASIN_TUNING.few_matches:
         starts = [*starts, *hemisphere_starts(starts[0].R, BASIN_TUNING.many_directions)]
-        sketch = refine_all(some, starts, tight, BASIN_TUNING.steps_to_sketch)
-        starts = _cheapest_basins(some, sketch, tight, BASIN_TUNING.refined_starts)
+        sketch = refine_all(subset, starts, tight, BASIN_TUNING.steps_to_sketch)
+        starts = _cheapest_basins(subset, sketch, tight, BASIN_TUNING.refined_starts)
     else:
         starts = [*starts, *hemisphere_starts(starts[0].R, BASIN_TUNING.directions)]
     return _refine_and_choose(problem, places, starts, tight, prior, measured)
@@ -171,21 +171,21 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
     convergence, as some may lead to the same minimum; if that does not help, they are refined on
     all matches. If a rotation alone explains the matches, the choice does not matter.
     """
-    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_predicted))
+    subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_predicted))
     tight = Loss()
     basins = starts = starts_around(predicted, BASIN_TUNING.directions)
     for steps in (0, *BASIN_TUNING.steps_predicted):
-        found = refine_all(some, basins, tight, steps)
-        scale = max(found.scales().min(), MIN_SCALE)
+        refined = refine_all(subset, basins, tight, steps)
+        scale = max(refined.scales().min(), MIN_SCALE)
         tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
         if steps:
-            basins = _cheapest_basins(some, found, tight, BASIN_TUNING.refined_starts)
+            basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)
     if ((len(basins) > 1 and _is_clear(problem, places, basins, tight))
             or _is_pure_rotation(problem, config.min_parallax)):
         return basin_of(problem, basins[0])
     # Include all starts again: the cheapest so far may all be of one valley.
-    found = refine_all(some, [*basins, *starts], tight, BASIN_TUNING.steps_to_compare)
-    basins = _cheapest_basins(some, found, tight, BASIN_TUNING.refined_starts)
+    refined = refine_all(subset, [*basins, *starts], tight, BASIN_TUNING.steps_to_compare)
+    basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)
     if _is_clear(problem, places, basins, tight):
         return basin_of(problem, basins[0])
     prior = predicted if predicted.t.any() else None
@@ -251,13 +251,13 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
     steps = (axes[:, :2] * BASIN_TUNING.nearby_distance / np.sqrt(eigenvalues[:2])).T
     starts = map(Pose, *moved_all(solution.R, solution.t, solution.residuals.tangents,
                                   np.concatenate([steps, -steps])))
-    some = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.few_matches))
-    refined = refine_all(some, [solution.pose, *starts], loss, BASIN_TUNING.steps_nearby).poses()
-    bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(some.blur)
-    others = _distinct(refined, solution, information, bound)[1:]
-    minima = [solution, *(minimise(problem, refined[number].R, refined[number].t, loss)
-                          for number in others)]
-    minima = [minima[number] for number in _distinct(
+    subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.few_matches))
+    refined = refine_all(subset, [solution.pose, *starts], loss, BASIN_TUNING.steps_nearby).poses()
+    bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(subset.blur)
+    distinct = _distinct(refined, solution, information, bound)[1:]
+    minima = [solution, *(minimise(problem, refined[index].R, refined[index].t, loss)
+                          for index in distinct)]
+    minima = [minima[index] for index in _distinct(
         [minimum.pose for minimum in minima], solution, information, BASIN_TUNING.same_minimum)]
     if len(minima) == 1:
         return solution, ()
@@ -265,8 +265,8 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
     losses = losses_at(problem, poses, loss)
     best = int(losses.sum(1).argmin())
     preferred = preferences(losses, places, best)
-    return minima[best], tuple(Rival(pose, float(preference)) for number, (pose, preference)
-                               in enumerate(zip(poses, preferred)) if number != best)
+    return minima[best], tuple(Rival(pose, float(preference)) for index, (pose, preference)
+                               in enumerate(zip(poses, preferred)) if index != best)
 
 
 def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bound: float
@@ -279,9 +279,9 @@ def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bou
     offsets = pose_differences(solution.R, solution.t, np.array([pose.R for pose in poses]),
                                np.array([pose.t for pose in poses]))
     kept: list[int] = []
-    for number in range(len(poses)):
-        if (_squared_distances(offsets[kept] - offsets[number], information) > bound).all():
-            kept.append(number)
+    for index in range(len(poses)):
+        if (_squared_distances(offsets[kept] - offsets[index], information) > bound).all():
+            kept.append(index)
     return kept
 
 
@@ -296,7 +296,7 @@ def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose |
         return best
     undecided = preferences(losses, places, best) < SIGNIFICANT_PREFERENCE
     return min(np.flatnonzero(undecided).tolist(),
-               key=lambda number: unsigned_distance(prior, poses[number]))
+               key=lambda index: unsigned_distance(prior, poses[index]))
 
 
 def _has_rotation(measured: MeasuredRotation, sketch: Sketch) -> NDArray[np.bool_]:
@@ -333,20 +333,20 @@ def _cheapest_basins(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
     R = sketch.R.reshape(-1, 9)
     # Squares of `unsigned_distance`, for all pairs at once.
     near = 5 - R @ R.T - 2 * np.abs(sketch.t @ sketch.t.T) <= BASIN_TUNING.same_basin**2
-    passed = np.zeros(len(sketch), bool) if possible is None else ~possible
-    for number in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
-        if passed[number]:
+    excluded = np.zeros(len(sketch), bool) if possible is None else ~possible
+    for index in costs_in_front(problem, sketch, loss).argsort(kind='stable').tolist():
+        if excluded[index]:
             continue
-        chosen.append(number)
+        chosen.append(index)
         if len(chosen) == most:
             break
         # A valley holds several poses that matches do not distinguish.
         information = _information(
-            epipolar_residuals(problem, sketch.R[number], sketch.t[number]), loss)
-        offsets = pose_differences(sketch.R[number], sketch.t[number], sketch.R, sketch.t)
+            epipolar_residuals(problem, sketch.R[index], sketch.t[index]), loss)
+        offsets = pose_differences(sketch.R[index], sketch.t[index], sketch.R, sketch.t)
         squared = _squared_distances(offsets, information)
-        passed |= near[number] | (squared <= BASIN_TUNING.same_minimum)
-    return [sketch.pose(number) for number in chosen]
+        excluded |= near[index] | (squared <= BASIN_TUNING.same_minimum)
+    return [sketch.pose(index) for index in chosen]
 
 
 def _information(residuals: Residuals, loss: Loss) -> Array:

@@ -106,12 +106,12 @@ class PosePrior:
     """
     Prior on F poses, in addition to their landmarks.
 
-    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from the linearisation point `since`.
+    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from the poses `linearised_at`.
     """
 
     H: Array
     g: Array
-    since: Poses
+    linearised_at: Poses
 
     @classmethod
     def holding(cls, pose: Poses) -> PosePrior:
@@ -120,30 +120,31 @@ class PosePrior:
 
     def at(self, poses: Poses) -> PriorCost:
         """Return the cost of poses and its gradient."""
-        step = poses.step_from(self.since)
+        step = poses.step_from(self.linearised_at)
         pull = self.H @ step
         return PriorCost(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
         """Add information H, g linearised at `poses`."""
         self.H += H
-        self.g += g - H @ poses.step_from(self.since)
+        self.g += g - H @ poses.step_from(self.linearised_at)
 
     def with_frame(self, R: Array, t: Array) -> PosePrior:
         """Return the prior with one more pose, without information on it."""
-        return PosePrior(np.pad(self.H, (0, 6)), np.pad(self.g, (0, 6)), self.since.joined(R, t))
+        return PosePrior(np.pad(self.H, (0, 6)), np.pad(self.g, (0, 6)),
+                         self.linearised_at.joined(R, t))
 
     def without_frame(self, frame: int) -> PosePrior:
         """Return the prior with a frame marginalised out."""
-        gone = np.zeros(len(self.H), bool)
-        gone[6 * frame:6 * frame + 6] = True
-        own, others = self.H[np.ix_(gone, gone)], self.H[np.ix_(~gone, gone)]
+        removed = np.zeros(len(self.H), bool)
+        removed[6 * frame:6 * frame + 6] = True
+        block, coupling = self.H[np.ix_(removed, removed)], self.H[np.ix_(~removed, removed)]
         # After a pure rotation, only the rotation of a frame may be constrained.
-        own = own + np.diag(1e-9 * np.diag(own) + _WEAK)
-        gain = np.linalg.solve(own, others.T).T
-        H = self.H[np.ix_(~gone, ~gone)] - gain @ others.T
-        return PosePrior((H + H.T) / 2, self.g[~gone] - gain @ self.g[gone],
-                         self.since.without_frame(frame))
+        block = block + np.diag(1e-9 * np.diag(block) + _WEAK)
+        gain = np.linalg.solve(block, coupling.T).T
+        H = self.H[np.ix_(~removed, ~removed)] - gain @ coupling.T
+        return PosePrior((H + H.T) / 2, self.g[~removed] - gain @ self.g[removed],
+                         self.linearised_at.without_frame(frame))
 
 
 @dataclass
@@ -156,7 +157,7 @@ class Landmarks:
     estimated pixels there, undistorted; rho: (N,) inverse depths there; slopes: (N, 2) relative
     slopes of the inverse depth around them, per pixel; strengths: (N,) texture strengths of their
     patches; observation_counts: (N,) also by frames since removed; minima: (N, F, 2) pixels y*;
-    roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; seen: (N, F)
+    roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; observed: (N, F)
     whether the last two are valid.
     """
 
@@ -170,7 +171,7 @@ class Landmarks:
     observation_counts: NDArray[np.int64]
     minima: Array
     roots: Array
-    seen: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.rho)
@@ -211,9 +212,9 @@ class Landmarks:
 
     def without_frame(self, frame: int) -> Landmarks:
         """Return the landmarks with other anchors, without the observations of a frame."""
-        others = self.of(self.anchors != frame)
-        return Landmarks(others.anchors - (others.anchors > frame), *others._by_anchor()[1:],
-                         *(np.delete(array, frame, axis=1) for array in others._by_frame()))
+        left = self.of(self.anchors != frame)
+        return Landmarks(left.anchors - (left.anchors > frame), *left._by_anchor()[1:],
+                         *(np.delete(array, frame, axis=1) for array in left._by_frame()))
 
     def moved(self, step: Array) -> Landmarks:
         """Return the landmarks moved by a step (N, 3) of their inverse depths and points."""
@@ -246,14 +247,14 @@ class Landmarks:
             self.slopes, self.strengths, self.observation_counts
 
     def _by_frame(self) -> tuple[Any, ...]:
-        return self.minima, self.roots, self.seen
+        return self.minima, self.roots, self.observed
 
 
 def points_in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> Array:
     """Return landmarks (N, 3) in a frame, times their inverse depths in their anchors."""
     R, t = poses.relative_motions
-    turned = R[frame, landmarks.anchors]
-    places = times(turned, rays(K, landmarks.points))
+    rotations = R[frame, landmarks.anchors]
+    places = times(rotations, rays(K, landmarks.points))
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
 
 
@@ -294,7 +295,7 @@ class Observed:
 
 def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     """Return the residuals of all observations, whitened by their roots of precision."""
-    landmark, frame = np.nonzero(landmarks.seen)
+    landmark, frame = np.nonzero(landmarks.observed)
     if compiled.library is not None:
         anchor, (residuals, anchor_residuals, normalised, *at_places) = compiled.observe(
             (landmark, frame), landmarks.anchors, poses.relative_motions,
@@ -349,8 +350,8 @@ def _undistorted(observed: Observed) -> Array:
 def _by_undistorted(observed: Observed) -> tuple[Array, Array]:
     """Return the Jacobians of residuals (M, 2, 2) and (N, 2, 2) by undistorted pixels."""
     roots = np.concatenate([observed.root, observed.anchor_roots])
-    turned = roots @ distortion_jacobian(observed.K, _undistorted(observed), observed.k1)
-    return turned[:len(observed.root)], turned[len(observed.root):]
+    whitened = roots @ distortion_jacobian(observed.K, _undistorted(observed), observed.k1)
+    return whitened[:len(observed.root)], whitened[len(observed.root):]
 
 
 def _by_k1(observed: Observed) -> tuple[Array, Array]:
@@ -369,17 +370,17 @@ def jacobians(observed: Observed) -> Jacobians:
     # Projection: d(x / z) = (dx - x / z dz) / z.
     ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _MIN_DEPTH)
     by_place = np.concatenate([scaled, ahead[:, :, None]], axis=2)
-    by_turned = by_place @ R
+    by_ray = by_place @ R
     weight = observed.rho[:, None, None]
     by_frame, by_anchor = np.empty((2, len(place), 2, 6))
     # Rotation by omega: d(X) = omega x X, and a . (omega x X) = omega . (X x a).
     _cross(place[:, None], by_place, by_frame[:, :, :3])
-    _cross(by_turned, ray[:, None], by_anchor[:, :, :3])
+    _cross(by_ray, ray[:, None], by_anchor[:, :, :3])
     np.multiply(by_place, weight, out=by_frame[:, :, 3:])
-    np.multiply(by_turned, -weight, out=by_anchor[:, :, 3:])
+    np.multiply(by_ray, -weight, out=by_anchor[:, :, 3:])
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
-    np.matmul(by_turned, inverse_intrinsics(K)[:, :2], out=by_own[:, :, 1:])
+    np.matmul(by_ray, inverse_intrinsics(K)[:, :2], out=by_own[:, :, 1:])
     by_k1, points_by_k1 = _by_k1(observed)
     return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
 
@@ -406,10 +407,11 @@ def noise_scale(observed: Observed) -> float:
     count = np.bincount(observed.landmark, minlength=n)
     squares = (observed.anchor_residuals**2).sum(1) + np.bincount(
         observed.landmark, (observed.residuals**2).sum(1), minlength=n)
-    seen = count > 0
+    observed_once = count > 0
     # Wilson and Hilferty's median of the chi-square distribution.
-    freedom = 2 * count[seen] - 1
-    return float(np.sqrt(median(squares[seen] / (freedom * (1 - 2 / (9 * freedom))**3))))
+    freedom = 2 * count[observed_once] - 1
+    medians = freedom * (1 - 2 / (9 * freedom))**3
+    return float(np.sqrt(median(squares[observed_once] / medians)))
 
 
 class K1Estimate(NamedTuple):
@@ -424,11 +426,11 @@ class Reduced:
     """
     Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
 
-    If k1 is a parameter, it comes before the poses in the whole. `change` back-substitutes the
+    If k1 is a parameter, it comes before the poses in the Hessian. `change` back-substitutes the
     landmarks.
     """
 
-    _whole: Array
+    _hessian: Array
     _gradient: Array
     _coupling: Array
     _variances: Array
@@ -438,7 +440,7 @@ class Reduced:
     @property
     def H(self) -> Array:
         """Return the Hessian (6 F, 6 F) over the poses, given k1."""
-        return self._whole[self._lens:, self._lens:]
+        return self._hessian[self._lens:, self._lens:]
 
     @property
     def g(self) -> Array:
@@ -451,10 +453,10 @@ class Reduced:
 
         k1 has to be among the parameters.
         """
-        row, H = self._whole[0, 1:], self.H
+        row, H = self._hessian[0, 1:], self.H
         # Position and scale are gauge freedoms.
         gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), row)
-        curvature = float(self._whole[0, 0] - gain @ row)
+        curvature = float(self._hessian[0, 0] - gain @ row)
         slope = float(self._gradient[0] - gain @ self.g)
         return K1Estimate(curvature, -slope / curvature if curvature > 0 else 0.0)
 
@@ -492,25 +494,25 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     J[:, :, :lens] = by_k1[:, :, :lens]
     flat = J.reshape(-1, size)
     H, g = flat.T @ flat, flat.T @ e.ravel()
-    own, by_lens = linear.points_by_own, linear.points_by_k1
+    points_by_own, points_by_k1 = linear.points_by_own, linear.points_by_k1
     information, slopes = np.tile(np.eye(3) * _DEPTH_INFORMATION, (n, 1, 1)), np.zeros((n, 3))
-    transposed = own.transpose(0, 2, 1) * weight
-    information[:, 1:, 1:] += transposed @ own
+    transposed = points_by_own.transpose(0, 2, 1) * weight
+    information[:, 1:, 1:] += transposed @ points_by_own
     slopes[:, 1:] = times(transposed, observed.anchor_residuals)
     with_k1, coupling = np.zeros((n, 3, 1)), np.zeros((n, frames, 3, 6))
-    with_k1[:, 1:, 0] = times(transposed, by_lens)
+    with_k1[:, 1:, 0] = times(transposed, points_by_k1)
     if lens:
-        H[0, 0] += weight * (by_lens * by_lens).sum()
-        g[0] += weight * (by_lens * observed.anchor_residuals).sum()
+        H[0, 0] += weight * (points_by_k1 * points_by_k1).sum()
+        g[0] += weight * (points_by_k1 * observed.anchor_residuals).sum()
     if count:
         # Each frame observes a landmark once, and each landmark has one anchor.
         coupling[observed.landmark, observed.frame] = back @ by_frame
         first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
-        seen, anchor = observed.landmark[first], observed.anchor[first]
-        coupling[seen, anchor] = np.add.reduceat(back @ by_anchor, first)
-        information[seen] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
-        slopes[seen] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
-        with_k1[seen] += np.add.reduceat(back @ by_k1, first)
+        landmark, anchor = observed.landmark[first], observed.anchor[first]
+        coupling[landmark, anchor] = np.add.reduceat(back @ by_anchor, first)
+        information[landmark] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
+        slopes[landmark] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
+        with_k1[landmark] += np.add.reduceat(back @ by_k1, first)
     coupled = np.concatenate(
         [with_k1[:, :, :lens], coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
     variances = np.asarray(np.linalg.inv(information), float)

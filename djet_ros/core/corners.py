@@ -90,12 +90,13 @@ def detect_corners(gray: Image, max_features: int, contrast: float,
     def octave_corners(octave: int, most: int) -> Features:
         return _detect_octave(gray, octave, most, contrast, mask, smoothed)
 
-    wanted = [round(share * max_features) for share in _QUOTAS]
-    found = Features.concatenated(map_parallel(
-        lambda octave: octave_corners(octave, wanted[octave]), _DEFAULT_OCTAVES))
-    if len(found) < _ENOUGH * sum(wanted[octave] for octave in _DEFAULT_OCTAVES):
-        return Features.concatenated([found, octave_corners(_MIDDLE, max_features - len(found))])
-    return replace(found, additional=lambda: octave_corners(_MIDDLE, wanted[_MIDDLE]))
+    quotas = [round(share * max_features) for share in _QUOTAS]
+    corners = Features.concatenated(map_parallel(
+        lambda octave: octave_corners(octave, quotas[octave]), _DEFAULT_OCTAVES))
+    if len(corners) < _ENOUGH * sum(quotas[octave] for octave in _DEFAULT_OCTAVES):
+        middle = octave_corners(_MIDDLE, max_features - len(corners))
+        return Features.concatenated([corners, middle])
+    return replace(corners, additional=lambda: octave_corners(_MIDDLE, quotas[_MIDDLE]))
 
 
 def detect_large_corners(gray: Image, max_features: int, contrast: float,
@@ -129,9 +130,9 @@ def _block_curvatures(image: Image) -> NDArray[np.int32]:
     rows = image[first[:, None] + np.arange(_NOISE_BLOCK + 2)]
     curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_16S, _MIXED_DIFFERENCE)
     # The outer rows are only needed for the differences.
-    across = image.shape[1] // _NOISE_BLOCK
-    sizes = np.abs(curved.reshape(rows.shape)[:, 1:-1, :across * _NOISE_BLOCK])
-    blocks = sizes.reshape(len(first), _NOISE_BLOCK, across, _NOISE_BLOCK)
+    per_row = image.shape[1] // _NOISE_BLOCK
+    sizes = np.abs(curved.reshape(rows.shape)[:, 1:-1, :per_row * _NOISE_BLOCK])
+    blocks = sizes.reshape(len(first), _NOISE_BLOCK, per_row, _NOISE_BLOCK)
     return np.asarray(blocks.sum((1, 3), dtype=np.int32).ravel())
 
 
@@ -158,11 +159,11 @@ def _slopes_of_rows(image: Image, first: int, after: int) -> NDArray[np.float32]
     top = max(2 * start - 1, 0)
     dx, dy = (slope[2 * start - top:2 * end - top].astype(np.float32)
               for slope in cv2.spatialGradient(image[top:2 * end + 1]))
-    both = dx * dy
+    dx_dy = dx * dy
     dx *= dx
     dy *= dy
     xx, xy, yy = (_block_means(products)[first - start:after - start]
-                  for products in (dx, both, dy))
+                  for products in (dx, dx_dy, dy))
     trace = xx + yy
     # Not cv2.magnitude: its last bit depends on the memory alignment of the arrays.
     xx -= yy
@@ -227,15 +228,15 @@ def _detect_octave(gray: Image, octave: int, most: int, contrast: float, mask: M
     slopes, contrast = corner_slopes(image), max(contrast, _NOISE_FACTOR * image_noise(image))
     zoom = np.array(gray.shape[::-1]) / image.shape[::-1]
 
-    found, strongest = _peaks(slopes, contrast, image.shape)
-    points = _exact_peaks(slopes, found)
+    peaks, strongest = _peaks(slopes, contrast, image.shape)
+    points = _exact_peaks(slopes, peaks)
     # Maxima of the narrow radius are only used if there are not enough of the wide one.
-    wanted = (np.ones(len(found), bool) if mask is None
+    usable = (np.ones(len(peaks), bool) if mask is None
               else ~masked_at(mask, (points + 0.5) * zoom - 0.5))
-    if (strongest & wanted).sum() >= _ENOUGH * most:
-        wanted &= strongest
-    points, strengths = points.compress(wanted, axis=0), slopes.ravel()[found[wanted]]
-    chosen = spread_out(_nearest_pixels(points), strengths, most, strongest[wanted])
+    if (strongest & usable).sum() >= _ENOUGH * most:
+        usable &= strongest
+    points, strengths = points.compress(usable, axis=0), slopes.ravel()[peaks[usable]]
+    chosen = spread_out(_nearest_pixels(points), strengths, most, strongest[usable])
     points, strengths = points.take(chosen, axis=0), strengths[chosen]
 
     @cache
@@ -243,9 +244,9 @@ def _detect_octave(gray: Image, octave: int, most: int, contrast: float, mask: M
         # The image is computed again, which is rare: a view that is kept would keep it in memory.
         # The result is cached, as the pairs of a view with its predecessor and its successor both
         # need it.
-        seen = (smoothed if scale == 1 and smoothed is not None
-                else smooth(_downscaled(gray, scale)))
-        return dense_descriptors(seen, _nearest_pixels(points))
+        sampled = (smoothed if scale == 1 and smoothed is not None
+                   else smooth(_downscaled(gray, scale)))
+        return dense_descriptors(sampled, _nearest_pixels(points))
 
     return Features((points + 0.5) * zoom - 0.5, np.full(len(points), octave, np.int32),
                     np.zeros(len(points), np.float32), np.sqrt(strengths), describe)
@@ -273,30 +274,30 @@ def _peaks(slopes: NDArray[np.float32], contrast: float, shape: tuple[int, ...]
         return compiled.peaks(slopes, contrast**2, margin // 2, (width, height))
     above = slopes > contrast**2
     # Indices of the flat array are five times as fast.
-    found = np.flatnonzero(_is_local_maximum(slopes, _NARROW_RADIUS) & above)
-    rows, columns = np.divmod(found, slopes.shape[1])
-    found = found[describable(2 * np.stack([columns, rows], axis=1) + 1, shape, 1)]
-    return found, _is_local_maximum(slopes, _WIDE_RADIUS).ravel()[found]
+    peaks = np.flatnonzero(_is_local_maximum(slopes, _NARROW_RADIUS) & above)
+    rows, columns = np.divmod(peaks, slopes.shape[1])
+    peaks = peaks[describable(2 * np.stack([columns, rows], axis=1) + 1, shape, 1)]
+    return peaks, _is_local_maximum(slopes, _WIDE_RADIUS).ravel()[peaks]
 
 
-def _is_local_maximum(slopes: NDArray[np.float32], apart: int) -> NDArray[np.bool_]:
-    side = 2 * apart + 1
+def _is_local_maximum(slopes: NDArray[np.float32], radius: int) -> NDArray[np.bool_]:
+    side = 2 * radius + 1
     return np.asarray(slopes == cv2.dilate(slopes, np.ones((side, side), np.uint8)))
 
 
-def _exact_peaks(slopes: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.float64]:
+def _exact_peaks(slopes: NDArray[np.float32], peaks: NDArray[np.int64]) -> NDArray[np.float64]:
     """
     Return the pixels (M, 2) of the image where parabolas through peaks of the slopes are highest.
 
-    found: (M,) indices of the peaks in the flat array, none of them at its border.
+    peaks: (M,) indices of the peaks in the flat array, none of them at its border.
     """
     if compiled.library is not None:
-        return compiled.exact_peaks(slopes, found)
+        return compiled.exact_peaks(slopes, peaks)
     flat, width = slopes.ravel(), slopes.shape[1]
-    here, points = flat[found], np.empty((len(found), 2))
-    for axis, index, step in ((0, found % width, 1), (1, found // width, width)):
-        before, after = flat[found - step], flat[found + step]
-        curvature = np.maximum(2 * here - before - after, np.float32(1e-9))
+    values, points = flat[peaks], np.empty((len(peaks), 2))
+    for axis, index, step in ((0, peaks % width, 1), (1, peaks // width, width)):
+        before, after = flat[peaks - step], flat[peaks + step]
+        curvature = np.maximum(2 * values - before - after, np.float32(1e-9))
         highest = index + np.clip((after - before) / (2 * curvature), -0.5, 0.5)
         # The centre of two pixels is half a pixel beyond the first.
         points[:, axis] = 2 * highest + 0.5

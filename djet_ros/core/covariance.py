@@ -144,9 +144,9 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
     if curved is None or variances[0] <= 0:
         return covariance
     ends = (axes * np.sqrt(_CHI2_95 * variances)).T
-    around = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
-                                  np.concatenate([ends, -ends])))
-    costs = refine_all(problem, [pose, *around], loss, 0).costs
+    displaced = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
+                                     np.concatenate([ends, -ends])))
+    costs = refine_all(problem, [pose, *displaced], loss, 0).costs
     rises = (costs[1:] - costs[0]).reshape(2, 5).min(0)
     share = np.clip(rises / (ends @ curved * ends).sum(1), _MIN_RISE, 1.0)
     return np.asarray((axes * variances / share**2) @ axes.T)
@@ -194,13 +194,13 @@ class _Cells:
     """
     Sums over the matches of C cells.
 
-    whole: (5, 5) H of all matches, and its inverse; places: (C, 2) pixels in the cells; sums:
+    H_of_all: (5, 5) H of all matches, and its inverse; places: (C, 2) pixels in the cells; sums:
     (27, C), by rows the upper triangle of H (5, 5) of the loss, its gradient (5,), the derivative
     of the gradient by a common shift of all residuals of the cell (5,), and the sums of the
     weighted residuals and of the weights.
     """
 
-    whole: Array
+    H_of_all: Array
     inverse: Array
     places: Array
     sums: Array
@@ -208,7 +208,7 @@ class _Cells:
     def in_larger(self, side: float) -> _Cells:
         """Merge the small cells into larger ones; places are those of one of them."""
         order, first = group_by_cell(self.places, side)
-        return _Cells(self.whole, self.inverse, self.places[order[first]],
+        return _Cells(self.H_of_all, self.inverse, self.places[order[first]],
                       np.add.reduceat(self.sums.take(order, axis=1), first, axis=1))
 
     def __len__(self) -> int:
@@ -232,7 +232,7 @@ class _Cells:
         heavy = self.H[self.H.reshape(-1, 25) @ self.inverse.ravel() > _HEAVY]
         if not len(heavy):
             return True
-        whitening = np.linalg.inv(np.linalg.cholesky(self.whole))
+        whitening = np.linalg.inv(np.linalg.cholesky(self.H_of_all))
         shares = np.linalg.eigvalsh(whitening @ heavy @ whitening.T)
         return bool((shares <= 1 - _MIN_SUPPORT).all())
 
@@ -313,10 +313,10 @@ def _jackknife(cells: _Cells, inverses_left: Array, shifts: Array) -> Array:
     expected from noise, which are large there, at the scale that matches the observed ones on
     average.
     """
-    seen = shifts @ shifts.T + _MIN_VARIANCE * cells.inverse
+    observed = shifts @ shifts.T + _MIN_VARIANCE * cells.inverse
     by_noise = inverses_left - len(cells) * cells.inverse
-    by_noise *= np.trace(np.linalg.solve(by_noise, seen)) / 5
-    return np.asarray((1 - 1 / len(cells)) * (seen + by_noise) / 2)
+    by_noise *= np.trace(np.linalg.solve(by_noise, observed)) / 5
+    return np.asarray((1 - 1 / len(cells)) * (observed + by_noise) / 2)
 
 
 def _correlated(pulls: Array, products: Array, inverse: Array, independent: Array, size: float,
@@ -337,16 +337,16 @@ def _correlated(pulls: Array, products: Array, inverse: Array, independent: Arra
     match, an upper bound of a.
     """
     pulls, products = np.diff(pulls, axis=0), np.diff(products, axis=0)
-    found = products[:, 0] + (pulls * independent).sum((1, 2))
+    observed = products[:, 0] + (pulls * independent).sum((1, 2))
     left = inverse @ _weighted_sum(_DECAYS, pulls) @ inverse
     expected = _DECAYS * products[:, 1] - left.reshape(-1, 25) @ pulls.reshape(-1, 25).T
     weighted = (_DECAYS > 0) * expected / np.maximum(2 * size**2 * products[:, 1], 1e-300)
-    known, amounts = (weighted * expected).sum(1), np.zeros(len(pulls))
-    for nearest in np.flatnonzero(known > 0):
-        amount = min(max(weighted[nearest] @ found / known[nearest], 0.0), noise)
-        amounts += amount * _DECAYS[nearest]
-        found -= amount * expected[nearest]
-    total = _weighted_sum(amounts[_SMALL_CELLS:], pulls[_SMALL_CELLS:])
+    information, coefficients = (weighted * expected).sum(1), np.zeros(len(pulls))
+    for nearest in np.flatnonzero(information > 0):
+        coefficient = min(max(weighted[nearest] @ observed / information[nearest], 0.0), noise)
+        coefficients += coefficient * _DECAYS[nearest]
+        observed -= coefficient * expected[nearest]
+    total = _weighted_sum(coefficients[_SMALL_CELLS:], pulls[_SMALL_CELLS:])
     return np.asarray(inverse @ total @ inverse)
 
 
@@ -406,16 +406,16 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
             np.array([(sums[5:]**2).sum(1) for sums in by_side]))
 
 
-def leave_one_out(whole: Array, sums: Array) -> tuple[Array, Array]:
+def leave_one_out(H: Array, sums: Array) -> tuple[Array, Array]:
     """
     Return the shifts of the pose without the matches of each of C cells, to first order.
 
-    whole: (5, 5) H of all; sums: (27, C), see `_Cells`; H without any cell has to be positive
+    H: (5, 5) of all matches; sums: (27, C), see `_Cells`. H without any cell has to be positive
     definite. Returns the shifts (5, C), and the sum (5, 5) of the inverses of H without each cell.
     """
     if compiled.library is not None:
-        return compiled.leave_one_out(whole, sums)
-    left = np.asarray(np.linalg.inv(whole - sums[_FULL].T.reshape(-1, 5, 5)))
+        return compiled.leave_one_out(H, sums)
+    left = np.asarray(np.linalg.inv(H - sums[_FULL].T.reshape(-1, 5, 5)))
     return np.einsum('cij,jc->ic', left, sums[15:20]), left.sum(0)
 
 

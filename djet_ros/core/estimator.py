@@ -79,7 +79,8 @@ class TwoViewEstimator:
         smoothed = smooth(gray)
         if features is None:
             features = self._detected(gray, mask, smoothed)
-        return View(gray, K, features, smoothed, DescriptorDistances(self.config).seen(gray), mask)
+        surface_gray = DescriptorDistances(self.config).smoothed(gray)
+        return View(gray, K, features, smoothed, surface_gray, mask)
 
     def undistorted(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
         """Return an image (H, W) undistorted as in its views, to whose pixels results refer."""
@@ -208,11 +209,11 @@ class TwoViewEstimator:
         if config.starts != 'several' or config.method == 'five_point':
             # The paper's start: the 5-point algorithm, and only its inliers.
             with _timed(pair.timings, 'starts'):
-                found = five_point(pair.current.K, pair.x, pair.y, config.ransac_threshold,
-                                   robust=False)
-            if found is None:
+                initial = five_point(pair.current.K, pair.x, pair.y, config.ransac_threshold,
+                                     robust=False)
+            if initial is None:
                 return None
-            start, agree = found
+            start, agree = initial
             pair = pair.without(~agree)
             return pair, [start], self._sampled_surface(pair)
         if pair.start is not None:
@@ -223,12 +224,12 @@ class TwoViewEstimator:
         # The first surfaces need no pose, so they are sampled in parallel with the search for
         # starts.
         timings = pair.timings
-        began, jet = perf_counter(), timings.get('jet', 0.0)
+        started, jet = perf_counter(), timings.get('jet', 0.0)
         starts, surface = run_both(lambda: self._starts(pair), lambda: self._sampled_surface(pair))
         # Time that overlaps with sampling is counted as 'jet' only, so that stages add up to the
         # total.
-        alone = perf_counter() - began - (timings['jet'] - jet)
-        timings['starts'] = timings.get('starts', 0.0) + alone
+        elapsed = perf_counter() - started - (timings['jet'] - jet)
+        timings['starts'] = timings.get('starts', 0.0) + elapsed
         return pair, starts, surface
 
     def _starts(self, pair: Pair) -> list[Pose]:

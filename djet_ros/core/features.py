@@ -74,45 +74,46 @@ def match_nearby(previous: Features, current: Features,
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)
     rows, columns = _octave_column_order(previous), _octave_column_order(current)
-    there, here = previous.points[rows], current.points[columns]
-    strips = _search_strips(previous.octaves[rows], there[:, 0], current.octaves[columns],
-                            here[:, 0], search_radius)
+    x, y = previous.points[rows], current.points[columns]
+    strips = _search_strips(previous.octaves[rows], x[:, 0], current.octaves[columns],
+                            y[:, 0], search_radius)
     # Small numbers: single precision suffices.
-    centre, weight = there.mean(0), np.sqrt(_DISTANCE_BITS / 2) / search_radius
-    claim, best_there, best_here = most_similar(
-        strips, (previous.descriptors[rows], (there - centre) * weight),
-        (current.descriptors[columns], (here - centre) * weight))
-    apart = np.linalg.norm(here[claim] - there, axis=1)
-    mutual = (claim >= 0) & (best_there == best_here[claim]) & (apart <= search_radius)
-    best = np.flatnonzero(mutual)[np.argsort(-best_there[mutual], kind='stable')]
+    centre, weight = x.mean(0), np.sqrt(_DISTANCE_BITS / 2) / search_radius
+    claim, best_previous, best_current = most_similar(
+        strips, (previous.descriptors[rows], (x - centre) * weight),
+        (current.descriptors[columns], (y - centre) * weight))
+    distances = np.linalg.norm(y[claim] - x, axis=1)
+    mutual = (claim >= 0) & (best_previous == best_current[claim]) & (distances <= search_radius)
+    best = np.flatnonzero(mutual)[np.argsort(-best_previous[mutual], kind='stable')]
     return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))
 
 
-def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Array],
-                 here: tuple[NDArray[np.uint8], Array]
+def most_similar(strips: NDArray[np.int64], previous: tuple[NDArray[np.uint8], Array],
+                 current: tuple[NDArray[np.uint8], Array]
                  ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
     """
     Find the most similar features in strips of two images.
 
-    there, here: descriptors (N, 32) and places (N, 2) of N and of M features; strips: (S, 4), each
-    the range [first, after) of those there, and the range of those here to compare with.
-    Similarity is 64 - Hamming distance / 2 - distance of places^2. Returns the index of the most
-    similar here for each there (N,), -1 if it is compared with none, its similarity (N,), and the
-    highest similarity of each here (M,).
+    previous, current: descriptors (N, 32) and positions (N, 2) of N and of M features; strips: (S,
+    4), each the range [first, after) of previous features, and the range of current ones to
+    compare with. Similarity is 64 - Hamming distance / 2 - distance of positions^2. Returns the
+    index of the most similar current feature for each previous one (N,), -1 if it is compared with
+    none, its similarity (N,), and the highest similarity of each current feature (M,).
     """
     if compiled.library is not None:
-        return compiled.most_similar(strips, there, here)
-    claim = np.full(len(there[0]), -1)
-    best_there = np.full(len(there[0]), -np.inf, np.float32)
-    best_here = np.full(len(here[0]), -np.inf, np.float32)
-    left, right = _similarity_factors(there, here)
+        return compiled.most_similar(strips, previous, current)
+    claim = np.full(len(previous[0]), -1)
+    best_previous = np.full(len(previous[0]), -np.inf, np.float32)
+    best_current = np.full(len(current[0]), -np.inf, np.float32)
+    left, right = _similarity_factors(previous, current)
     bounds = [(slice(*strip[:2]), slice(*strip[2:])) for strip in strips.tolist()]
     compared = map_parallel(lambda two: _best_matches(left[two[0]], right[two[1]]), bounds)
-    for (strip, near), (nearest, highest, highest_here) in zip(bounds, compared):
-        claim[strip] = np.where(highest > best_there[strip], nearest + near.start, claim[strip])
-        np.maximum(best_there[strip], highest, out=best_there[strip])
-        np.maximum(best_here[near], highest_here, out=best_here[near])
-    return claim, best_there, best_here
+    for (strip, candidates), (nearest, highest, highest_current) in zip(bounds, compared):
+        claim[strip] = np.where(highest > best_previous[strip], nearest + candidates.start,
+                                claim[strip])
+        np.maximum(best_previous[strip], highest, out=best_previous[strip])
+        np.maximum(best_current[candidates], highest_current, out=best_current[candidates])
+    return claim, best_previous, best_current
 
 
 def _one_to_one(matches: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -136,11 +137,11 @@ def _octave_column_order(features: Features) -> NDArray[np.int64]:
     return np.lexsort((features.points[:, 0], features.octaves))
 
 
-def _similarity_factors(there: tuple[NDArray[np.uint8], Array],
-                        here: tuple[NDArray[np.uint8], Array]
+def _similarity_factors(previous: tuple[NDArray[np.uint8], Array],
+                        current: tuple[NDArray[np.uint8], Array]
                         ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return factors (N, 260) and (M, 260) whose product is the similarity of features."""
-    (one, a), (other, b) = there, here
+    (one, a), (other, b) = previous, current
     one_a, one_b = np.ones((len(a), 1)), np.ones((len(b), 1))
     square_a, square_b = ((p * p).sum(1, keepdims=True) for p in (a, b))
     return run_both(lambda: signed_bits(one, 2 * a, -square_a, -one_a),
@@ -154,32 +155,32 @@ def signed_bits(descriptors: NDArray[np.uint8], *places: Array) -> NDArray[np.fl
     The product of two of them is 64 - Hamming distance / 2.
     """
     columns = 256 + sum(place.shape[1] for place in places)
-    whole = np.empty((len(descriptors), columns), np.float32)
-    np.subtract(np.unpackbits(descriptors, axis=1), np.float32(0.5), out=whole[:, :256])
+    signed = np.empty((len(descriptors), columns), np.float32)
+    np.subtract(np.unpackbits(descriptors, axis=1), np.float32(0.5), out=signed[:, :256])
     if places:
-        np.concatenate(places, axis=1, out=whole[:, 256:], casting='same_kind')
-    return whole
+        np.concatenate(places, axis=1, out=signed[:, 256:], casting='same_kind')
+    return signed
 
 
-def _search_strips(octaves_there: NDArray[np.int32], x_there: Array,
-                   octaves_here: NDArray[np.int32], x_here: Array,
+def _search_strips(octaves_previous: NDArray[np.int32], x_previous: Array,
+                   octaves_current: NDArray[np.int32], x_current: Array,
                    search_radius: float) -> NDArray[np.int64]:
     """
     Return strips (S, 4) of features of one octave with the range of candidates in the other image.
 
     As in `most_similar`. Features are sorted by octave, and by column x within these.
     """
-    found = [np.empty((0, 4), np.int64)]
-    for octave in np.unique(octaves_there).tolist():
-        start, end = octaves_there.searchsorted([octave, octave + 1])
+    parts = [np.empty((0, 4), np.int64)]
+    for octave in np.unique(octaves_previous).tolist():
+        start, end = octaves_previous.searchsorted([octave, octave + 1])
         first = np.arange(start, end, _STRIP)
         last = np.minimum(first + _STRIP, end)
-        reach = x_there[first] - search_radius, x_there[last - 1] + search_radius
-        others = np.arange(octave - _MAX_OCTAVE_CHANGE, octave + _MAX_OCTAVE_CHANGE + 2)
-        bounds = octaves_here.searchsorted(others)
+        reach = x_previous[first] - search_radius, x_previous[last - 1] + search_radius
+        octaves = np.arange(octave - _MAX_OCTAVE_CHANGE, octave + _MAX_OCTAVE_CHANGE + 2)
+        bounds = octaves_current.searchsorted(octaves)
         # Ordered by strip, then by octave.
         strips = np.stack([np.stack([first, last, *(
-            there + x_here[there:after].searchsorted(x) for x in reach)], axis=1)
-            for there, after in pairwise(bounds)], axis=1).reshape(-1, 4)
-        found.append(strips[strips[:, 2] < strips[:, 3]])
-    return np.concatenate(found)
+            lower + x_current[lower:upper].searchsorted(x) for x in reach)], axis=1)
+            for lower, upper in pairwise(bounds)], axis=1).reshape(-1, 4)
+        parts.append(strips[strips[:, 2] < strips[:, 3]])
+    return np.concatenate(parts)

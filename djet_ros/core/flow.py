@@ -47,24 +47,24 @@ def track_features(previous: View, current: View, start: Array, reach: float,
     points = previous.features.points
     bits = np.full(len(points), np.inf)
     x, at_first = (places.astype(np.float32)[:, None] for places in (points, start))
-    y, seen = _flow(previous.gray, current.gray, x, at_first, levels, _STEPS, _LAST_STEP)
-    near = np.flatnonzero(seen & _within(reach, y, at_first))
-    began = x.take(near, axis=0)
-    back, seen_back = _flow(current.gray, previous.gray, y.take(near, axis=0), began, 0,
-                            _STEPS_BACK, _LAST_STEP_BACK)
-    good = near[seen_back & _within(_MAX_ROUND_TRIP, back, began)]
+    y, tracked = _flow(previous.gray, current.gray, x, at_first, levels, _STEPS, _LAST_STEP)
+    near = np.flatnonzero(tracked & _within(reach, y, at_first))
+    origins = x.take(near, axis=0)
+    back, tracked_back = _flow(current.gray, previous.gray, y.take(near, axis=0), origins, 0,
+                               _STEPS_BACK, _LAST_STEP_BACK)
+    returned = near[tracked_back & _within(_MAX_ROUND_TRIP, back, origins)]
     places = y[:, 0].astype(np.float64)
-    bits[good] = match_distances(previous.smoothed, points.take(good, axis=0), current.smoothed,
-                                 places.take(good, axis=0))
+    bits[returned] = match_distances(previous.smoothed, points.take(returned, axis=0),
+                                     current.smoothed, places.take(returned, axis=0))
     # NaN if the descriptor would leave the image.
     bits[~(bits <= _MAX_BITS)] = np.inf
     return places, bits
 
 
-def _within(reach: float, places: NDArray[np.float32], others: NDArray[np.float32]
+def _within(reach: float, places: NDArray[np.float32], references: NDArray[np.float32]
             ) -> NDArray[np.bool_]:
     """Return the (N,) bool mask of the places (N, 1, 2) that are nearer than a reach to others."""
-    x, y = (places - others)[:, 0].T
+    x, y = (places - references)[:, 0].T
     return np.asarray(np.sqrt(x * x + y * y) < reach)
 
 
@@ -74,10 +74,10 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[n
     """Return the tracked points (N, 1, 2) from expected ones, and (N,) whether they were found."""
     if not len(points):
         return points, np.zeros(0, bool)
-    found, seen, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, start.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, steps, last_step),
         # Without this flag OpenCV would compare all patches again; the eigenvalues are computed
         # anyway.
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-    return np.asarray(found, np.float32), np.asarray(seen).ravel() > 0
+    return np.asarray(tracked, np.float32), np.asarray(status).ravel() > 0

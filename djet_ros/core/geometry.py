@@ -44,11 +44,11 @@ def rotation_log(R: Array) -> Array:
     # Up to 90 degrees the antisymmetric part gives the axis, in a tenth of the time.
     if not (cosines > 0).all():
         return np.asarray(Rotation.from_matrix(R).as_rotvec())
-    odd = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0],
-                    R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
-    sines = np.sqrt((odd * odd).sum(-1))
+    antisymmetric = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0],
+                              R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
+    sines = np.sqrt((antisymmetric * antisymmetric).sum(-1))
     angles = np.arctan2(sines, cosines)
-    return np.asarray(odd * (angles / np.where(sines > 0, sines, 1.0))[..., None])
+    return np.asarray(antisymmetric * (angles / np.where(sines > 0, sines, 1.0))[..., None])
 
 
 def unit(v: Array) -> Array:
@@ -147,8 +147,8 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     R, weights, half = np.eye(3), np.ones(len(rays_x)), len(rays_x) // 2
     for _ in range(rounds):
         R = nearest_rotation((y * weights) @ x.T)
-        off = y - R @ x
-        squared = np.einsum('ij,ij->j', off, off)
+        residuals = y - R @ x
+        squared = np.einsum('ij,ij->j', residuals, residuals)
         # The median of the squared deviations.
         weights = 1 / (1 + squared / max(float(np.partition(squared, half)[half]), 1e-18))
     return R
@@ -270,8 +270,8 @@ def singular_values(warp: Array) -> tuple[Array, Array]:
     """Return the smallest and the largest singular values (N,) of matrices (N, 2, 2)."""
     size = (warp**2).sum((1, 2))
     area = np.abs(warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])
-    both, apart = np.sqrt(size + 2 * area), np.sqrt(np.maximum(size - 2 * area, 0))
-    return (both - apart) / 2, (both + apart) / 2
+    total, difference = np.sqrt(size + 2 * area), np.sqrt(np.maximum(size - 2 * area, 0))
+    return (total - difference) / 2, (total + difference) / 2
 
 
 def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Array, Array]:

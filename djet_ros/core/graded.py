@@ -75,14 +75,14 @@ def warped_grades(warp: Array, images: Sequence[ImagePoints], points: Array, gra
     places, ends = points.astype(np.float32), endpoints_of(tests)
     of_each = np.broadcast_to(np.float32(contrast), len(points))
 
-    def look(task: tuple[list[ImagePoints], slice]) -> Grades:
-        seen, some = task
+    def sample(task: tuple[list[ImagePoints], slice]) -> Grades:
+        part, block = task
         return compiled.warped_grades(
-            seen, (inverse[some], nearer[some]), places[some], of_each[some], ends,
+            part, (inverse[block], nearer[block]), places[block], of_each[block], ends,
             _largest_grade(grading), MAX_DEPTH_RATIO)
 
     none = np.empty((len(tests), 0), np.int16)
-    return np.concatenate([none, *map_parallel(look, passes(images))], axis=1)
+    return np.concatenate([none, *map_parallel(sample, passes(images))], axis=1)
 
 
 def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: int,

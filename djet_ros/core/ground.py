@@ -116,16 +116,16 @@ class Ground:
                                     np.arange(_TUNING.rim, shape[0] - _TUNING.rim, every))
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
         towards = rays(K, pixels)
-        seen = self._sees(towards)
-        if seen.any():
-            nearest = float(self._ahead(towards[seen]).min())
+        visible = self._sees(towards)
+        if visible.any():
+            nearest = float(self._ahead(towards[visible]).min())
             self._reach = max(_TUNING.flat, _TUNING.flat_factor * nearest)
         chosen = np.flatnonzero(self._sees(towards))
         self.is_in_view = len(chosen) >= _TUNING.least_pixels
         if not self.is_in_view:
             return
-        some = np.linspace(0, len(chosen) - 1, min(len(chosen), _TUNING.pixels)).astype(np.int64)
-        self._pixels, self._rays = pixels[chosen[some]], towards[chosen[some]]
+        subset = np.linspace(0, len(chosen) - 1, min(len(chosen), _TUNING.pixels)).astype(np.int64)
+        self._pixels, self._rays = pixels[chosen[subset]], towards[chosen[subset]]
         # Rows above the ground are cropped, except for the support of the filters.
         self._top = max(int(self._pixels[:, 1].min()) - _TUNING.side, 0)
         self._K = K - [[0, 0, 0], [0, 0, self._top], [0, 0, 0]]
@@ -141,9 +141,9 @@ class Ground:
     def _sees(self, towards: Array) -> NDArray[np.bool_]:
         """Return a mask (N,) of the rays (N, 3) that meet level ground within the region."""
         ahead = self._ahead(towards)
-        aside = np.abs(towards[:, 0]) / np.maximum(towards @ self._normal, 1e-9)
+        sideways = np.abs(towards[:, 0]) / np.maximum(towards @ self._normal, 1e-9)
         return np.asarray((ahead > _TUNING.near) & (ahead < min(self._reach, _TUNING.far))
-                          & (aside < _TUNING.aside))
+                          & (sideways < _TUNING.aside))
 
     def motion(self, previous: View, current: View, relative: RelativePose,
                lengths: tuple[float, float] = _TUNING.lengths) -> GroundMotion | None:
@@ -155,14 +155,14 @@ class Ground:
         """
         if not self.is_in_view:
             return None
-        here, there = self._texture(previous), self._texture(current)
-        wanted = _sampled(here, self._pixels)
+        previous_texture, texture = self._texture(previous), self._texture(current)
+        template = _sampled(previous_texture, self._pixels)
         if relative.status is not Status.OK:
-            return self._zero_motion(wanted, there, relative)
-        start = self._search(wanted, there, relative, lengths)
+            return self._zero_motion(template, texture, relative)
+        start = self._search(template, texture, relative, lengths)
         if start is None:
-            start = self._search(wanted, there, relative, _TUNING.lengths)
-        return None if start is None else self._fit(wanted, there, relative, start)
+            start = self._search(template, texture, relative, _TUNING.lengths)
+        return None if start is None else self._fit(template, texture, relative, start)
 
     def _texture(self, view: View) -> Image:
         """Return the image with normalised contrast, from the highest row used."""
@@ -178,39 +178,40 @@ class Ground:
 
     def _project(self, R: Array, t: Array, m: Array) -> Array:
         """Return the pixels (N, 2) of the points of a plane m in the current view."""
-        seen = (self._rays @ R.T + np.outer(self._rays @ m, t)) @ self._K.T
-        return np.asarray(seen[:, :2] / np.maximum(seen[:, 2:], 1e-9))
+        points = (self._rays @ R.T + np.outer(self._rays @ m, t)) @ self._K.T
+        return np.asarray(points[:, :2] / np.maximum(points[:, 2:], 1e-9))
 
-    def _zero_motion(self, wanted: Array, there: Image,
+    def _zero_motion(self, template: Array, texture: Image,
                      relative: RelativePose) -> GroundMotion | None:
         """Return zero motion if the ground is where a pure rotation, or none, predicts it."""
         turned = relative.status is Status.NO_PARALLAX
         R = relative.R if turned else np.eye(3)
         correlation = _correlation(
-            wanted, _sampled(there, self._project(R, np.zeros(3), self._normal)))
+            template, _sampled(texture, self._project(R, np.zeros(3), self._normal)))
         if correlation < (_TUNING.min_correlation if turned else _TUNING.same_place):
             return None
         least = _TUNING.least_shift / (self._K[0, 0] * float(np.median(self._rays @ self._normal)))
         return GroundMotion(np.zeros(3), np.diag([least**2, np.pi**2, np.pi**2]))
 
-    def _search(self, wanted: Array, there: Image, relative: RelativePose,
+    def _search(self, template: Array, texture: Image, relative: RelativePose,
                 lengths: tuple[float, float]) -> Array | None:
         """Return level ground (3,) for the length of best correlation, if that is distinct."""
         step, (least, most) = _TUNING.step, _TUNING.lengths
         low, high = max(lengths[0], least), min(lengths[1], most)
-        tried = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
-        found = np.array([_correlation(wanted, _sampled(there, self._project(
-            relative.R, relative.t, length * self._normal))) for length in tried])
-        best = int(found.argmax())
-        if found[best] < _TUNING.min_correlation or best in (0, len(found) - 1):
+        candidates = np.exp(np.arange(np.log(low) - step, np.log(max(low, high)) + 2 * step, step))
+        correlations = np.array([_correlation(template, _sampled(texture, self._project(
+            relative.R, relative.t, length * self._normal))) for length in candidates])
+        best = int(correlations.argmax())
+        if correlations[best] < _TUNING.min_correlation or best in (0, len(correlations) - 1):
             return None
         # Repetitive textures have several peaks; slow ground has one, but a broad one.
-        peaks = found == maximum_filter1d(found, 2 * _TUNING.neighbours + 1, mode='nearest')
-        if (peaks & (found > found[best] - _TUNING.distinctness)).sum() > 1:
+        peaks = correlations == maximum_filter1d(
+            correlations, 2 * _TUNING.neighbours + 1, mode='nearest')
+        if (peaks & (correlations > correlations[best] - _TUNING.distinctness)).sum() > 1:
             return None
-        return np.asarray(tried[best] * self._normal)
+        return np.asarray(candidates[best] * self._normal)
 
-    def _fit(self, wanted: Array, there: Image, relative: RelativePose,
+    def _fit(self, template: Array, texture: Image, relative: RelativePose,
              m: Array) -> GroundMotion | None:
         """
         Fit the plane by Gauss-Newton, jointly with the pose within its covariance.
@@ -221,14 +222,14 @@ class Ground:
         known = np.zeros((8, 8))
         known[3:, 3:] = np.linalg.inv(relative.covariance_5 + 1e-12 * np.eye(5))
         tangents, theta = sphere_tangents(relative.t), np.zeros(5)
-        gradients = [np.asarray(cv2.Scharr(there, -1, *axis, scale=1 / 32), np.float32)
+        gradients = [np.asarray(cv2.Scharr(texture, -1, *axis, scale=1 / 32), np.float32)
                      for axis in ((1, 0), (0, 1))]
         for _ in range(_TUNING.rounds):
             R = rotation_exp(theta[:3]) @ relative.R
             t = relative.t + tangents @ theta[3:]
             places = self._project(R, t, m)
-            found = _sampled(there, places)
-            r = found - wanted
+            values = _sampled(texture, places)
+            r = values - template
             J = self._jacobian([_sampled(g, places) for g in gradients], R, t, m, tangents)
             inside = np.isfinite(r) & np.isfinite(J).all(axis=1)
             if inside.sum() < _TUNING.least_pixels:
@@ -251,7 +252,7 @@ class Ground:
                 break
         shift = float(np.median(np.linalg.norm(
             places - self._project(R, np.zeros(3), m), axis=1)))
-        correlation = _correlation(wanted, found)
+        correlation = _correlation(template, values)
         if correlation < _TUNING.min_correlation or shift < _TUNING.least_shift \
                 or m @ self._normal <= 0 \
                 or not self._unevenness(r, J, R, t, m) <= _TUNING.max_unevenness:
@@ -306,10 +307,10 @@ def _sampled(image: Image, pixels: Array) -> Array:
 
 def _correlation(a: Array, b: Array) -> float:
     """Return the correlation of two samples (N,) where both are finite; 0 if these are too few."""
-    there = np.isfinite(a) & np.isfinite(b)
-    if there.sum() < max(_TUNING.least_pixels, len(b) / 4):
+    finite = np.isfinite(a) & np.isfinite(b)
+    if finite.sum() < max(_TUNING.least_pixels, len(b) / 4):
         return 0.0
-    a, b = a[there], b[there]
+    a, b = a[finite], b[finite]
     power = float(a @ a) * float(b @ b)
     return float(a @ b) / np.sqrt(power) if power > 0 else 0.0
 

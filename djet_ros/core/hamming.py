@@ -111,7 +111,7 @@ def warped_intensities(warp: Array, images: Sequence[ImagePoints], points: Array
     places = points.astype(np.float32)
     values = np.empty((len(points), ends.shape[1]), np.float32)
 
-    def look(task: tuple[NDArray[np.float32], slice]) -> None:
+    def sample(task: tuple[NDArray[np.float32], slice]) -> None:
         # Points first, so that neighbours in the image are neighbours in memory.
         image, block = task
         away = [inverse[block, axis] @ ends for axis in (0, 1)]
@@ -123,7 +123,7 @@ def warped_intensities(warp: Array, images: Sequence[ImagePoints], points: Array
         x, y = (places[block, axis, None] + along for axis, along in enumerate(away))
         cv2.remap(image, x, y, cv2.INTER_LINEAR, values[block], cv2.BORDER_REPLICATE)
 
-    map_parallel(look, blocks(floating(images)))
+    map_parallel(sample, blocks(floating(images)))
     by_end = np.asarray(cv2.transpose(values)) if len(points) else values.T
     return by_end[of_tests[0]], by_end[of_tests[1]]
 
@@ -161,15 +161,15 @@ def floating(images: Sequence[ImagePoints]) -> list[ImagePoints]:
 
 def passes(images: Sequence[ImagePoints]) -> list[tuple[list[ImagePoints], slice]]:
     """Split points into passes, each over one or more images of the same size."""
-    found: list[tuple[list[ImagePoints], slice]] = []
-    for image, some in blocks(images, _PASS):
-        part = image, some.stop - some.start
-        seen, begun = found[-1] if found else ([], some)
-        if seen and seen[0][0].shape == image.shape and some.stop - begun.start <= _PASS:
-            found[-1] = [*seen, part], slice(begun.start, some.stop)
+    grouped: list[tuple[list[ImagePoints], slice]] = []
+    for image, block in blocks(images, _PASS):
+        part = image, block.stop - block.start
+        group, first = grouped[-1] if grouped else ([], block)
+        if group and group[0][0].shape == image.shape and block.stop - first.start <= _PASS:
+            grouped[-1] = [*group, part], slice(first.start, block.stop)
         else:
-            found.append(([part], some))
-    return found
+            grouped.append(([part], block))
+    return grouped
 
 
 def endpoints_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -180,8 +180,8 @@ def endpoints_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 @lru_cache(maxsize=8)
 def _ends(tests: bytes) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     ends = np.frombuffer(tests, np.int64).reshape(-1, 2, 2).transpose(1, 0, 2)
-    places, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-    return places.T.astype(np.float32), which.reshape(2, -1)
+    places, indices = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    return places.T.astype(np.float32), indices.reshape(2, -1)
 
 
 def dense_descriptors(smoothed: Image, points: Pixels) -> Image:
@@ -246,12 +246,12 @@ def _summed(reference: NDArray[Any], patches: NDArray[Any], radius: int, tests: 
     buffer = np.empty((at_once, *total.shape), reference.dtype)
     places = (tests + reach(tests)).tolist()
     for first in range(0, len(places), at_once):
-        some = slice(first, first + at_once)
-        outcomes = buffer[:len(places[some])]
-        for one, (px, py, qx, qy) in zip(outcomes, places[some]):
+        chunk = slice(first, first + at_once)
+        outcomes = buffer[:len(places[chunk])]
+        for result, (px, py, qx, qy) in zip(outcomes, places[chunk]):
             outcome(patches[py:py + side, px:px + side], patches[qy:qy + side, qx:qx + side],
-                    out=one)
-        differences = differ(outcomes, reference[some, None, None])
+                    out=result)
+        differences = differ(outcomes, reference[chunk, None, None])
         total += np.add.reduce(differences, axis=0, dtype=differences.dtype)
     return total
 

@@ -58,11 +58,11 @@ def fuse_alignment(problem: JetProblem, solution: Solution, K: Array, placed: Al
     residuals = epipolar_residuals(aligned, solution.R, solution.t).r
     S, T = (clipped_scale(r)**2 * measured.covariances
             for measured, r in ((problem, solution.residuals.r), (aligned, residuals)))
-    which = np.flatnonzero((S[0] > 0) & (S[0] * S[2] > S[1]**2))  # matches with a minimum
+    indices = np.flatnonzero((S[0] > 0) & (S[0] * S[2] > S[1]**2))  # matches with a minimum
     rays_y, fused = problem.rays_y.copy(), S.copy()
-    shifts, fused[:, which] = fuse(*(values.take(which, axis=1) for values in (
+    shifts, fused[:, indices] = fuse(*(values.take(indices, axis=1) for values in (
         aligned.rays_y[:2] - rays_y[:2], S, T)))
-    rays_y[:2, which] += shifts
+    rays_y[:2, indices] += shifts
     # Residuals are in pixels for a match of median curvature again.
     G = inverse_intrinsics(K)[:2, :2]
     width = np.trace(G @ G.T)
@@ -72,7 +72,7 @@ def fuse_alignment(problem: JetProblem, solution: Solution, K: Array, placed: Al
     return replace(problem, rays_y=rays_y, covariances=covariances, blur=blur)
 
 
-def fuse(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
+def fuse(differences: Array, S: Array, T: Array) -> tuple[Array, Array]:
     """
     Fuse two measurements of N positions: by surfaces, with S (3, N), and by alignment, with T.
 
@@ -81,13 +81,13 @@ def fuse(apart: Array, S: Array, T: Array) -> tuple[Array, Array]:
     N), scaled by the noise of each match.
     """
     if not S.size:
-        return apart, S
+        return differences, S
     S = _CORRELATION_INFLATION * S
     inverse = _inverse(S + T)
-    pull = _multiply(inverse, apart)
+    pull = _multiply(inverse, differences)
     fused = S - np.array([_form(S[:2], inverse, S[:2]), _form(S[:2], inverse, S[1:]),
                          _form(S[1:], inverse, S[1:])])
-    return _multiply(S, pull), fused * _relative_noise((apart * pull).sum(0))
+    return _multiply(S, pull), fused * _relative_noise((differences * pull).sum(0))
 
 
 def fuse_positions(minima: Array, covariances: Array, placed: Aligned) -> tuple[Array, Array]:
@@ -100,12 +100,12 @@ def fuse_positions(minima: Array, covariances: Array, placed: Aligned) -> tuple[
     Returns positions (N, 2) and covariances (N, 2, 2) in square pixels.
     """
     S, T = entries(covariances), _ALIGNMENT_INFLATION * entries(placed.covariances)
-    apart = (placed.places - minima).T
+    differences = (placed.places - minima).T
     if len(minima):
-        squared = (apart * _multiply(_inverse(S), apart)).sum(0)
+        squared = (differences * _multiply(_inverse(S), differences)).sum(0)
         S = S * max(median(squared) / (2 * np.log(2)),
                     median(T[0] + T[2]) / median(S[0] + S[2]))
-    shifts, fused = fuse(apart, S, T)
+    shifts, fused = fuse(differences, S, T)
     return minima + shifts.T, fused[[0, 1, 1, 2]].T.reshape(-1, 2, 2)
 
 
@@ -137,5 +137,5 @@ def _relative_noise(squared: Array) -> Array:
     """
     middle, upper = median(squared), quantile(squared, 0.75)
     ratio = upper / max(middle, _NEGLIGIBLE * upper, 1e-300)
-    unlike = np.log2(max(ratio - 1, 1.0)) * _HETEROGENEITY  # 2 / nu
-    return np.asarray((1 + unlike / 2 * squared) / (1 + unlike))
+    variation = np.log2(max(ratio - 1, 1.0)) * _HETEROGENEITY  # 2 / nu
+    return np.asarray((1 + variation / 2 * squared) / (1 + variation))

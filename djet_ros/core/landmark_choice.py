@@ -26,8 +26,8 @@ def choose_landmarks(x: Array, rho: Array, present: Array, side: float, room: in
     # with the largest errors, and bias each step short: by 6 % over 300 small images. So depth is
     # judged by neighbours.
     nearest = np.argsort(-np.floor(surrounding_means(x, np.log2(rho)) / _CLASSES), kind='stable')
-    cells, taken = (cells_of(points, side) for points in (x[nearest], present))
-    rank = rank_in_cells(cells) + np.isin(cells, taken)
+    cells, occupied = (cells_of(points, side) for points in (x[nearest], present))
+    rank = rank_in_cells(cells) + np.isin(cells, occupied)
     return np.asarray(nearest[np.argsort(rank, kind='stable')[:max(room, 0)]])
 
 
@@ -52,5 +52,6 @@ def surrounding_means(points: Array, values: Array) -> Array:
         return np.asarray(total[beyond_x, beyond_y] - total[x, beyond_y] - total[beyond_x, y]
                           + total[x, y])
 
-    there, count = (within(2) - within(1))[cells[:, 0], cells[:, 1]].T
-    return np.where(count > 0, there / np.maximum(count, 1), values.mean() if len(values) else 0)
+    sums_around, count = (within(2) - within(1))[cells[:, 0], cells[:, 1]].T
+    mean = values.mean() if len(values) else 0
+    return np.where(count > 0, sums_around / np.maximum(count, 1), mean)

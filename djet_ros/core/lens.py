@@ -119,8 +119,8 @@ class MatchedPair:
         inliers were selected with the calibration under test.
         """
         voting = np.flatnonzero(relative.voting)
-        some = voting[subsampled(len(voting), MOST_MATCHES)]
-        x, y = (rays(K, points[some])[:, :2] for points in (relative.x, relative.placed))
+        chosen = voting[subsampled(len(voting), MOST_MATCHES)]
+        x, y = (rays(K, points[chosen])[:, :2] for points in (relative.x, relative.placed))
         return cls(x, y, Pose(relative.R, relative.t))
 
     @property
@@ -198,7 +198,7 @@ def outermost(pairs: Sequence[MatchedPair]) -> Array:
 
 def displacements(places: Array, lens: Lens, k1: float) -> Array:
     """Return the pixels (N,) by which points (N, 2) move per unit of k1."""
-    more, less = (lens.pixels(places, k1 + way)[0] for way in (_STEP, -_STEP))
+    more, less = (lens.pixels(places, k1 + step)[0] for step in (_STEP, -_STEP))
     return np.asarray(np.linalg.norm(more - less, axis=1) / (2 * _STEP))
 
 
@@ -251,8 +251,8 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
 def _unabsorbed(pair: MatchedPair, lens: Lens, k1: float, solution: Solution, weights: Array
                 ) -> Array:
     """Return derivatives (N,) of residuals by k1, in pixels, orthogonal to those by the pose."""
-    more, less = (epipolar_residuals(_problem(pair, lens, k1 + way)[0], solution.R, solution.t).r
-                  for way in (_STEP, -_STEP))
+    more, less = (epipolar_residuals(_problem(pair, lens, k1 + step)[0], solution.R, solution.t).r
+                  for step in (_STEP, -_STEP))
     by_k1, J = (more - less) / (2 * _STEP), solution.residuals.jacobian
     weighed = J * weights
     followed = np.linalg.lstsq(weighed @ J.T, weighed @ by_k1, rcond=None)[0]
@@ -290,12 +290,12 @@ def _undistorted(places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
     return _invert_projection(lens.pixels(places, lens.k1)[0], places, lens, k1)
 
 
-def _invert_projection(seen: Array, places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
+def _invert_projection(pixels: Array, places: Array, lens: Lens, k1: float) -> tuple[Array, Array]:
     """Undistort pixels (N, 2) from nearby points; also return the Jacobians."""
     for _ in range(_INVERSIONS):
-        there, slopes = lens.pixels(places, k1)
+        projected, slopes = lens.pixels(places, k1)
         by_pixel = inverses(slopes)
-        step = times(by_pixel, seen - there)
+        step = times(by_pixel, pixels - projected)
         places = places + step
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
@@ -309,12 +309,12 @@ def _is_far_from_fold(rim: Array, lens: Lens, k1: float) -> bool:
     At a fold (1 + 3 k1 r^2 = 0) points move without bound from pixel to pixel. So does their
     assumed noise, and all whitened residuals vanish: a spurious minimum.
     """
-    seen, middle = lens.pixels(rim, lens.k1)[0], lens.pixels(np.zeros((1, 2)), k1)[0]
+    rim_pixels, middle = lens.pixels(rim, lens.k1)[0], lens.pixels(np.zeros((1, 2)), k1)[0]
     areas = []
     # Beyond a fold there is no solution, and iterations diverge.
     with np.errstate(all='ignore'):
         for farther in (0.0, _RADIUS_SHARE):
-            pixels = seen + farther * (seen - middle)
+            pixels = rim_pixels + farther * (rim_pixels - middle)
             places, by_pixel = _invert_projection(pixels, rim, lens, k1)
             if not np.abs(lens.pixels(places, k1)[0] - pixels).max() < _PIXEL_TOLERANCE:
                 return False
@@ -337,9 +337,9 @@ def _parallax(pair: MatchedPair, lens: Lens) -> float:
     """Return the median distance in pixels of matches from their prediction by rotation alone."""
     rays_x, rays_y = (np.column_stack([one, np.ones(len(one))]) for one in (pair.x, pair.y))
     turned = rays_x @ fit_rotation(rays_x, rays_y).T
-    there, here = (lens.pixels(places, lens.k1)[0]
-                   for places in (turned[:, :2] / turned[:, 2:], pair.y))
-    return float(np.median(np.linalg.norm(there - here, axis=1)))
+    predicted, measured = (lens.pixels(places, lens.k1)[0]
+                           for places in (turned[:, :2] / turned[:, 2:], pair.y))
+    return float(np.median(np.linalg.norm(predicted - measured, axis=1)))
 
 
 def _disagreement(linearised: Sequence[Linearised]) -> float:
@@ -351,9 +351,9 @@ def _disagreement(linearised: Sequence[Linearised]) -> float:
                         len(linearised) - _MIN_PAIRS))
     # The jackknife needs the order of the recording.
     halves = [sums[:, np.sort(half)] for half in (order[:first], order[first:])]
-    off = [gradient.sum() / curvature.sum() for curvature, gradient in halves]
+    steps = [gradient.sum() / curvature.sum() for curvature, gradient in halves]
     one, other = (_standard_error(*half) for half in halves)
-    return float(abs(off[0] - off[1]) / np.hypot(one, other))
+    return float(abs(steps[0] - steps[1]) / np.hypot(one, other))
 
 
 def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
@@ -362,13 +362,13 @@ def _shift_error(linearised: Sequence[Linearised], lens: Lens) -> float:
 
     They are the same in all pairs, as sampling and lens depend on the position in the image.
     """
-    seen = np.concatenate([lens.pixels(one.pair.y, lens.k1)[0] for one in linearised])
-    side = max(float(np.sqrt(np.ptp(seen, axis=0).prod() / LARGE_CELLS)), 1.0)
-    _, cell = np.unique(cells_of(seen, side), return_inverse=True)
-    together = np.array([np.bincount(cell, along) for along in
-                         np.concatenate([one.pulls for one in linearised]).T])
+    pixels = np.concatenate([lens.pixels(one.pair.y, lens.k1)[0] for one in linearised])
+    side = max(float(np.sqrt(np.ptp(pixels, axis=0).prod() / LARGE_CELLS)), 1.0)
+    _, cell = np.unique(cells_of(pixels, side), return_inverse=True)
+    by_cell = np.array([np.bincount(cell, along) for along in
+                        np.concatenate([one.pulls for one in linearised]).T])
     curvature = sum(one.by_match[0].sum() for one in linearised)
-    return float(SHIFT * np.sqrt((together**2).sum()) / curvature)
+    return float(SHIFT * np.sqrt((by_cell**2).sum()) / curvature)
 
 
 def _standard_error(curvature: Array, gradient: Array) -> float:

@@ -80,13 +80,13 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
     motion = Pose(prior.R if known.guess is None else known.guess.R, prior.t)
     predicted = predict_constant_motion(previous.features, current.K, motion.R, prior)
     y, bits = track_features(previous, current, predicted, reach, NEAR_LEVELS)
-    found = np.isfinite(bits)
-    if found.sum() < max(_MIN_SHARE * _expected(prior, len(found)), _MIN_MATCHES):
+    tracked = np.isfinite(bits)
+    if tracked.sum() < max(_MIN_SHARE * _expected(prior, len(tracked)), _MIN_MATCHES):
         return None
     # If many are far from their prediction, as after a step twice as long, others are beyond the
     # search radius.
-    off = np.linalg.norm((y - predicted).compress(found, axis=0), axis=1)
-    if quantile(off, _QUANTILE) > reach / 2:
+    offsets = np.linalg.norm((y - predicted).compress(tracked, axis=0), axis=1)
+    if quantile(offsets, _QUANTILE) > reach / 2:
         return None
     first = _most_similar_first(bits)
     x = previous.features.points.take(first, axis=0)
@@ -103,19 +103,19 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     """
     previous, current = (replace(view, features=view.features.with_additional)
                          for view in (previous, current))
-    there, here = previous.features, current.features
+    points = previous.features.points
     if search_radius >= 1:
-        pairs = match_everywhere(there, here)
-        return Matches(there.points[pairs[:, 0]], here.points[pairs[:, 1]])
+        pairs = match_everywhere(previous.features, current.features)
+        return Matches(points[pairs[:, 0]], current.features.points[pairs[:, 1]])
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
-    rotated = predict_at_infinity(there, here, current.K, rotations, radius,
-                                  measured=known.rotation is not None)
+    rotated = predict_at_infinity(previous.features, current.features, current.K, rotations,
+                                  radius, measured=known.rotation is not None)
     y, bits = track_features(previous, current, rotated, radius)
     pairs = _match_rotated(previous, current, rotated, prior, radius)
     y, bits = _resolved(previous, current, y, bits, pairs)
     first = _most_similar_first(bits)
-    return Matches(there.points.take(first, axis=0), y.take(first, axis=0))
+    return Matches(points.take(first, axis=0), y.take(first, axis=0))
 
 
 def _match_rotated(previous: View, current: View, places: Array, prior: RelativePose | None,
@@ -144,16 +144,18 @@ def _resolved(previous: View, current: View, y: Array, bits: Array, pairs: NDArr
     more similar place is taken; if neither is, the feature is dropped. If both are the same place,
     the tracked one is kept, as more accurate.
     """
-    there, here = pairs.T
-    matched, y, bits = current.features.points[here], y.copy(), bits.copy()
-    distance = match_distances(previous.smoothed, previous.features.points[there],
+    y, bits = y.copy(), bits.copy()
+    tracked, other = pairs.T
+    matched = current.features.points[other]
+    distance = match_distances(previous.smoothed, previous.features.points[tracked],
                                current.smoothed, matched)
-    lost = np.isinf(bits[there])
-    elsewhere = ~lost & (np.linalg.norm(y[there] - matched, axis=1) > _SAME_PLACE)
-    better = lost | (elsewhere & (distance < bits[there] - _CLEAR_BITS))
-    neither = elsewhere & ~better & ~(distance > bits[there] + _CLEAR_BITS)
-    y[there[better]], bits[there[better]] = matched[better], distance[better]
-    bits[there[neither]] = np.inf
+    lost = np.isinf(bits[tracked])
+    elsewhere = ~lost & (np.linalg.norm(y[tracked] - matched, axis=1) > _SAME_PLACE)
+    more_similar = lost | (elsewhere & (distance < bits[tracked] - _CLEAR_BITS))
+    unclear = elsewhere & ~more_similar & ~(distance > bits[tracked] + _CLEAR_BITS)
+    y[tracked[more_similar]] = matched[more_similar]
+    bits[tracked[more_similar]] = distance[more_similar]
+    bits[tracked[unclear]] = np.inf
     return y, bits
 
 

@@ -77,11 +77,11 @@ class Pair:
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)
 
-    def without(self, some: NDArray[np.bool_]) -> Pair:
+    def without(self, removed: NDArray[np.bool_]) -> Pair:
         """Return the pair without some (N,) of its matches, as outliers, and not predicted."""
         def rest(values: Array | None) -> Array | None:
-            return None if values is None else values[~some]
+            return None if values is None else values[~removed]
 
-        return replace(self, x=self.x[~some], y=self.y[~some], bits=rest(self.bits),
+        return replace(self, x=self.x[~removed], y=self.y[~removed], bits=rest(self.bits),
                        covariances=rest(self.covariances), predicted=None,
-                       outliers=self.outliers + int(some.sum()))
+                       outliers=self.outliers + int(removed.sum()))

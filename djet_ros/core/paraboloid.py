@@ -53,12 +53,13 @@ class Paraboloids:
         """Return a subset, by a mask (N,) bool or indices."""
         # np.take is three to six times as fast as indexing for arrays of several axes.
         places = np.arange(len(self.c))[chosen]
-        some = Paraboloids(*(values.take(places, axis=0) for values in (
+        subset = Paraboloids(*(values.take(places, axis=0) for values in (
             self.centres, self.A, self.b, self.c, self.usable)))
         # Cached properties are kept.
-        vars(some).update((name, value.take(places, axis=0)) for name, value in vars(self).items()
-                          if name in ('inverses', 'minimum_offsets'))
-        return some
+        vars(subset).update((name, value.take(places, axis=0))
+                            for name, value in vars(self).items()
+                            if name in ('inverses', 'minimum_offsets'))
+        return subset
 
     def minimum_within(self, radius: float) -> NDArray[np.bool_]:
         """Return a mask (N,) of those with a minimum within `radius` along either axis."""
@@ -103,8 +104,8 @@ def median(values: Array) -> float:
 
 def medians(values: Array) -> Array:
     """Return the median of each of (..., N) values, (...,)."""
-    half, odd = divmod(values.shape[-1], 2)
-    return middles(np.partition(values, half if odd else (half - 1, half)))
+    half, is_odd = divmod(values.shape[-1], 2)
+    return middles(np.partition(values, half if is_odd else (half - 1, half)))
 
 
 def medians_of_parts(values: Array, counts: NDArray[np.int64]) -> Array:
@@ -131,9 +132,9 @@ def quantile(values: Array, share: float) -> float:
 
 def middles(ordered: Array) -> Array:
     """Return medians (...,) of (..., N) values that are sorted, or partitioned at the middle."""
-    half, odd = divmod(ordered.shape[-1], 2)
+    half, is_odd = divmod(ordered.shape[-1], 2)
     return np.asarray(
-        ordered[..., half] if odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
+        ordered[..., half] if is_odd else (ordered[..., half - 1] + ordered[..., half]) / 2)
 
 
 def median_of_sorted(ordered: Array, count: int) -> float:
@@ -162,10 +163,10 @@ def project_to_positive(paraboloids: Paraboloids) -> Paraboloids:
         return paraboloids
     least, most = (mean - spread)[low], (mean + spread)[low]
     # The projection onto the weak direction is (most I - A) / (most - least).
-    both, width = most < floor, np.maximum(most - least, 1e-300)
+    both_low, width = most < floor, np.maximum(most - least, 1e-300)
     weak = (most[:, None, None] * np.eye(2) - A[low]) / width[:, None, None]
     raised = A.copy()
-    raised[low] = np.where(both[:, None, None], floor * np.eye(2),
+    raised[low] = np.where(both_low[:, None, None], floor * np.eye(2),
                            A[low] + (floor - least)[:, None, None] * weak)
     return replace(paraboloids, A=raised)
 
@@ -202,12 +203,12 @@ def constrained_minimum(A: Array, b: Array, g: Array, h: Array) -> Array:
     # Components first: a third of the time.
     (g1, g2), (a, c, d) = g.T, (A[:, 0, 0], A[:, 0, 1], A[:, 1, 1])
     norm = np.maximum(np.sqrt(g1 * g1 + g2 * g2), 1e-300)
-    n1, n2, away = g1 / norm, g2 / norm, h / norm
-    foot1, foot2 = n1 * away, n2 * away
+    n1, n2, distance = g1 / norm, g2 / norm, h / norm
+    foot1, foot2 = n1 * distance, n2 * distance
     # The line runs along (-n2, n1).
     slope = n1 * (c * foot1 + d * foot2 + b[:, 1]) - n2 * (a * foot1 + c * foot2 + b[:, 0])
     curvature = a * n2 * n2 - 2 * c * n1 * n2 + d * n1 * n1
     # A surface that is flat along the line does not move the point along it.
     flat = np.abs(curvature) < 1e-12
-    walk = np.where(flat, 0.0, -slope / np.where(flat, 1.0, curvature))
-    return np.stack([foot1 - walk * n2, foot2 + walk * n1], axis=1)
+    shift = np.where(flat, 0.0, -slope / np.where(flat, 1.0, curvature))
+    return np.stack([foot1 - shift * n2, foot2 + shift * n1], axis=1)

@@ -76,11 +76,11 @@ def unaligned(y: Array) -> Aligned:
     return Aligned(y.copy(), np.tile(np.eye(2), (len(y), 1, 1)))
 
 
-def align_patches(there: Image, here: Image, x: Array, y: Array, warp: Array) -> Aligned:
+def align_patches(previous: Image, current: Image, x: Array, y: Array, warp: Array) -> Aligned:
     """
     Align patches around x (N, 2) of one gray image with another, starting from y (N, 2).
 
-    there, here: (H, W) uint8; warp: (N, 3, 2) from the former to the latter, see
+    previous, current: (H, W) uint8; warp: (N, 3, 2) from the former to the latter, see
     `geometry.patch_warp`; only the derivatives dy/dx, the first two rows, are used for so small a
     patch, and must not be singular. Gauss-Newton on gray levels with the gradients of the warped
     patch ("inverse compositional", Baker and Matthews, IJCV 2004), with free brightness and
@@ -88,42 +88,42 @@ def align_patches(there: Image, here: Image, x: Array, y: Array, warp: Array) ->
     stay at y.
     """
     if compiled.library is not None and len(y):
-        return align_all([(there, len(x))], x, warp, here, y)
+        return align_all([(previous, len(x))], x, warp, current, y)
     places, covariances = y.copy(), np.empty((len(y), 2, 2))
 
     def refine(start: int) -> None:
         block = slice(start, start + _BLOCK)
         places[block], covariances[block] = align_all(
-            [(there, len(x[block]))], x[block], warp[block], here, y[block])
+            [(previous, len(x[block]))], x[block], warp[block], current, y[block])
 
     map_parallel(refine, range(0, len(y), _BLOCK))
     return Aligned(places, covariances)
 
 
-def align_all(images: Sequence[ImagePoints], x: Array, warp: Array, here: Image, y: Array
+def align_all(images: Sequence[ImagePoints], x: Array, warp: Array, current: Image, y: Array
               ) -> Aligned:
     """Align patches as `align_patches`, with x (N, 2) ordered by several gray images."""
-    inside = within(y, here.shape, _MARGIN)
+    inside = within(y, current.shape, _MARGIN)
     # Patches near the border are aligned elsewhere, and their result is discarded.
-    began = np.where(inside[:, None], y, _MARGIN)
-    if compiled.library is None or min(here.shape) <= 2 * _MARGIN or not len(x):
-        places, noise, spread = templates(images, x, warp).align(here, began, inside)
+    start = np.where(inside[:, None], y, _MARGIN)
+    if compiled.library is None or min(current.shape) <= 2 * _MARGIN or not len(x):
+        places, noise, spread = templates(images, x, warp).align(current, start, inside)
     else:
-        places, noise, spread = _stepped(images, x, warp, here, began, inside)
+        places, noise, spread = _stepped(images, x, warp, current, start, inside)
     return Aligned(np.where(inside[:, None], places, y),
                    noise[:, None, None] * spread + _LEAST_ERROR**2 * np.eye(2))
 
 
-def _stepped(images: Sequence[ImagePoints], x: Array, warp: Array, here: Image, began: Array,
+def _stepped(images: Sequence[ImagePoints], x: Array, warp: Array, current: Image, start: Array,
              inside: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
     """Run `Templates.align` compiled."""
     points, inverse = x.astype(np.float32), inverses(warp[:, :2]).astype(np.float32)
     tuning = np.array([_LEAST_SLOPE, _LEAST_NOISE, _STEPS, _MAX_SHIFT], float)
 
     def step(task: tuple[list[ImagePoints], slice]) -> tuple[Array, Array, Array]:
-        seen, some = task
-        return compiled.align(seen, here, points[some], inverse[some], began[some], inside[some],
-                              tuning)
+        part, block = task
+        return compiled.align(part, current, points[block], inverse[block], start[block],
+                              inside[block], tuning)
 
     places, noise, spread = (np.concatenate(values)
                              for values in zip(*map_parallel(step, passes(images))))
@@ -144,21 +144,21 @@ class Templates(NamedTuple):
     gray: Gray
     contrasts: Array
 
-    def align(self, here: Image, began: Array, inside: NDArray[np.bool_]
+    def align(self, image: Image, start: Array, inside: NDArray[np.bool_]
               ) -> tuple[Array, Array, Array]:
         """
-        Align the templates with an image by Gauss-Newton, starting from `began` (N, 2).
+        Align the templates with an image by Gauss-Newton, starting from `start` (N, 2).
 
         inside: (N,) those that may move. Returns positions (N, 2), the variances (N,) of a pixel,
         and the covariances (N, 2, 2) of positions for unit variance.
         """
-        seen, places = _CurrentPatches(self, here, began), began
+        patches, places = _CurrentPatches(self, image, start), start
         for _ in range(_STEPS):
-            step = -times(self.inverses, seen.along_slopes(places).T)
-            places = np.clip(places + step, began - _MAX_SHIFT, began + _MAX_SHIFT)
-        near = inside & (np.abs(places - began).max(1, initial=0) < _MAX_SHIFT)
-        places = np.where(near[:, None], places, began)
-        return places, seen.noise(places), self.inverses
+            step = -times(self.inverses, patches.along_slopes(places).T)
+            places = np.clip(places + step, start - _MAX_SHIFT, start + _MAX_SHIFT)
+        near = inside & (np.abs(places - start).max(1, initial=0) < _MAX_SHIFT)
+        places = np.where(near[:, None], places, start)
+        return places, patches.noise(places), self.inverses
 
 
 class _CurrentPatches:
@@ -186,14 +186,14 @@ class _CurrentPatches:
     def _fractions(self, places: Array) -> Array:
         """Return the fractions of positions (N, 2), and update patches that changed pixel."""
         # Few move to another pixel.
-        across = np.flatnonzero((np.floor(places) != self._whole).any(1))
-        if len(across):
-            self._whole[across] = np.floor(places[across])
-            patches = _around(self._image, self._whole[across])
-            self._patches[..., across] = patches
+        changed = np.flatnonzero((np.floor(places) != self._whole).any(1))
+        if len(changed):
+            self._whole[changed] = np.floor(places[changed])
+            patches = _around(self._image, self._whole[changed])
+            self._patches[..., changed] = patches
             # Points last in memory too, unlike after fancy indexing.
-            slopes = self._expected.slopes.take(across, axis=2)
-            self._products[..., across] = _products(slopes, patches)
+            slopes = self._expected.slopes.take(changed, axis=2)
+            self._products[..., changed] = _products(slopes, patches)
         return places - self._whole
 
 
@@ -203,12 +203,13 @@ def templates(images: Sequence[ImagePoints], points: Array, warp: Array) -> Temp
 
     images: of the points, in their order.
     """
-    back = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2, dtype=np.float32)
-    x, y = (back[:, axis] @ _SQUARE for axis in (0, 1))
+    to_image = np.concatenate([inverses(warp[:, :2]), points[:, :, None]], axis=2,
+                              dtype=np.float32)
+    x, y = (to_image[:, axis] @ _SQUARE for axis in (0, 1))
     # Points first, so that neighbours in the image are neighbours in memory.
     by_point = np.empty_like(x)
-    for image, these in blocks(floating(images)):
-        cv2.remap(image, x[these], y[these], cv2.INTER_LINEAR, by_point[these],
+    for image, block in blocks(floating(images)):
+        cv2.remap(image, x[block], y[block], cv2.INTER_LINEAR, by_point[block],
                   cv2.BORDER_REPLICATE)
     wide = np.asarray(cv2.transpose(by_point)).reshape(_SIDE, _SIDE, -1)
     middle = wide[1:-1, 1:-1]

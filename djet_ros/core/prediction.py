@@ -52,20 +52,20 @@ def predict_constant_motion(previous: Features, K: Array, R: Array, prior: Relat
     rotated = rays(K, previous.points) @ R.T
     if not prior.t.any() or not len(x):
         return _project(K, rotated)
-    seen = rays(K, x)
-    rho = inverse_depths(prior.R, prior.t, seen, rays(K, y))[0].clip(0, _MAX_INVERSE_DEPTH)
+    rays_x = rays(K, x)
+    rho = inverse_depths(prior.R, prior.t, rays_x, rays(K, y))[0].clip(0, _MAX_INVERSE_DEPTH)
     step = rho[:, None] * prior.t
     # Points scaled to z = 1 in the first camera, so that the step is rho t for any depth.
-    there = (seen @ prior.R.T + step) @ R.T
-    shift = _project(K, there + step) - _project(K, there)
+    points = (rays_x @ prior.R.T + step) @ R.T
+    shift = _project(K, points + step) - _project(K, points)
     return np.asarray(_project(K, rotated) + shift[nearest(y, previous.points)])
 
 
-def nearest(points: Array, others: Array) -> NDArray[np.int64]:
-    """Return the indices (M,) of the points (N, 2) nearest to each of others (M, 2)."""
+def nearest(points: Array, queries: Array) -> NDArray[np.int64]:
+    """Return the indices (M,) of the points (N, 2) nearest to each of queries (M, 2)."""
     if compiled.library is not None:
-        return compiled.nearest(points, others)
-    return np.asarray(cKDTree(points).query(others)[1])
+        return compiled.nearest(points, queries)
+    return np.asarray(cKDTree(points).query(queries)[1])
 
 
 def _project(K: Array, places: Array) -> Array:
@@ -111,14 +111,14 @@ def likely_rotation(previous: Features, current: Features, K: Array, known: Sequ
 
 def _large_matches(previous: Features, current: Features) -> tuple[Array, Array]:
     """Mutual nearest matches (M, 2) and (M, 2) among the features of the largest octave."""
-    there, here = _largest(previous), _largest(current)
-    if not len(there) or not len(here):
+    large_previous, large_current = _largest(previous), _largest(current)
+    if not len(large_previous) or not len(large_current):
         return np.empty((0, 2)), np.empty((0, 2))
-    bits, others = previous.descriptors[there], current.descriptors[here]
-    similarity = signed_bits(bits) @ signed_bits(others).T
-    nearest = similarity.argmax(1)
-    mutual = similarity.argmax(0)[nearest] == np.arange(len(there))
-    return previous.points[there[mutual]], current.points[here[nearest[mutual]]]
+    similarity = (signed_bits(previous.descriptors[large_previous])
+                  @ signed_bits(current.descriptors[large_current]).T)
+    partner = similarity.argmax(1)
+    mutual = similarity.argmax(0)[partner] == np.arange(len(large_previous))
+    return previous.points[large_previous[mutual]], current.points[large_current[partner[mutual]]]
 
 
 def _largest(features: Features) -> NDArray[np.int64]:

@@ -41,9 +41,9 @@ def distortion_jacobian(K: Array, u: Array, k1: float) -> Array:
 def undistorted_rays(K: Array, pixels: Array, k1: float) -> Array:
     """Return the viewing rays (N, 3), with z = 1, of pixels (N, 2) distorted by k1."""
     towards = rays(K, pixels)
-    u = seen = towards[:, :2]
+    u = distorted = towards[:, :2]
     for _ in range(_INVERSE_ITERATIONS):
-        u = seen / stretch(u, k1)
+        u = distorted / stretch(u, k1)
     towards[:, :2] = u
     return towards
 

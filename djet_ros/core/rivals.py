@@ -92,7 +92,7 @@ class SecondMotion:
     flatness: tuple[float, float]
 
     @property
-    def both(self) -> tuple[Pose, Pose]:
+    def motions(self) -> tuple[Pose, Pose]:
         """Both motions, the first one first."""
         return self.first, self.pose
 
@@ -134,8 +134,8 @@ def preferences(losses: Array, places: Array, chosen: int) -> Array:
 
 def refined_rivals(problem: JetProblem, rivals: Sequence[Pose], loss: Loss) -> list[Pose]:
     """Optimise rivals to the minima of their basins, on a subset of the matches."""
-    some = problem.subset(subsampled(len(problem.blur), _REFINED_ON))
-    return refine_all(some, rivals, loss, _STEPS).poses()
+    subset = problem.subset(subsampled(len(problem.blur), _REFINED_ON))
+    return refine_all(subset, rivals, loss, _STEPS).poses()
 
 
 def is_planar(x: Array, y: Array, noise: float) -> bool:
@@ -145,8 +145,8 @@ def is_planar(x: Array, y: Array, noise: float) -> bool:
     Nearly all of them have to, and as closely as their noise allows: with larger errors, depths
     may remain that determine the motion. noise: robust standard deviation in pixels.
     """
-    some = subsampled(len(x), _REFINED_ON)
-    H, _ = cv2.findHomography(x[some], y[some], cv2.USAC_MAGSAC, _INLIER * noise)
+    subset = subsampled(len(x), _REFINED_ON)
+    H, _ = cv2.findHomography(x[subset], y[subset], cv2.USAC_MAGSAC, _INLIER * noise)
     return H is not None and _fits_homography(np.asarray(H, np.float64), x, y, noise)
 
 
@@ -154,10 +154,10 @@ def _fits_homography(H: Array, x: Array, y: Array, noise: float) -> bool:
     """Return whether a homography (3, 3) brings x to y, both (N, 2), to within their noise."""
     if not np.isfinite(H).all():
         return False
-    off = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
+    errors = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
     # For normal errors in both directions the median distance is 1.18 standard deviations.
-    return bool(np.median(off) < _MAX_EXCESS * 1.18 * noise
-                and (off > _OUTLIER * noise).mean() < _MAX_OFF_PLANE)
+    return bool(np.median(errors) < _MAX_EXCESS * 1.18 * noise
+                and (errors > _OUTLIER * noise).mean() < _MAX_OFF_PLANE)
 
 
 def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival | None:
@@ -169,25 +169,25 @@ def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival
     decides between the two, which gives the preference. noise: as for ``is_planar``; None if the
     scene is not planar, or both motions are the same.
     """
-    few, some = (subsampled(len(x), count) for count in (_SCREENED_ON, _REFINED_ON))
+    few, subset = (subsampled(len(x), count) for count in (_SCREENED_ON, _REFINED_ON))
     # A few matches suffice to reject a plane in most scenes.
     if _induced_homography(pose, K, x[few], y[few], noise) is None:
         return None
-    x, y = x[some], y[some]
+    x, y = x[subset], y[subset]
     H = _induced_homography(pose, K, x, y, noise)
     if H is None:
         return None
     rays_x = rays(K, x)
-    _, turns, ways, normals = cv2.decomposeHomographyMat(H, np.eye(3))
-    others = [Pose(np.asarray(R, np.float64), unit(np.asarray(t, np.float64).ravel()))
-              for R, t in zip(turns, ways) if t.any()]
-    if len(others) < len(turns):
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    candidates = [Pose(np.asarray(R, np.float64), unit(np.asarray(t, np.float64).ravel()))
+                  for R, t in zip(rotations, translations) if t.any()]
+    if len(candidates) < len(rotations):
         return None
-    farthest = int(np.argmax([unsigned_distance(pose, other) for other in others]))
+    farthest = int(np.argmax([unsigned_distance(pose, candidate) for candidate in candidates]))
     ahead = rays_x @ normals[farthest].ravel() > 0
     behind = ahead != (ahead.mean() > 0.5)
     losses = np.stack([np.zeros(len(x)), behind])
-    return Rival(others[farthest], float(preferences(losses, x, 0)[1]))
+    return Rival(candidates[farthest], float(preferences(losses, x, 0)[1]))
 
 
 def _induced_homography(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Array | None:
@@ -213,12 +213,12 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     the same lines with the opposite direction. None if there are few outliers, or if no more than
     half of them agree: false matches that are off by a few pixels agree with many motions.
     """
-    on = refine_all(problem, [first], Loss(), 0)
-    first = _with_chirality(problem, first, np.abs(on.r[0]) < _INLIER * scale)
-    scale = min(max(robust_scale(on.r[0]), scale), 3 * scale)
-    off = _distances(problem, replace(on, t=first.t[None]))
-    outliers = np.flatnonzero(off > _OUTLIER * scale)
-    least = max(least, round(_MIN_SHARE * (off < _INLIER * scale).sum()))
+    lines = refine_all(problem, [first], Loss(), 0)
+    first = _with_chirality(problem, first, np.abs(lines.r[0]) < _INLIER * scale)
+    scale = min(max(robust_scale(lines.r[0]), scale), 3 * scale)
+    distances = _distances(problem, replace(lines, t=first.t[None]))
+    outliers = np.flatnonzero(distances > _OUTLIER * scale)
+    least = max(least, round(_MIN_SHARE * (distances < _INLIER * scale).sum()))
     if len(outliers) < least:
         return None
     pose = _fit_motion(problem.subset(outliers), first, scale)
@@ -226,23 +226,23 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     agreeing = members[outliers].sum()
     if agreeing < least or agreeing <= len(outliers) / 2:
         return None
-    only_first = (off < _INLIER * scale) & ~members
-    only_second = members & (off > _OUTLIER * scale)
+    only_first = (distances < _INLIER * scale) & ~members
+    only_second = members & (distances > _OUTLIER * scale)
     return SecondMotion(first, pose, members,
                         _area(places[only_second]) / max(_area(places[only_first]), 1e-9),
                         (_flatness(problem.subset(only_first), first),
                          _flatness(problem.subset(only_second), pose)))
 
 
-def _fit_motion(alone: JetProblem, near: Pose, scale: float) -> Pose:
+def _fit_motion(problem: JetProblem, near: Pose, scale: float) -> Pose:
     """Fit the motion with most inliers among some matches, from starts around another motion."""
     rough, tight = (Loss('geman_mcclure', share * scale) for share in (_OUTLIER, _INLIER))
-    some = alone.subset(subsampled(len(alone.blur), _MAX_OUTLIERS))
-    found = refine_all(some, starts_around(near, _DIRECTIONS), rough, _STEPS)
-    seen = refine_all(alone, found.poses(), tight, 1)
-    best = int(losses_in_front(alone, seen, tight).sum(1).argmin())
-    refined = refine_all(alone, [seen.pose(best)], tight, _STEPS)
-    return _with_chirality(alone, refined.pose(0), np.abs(refined.r[0]) < _INLIER * scale)
+    subset = problem.subset(subsampled(len(problem.blur), _MAX_OUTLIERS))
+    sketch = refine_all(subset, starts_around(near, _DIRECTIONS), rough, _STEPS)
+    candidates = refine_all(problem, sketch.poses(), tight, 1)
+    best = int(losses_in_front(problem, candidates, tight).sum(1).argmin())
+    refined = refine_all(problem, [candidates.pose(best)], tight, _STEPS)
+    return _with_chirality(problem, refined.pose(0), np.abs(refined.r[0]) < _INLIER * scale)
 
 
 def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose: Pose,
@@ -263,19 +263,20 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     least = max(least, round(_MIN_SHARE * len(fixed)))
     if min(fixed.sum(), (~fixed).sum()) < least:
         return None
-    alone = problem.subset(~fixed)
-    world = _fit_motion(alone, pose, scale)
+    moving = problem.subset(~fixed)
+    motion = _fit_motion(moving, pose, scale)
     # Matches that stay in place are less noisy than those that move.
-    scale = max(clipped_scale(refine_all(alone, [world], Loss(), 0).r[0]), scale)
-    tight = refine_all(alone, [world], Loss('geman_mcclure', _INLIER * scale), _STEPS)
-    world = _with_chirality(alone, tight.pose(0), np.abs(tight.r[0]) < _INLIER * scale)
-    off = _distances(problem, refine_all(problem, [world], Loss(), 0))
-    agree = off[~fixed] < _INLIER * scale
-    attached = (off[fixed] > _OUTLIER * scale).sum()
+    scale = max(clipped_scale(refine_all(moving, [motion], Loss(), 0).r[0]), scale)
+    tight = refine_all(moving, [motion], Loss('geman_mcclure', _INLIER * scale), _STEPS)
+    motion = _with_chirality(moving, tight.pose(0), np.abs(tight.r[0]) < _INLIER * scale)
+    distances = _distances(problem, refine_all(problem, [motion], Loss(), 0))
+    agree = distances[~fixed] < _INLIER * scale
+    attached = (distances[fixed] > _OUTLIER * scale).sum()
     if agree.mean() <= 0.5 or attached < least or attached <= fixed.sum() / 2:
         return None
-    deep = _flatness(alone.subset(agree), world) < DEEP_RATIO
-    return world if deep or (prior is not None and continues_motion(prior, world, pose)) else None
+    deep = _flatness(moving.subset(agree), motion) < DEEP_RATIO
+    continued = prior is not None and continues_motion(prior, motion, pose)
+    return motion if deep or continued else None
 
 
 def false_alarms(agreeing: int, matches: int, chance: float) -> float:
@@ -298,14 +299,14 @@ def _log_choose(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
 
-def _distances(problem: JetProblem, on: Sketch) -> Array:
+def _distances(problem: JetProblem, lines: Sketch) -> Array:
     """
     Distances (N,) of matches from their epipolar half-lines, in units of the residuals.
 
-    on: a pose, with the residuals to its lines, which do not depend on the sign of t.
+    lines: a pose, with the residuals to its lines, which do not depend on the sign of t.
     """
     # Indefinite surfaces that are kept as printed have losses below 0.
-    return np.asarray(np.sqrt(np.abs(losses_in_front(problem, on, Loss(), signs=(1.0,))[0])))
+    return np.asarray(np.sqrt(np.abs(losses_in_front(problem, lines, Loss(), signs=(1.0,))[0])))
 
 
 def _with_chirality(problem: JetProblem, pose: Pose, agreeing: NDArray[np.bool_]) -> Pose:

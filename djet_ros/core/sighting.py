@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 class LandmarkObservations:
     """Observed landmarks: indices (M,), pixels (M, 2), and roots (M, 2, 2) of their precision."""
 
-    which: NDArray[np.int64]
+    indices: NDArray[np.int64]
     places: Array
     roots: Array
 
@@ -54,28 +54,28 @@ class Sighting:
     poses: Poses
     landmarks: Landmarks
 
-    def look(self, reach: int) -> LandmarkObservations | None:
+    def observe(self, reach: int) -> LandmarkObservations | None:
         """Observe landmarks within `reach` pixels of their prediction; None if none is found."""
-        here, distances = self.views[-1], self.distances
-        mine, expected, warps = self._predict(reach)
+        newest, distances = self.views[-1], self.distances
+        indices, expected, warps = self._predict(reach)
         # A wide paraboloid finds the direction to the minimum but overshoots by a quarter, since
         # the correction of pixel locking is made for small windows; landmarks would oscillate
         # about their prediction. A second, small window around the first estimate does not.
-        mine, fits = self._around(mine, warps[mine], expected[mine], reach)
+        indices, fits = self._around(indices, warps[indices], expected[indices], reach)
         close = fits.minima()
-        good = distances.describable(close, here.surface_gray.shape, SMALL_WINDOW // 2)
-        good &= ~masked_at(here.mask, close)
-        mine = mine[good]
-        mine, fits = self._around(mine, warps[mine], close[good], SMALL_WINDOW // 2)
-        if not len(mine):
+        usable = distances.describable(close, newest.surface_gray.shape, SMALL_WINDOW // 2)
+        usable &= ~masked_at(newest.mask, close)
+        indices = indices[usable]
+        indices, fits = self._around(indices, warps[indices], close[usable], SMALL_WINDOW // 2)
+        if not len(indices):
             return None
         minima = fits.minima()
         # The residual of a least-squares fit estimates its noise variance.
         residual = np.maximum(fits.values(minima), 1e-3)
         places, covariances = fuse_positions(minima, fits.inverses * residual[:, None, None],
-                                             self._aligned(mine, warps[mine], minima))
+                                             self._aligned(indices, warps[indices], minima))
         halves = np.asarray(np.linalg.cholesky(inverses(covariances)), float)
-        return LandmarkObservations(mine, places, halves.transpose(0, 2, 1))
+        return LandmarkObservations(indices, places, halves.transpose(0, 2, 1))
 
     def _predict(self, reach: int) -> tuple[NDArray[np.int64], Array, Array]:
         """
@@ -86,22 +86,23 @@ class Sighting:
         landmarks, newest = self.landmarks, len(self.views) - 1
         places = points_in_frame(self.K, self.poses, landmarks, newest)
         expected = projected(self.K, places, self.poses.k1)
-        here = self.views[newest]
-        wanted = (places[:, 2] > 0) & ~masked_at(here.mask, expected) & self.distances.describable(
-            expected, here.surface_gray.shape, reach)
+        view = self.views[newest]
+        visible = (places[:, 2] > 0) & ~masked_at(view.mask, expected)
+        visible &= self.distances.describable(expected, view.surface_gray.shape, reach)
         # A landmark that neither of the last two frames observed is lost.
-        wanted &= landmarks.seen[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
-        which = np.argsort(landmarks.anchors, kind='stable')
-        which = which[wanted[which]]
-        anchors = landmarks.anchors[which]
+        visible &= landmarks.observed[:, -3:-1].any(1) | (landmarks.anchors == newest - 1)
+        indices = np.argsort(landmarks.anchors, kind='stable')
+        indices = indices[visible[indices]]
+        anchors = landmarks.anchors[indices]
         R, t = (motions[newest, anchors] for motions in self.poses.relative_motions)
-        seen = expected[which], 1 / places[which, 2]
-        slope = landmarks.rho[which, None] * landmarks.slopes[which]
+        projection = expected[indices], 1 / places[indices, 2]
+        slope = landmarks.rho[indices, None] * landmarks.slopes[indices]
         warps = np.empty((len(landmarks), 3, 2))
-        warps[which] = patch_warp(self.K, R, *seen) + slant_warp(self.K, t, *seen, slope)
-        return which[has_moderate_stretch(warps[which])], expected, warps
+        warps[indices] = (patch_warp(self.K, R, *projection)
+                          + slant_warp(self.K, t, *projection, slope))
+        return indices[has_moderate_stretch(warps[indices])], expected, warps
 
-    def _around(self, mine: NDArray[np.int64], warps: Array, places: Array, radius: int
+    def _around(self, indices: NDArray[np.int64], warps: Array, places: Array, radius: int
                 ) -> tuple[NDArray[np.int64], Paraboloids]:
         """
         Sample surfaces of landmarks (M,) around places (M, 2) in the newest view.
@@ -109,30 +110,30 @@ class Sighting:
         Landmarks are ordered by their anchors, since images are sampled one by one. Returns those
         with a minimum within the window, and their paraboloids.
         """
-        if not len(mine):
-            return mine, no_paraboloids(0)
-        here, (anchors, counts) = self.views[-1].surface_gray, self._anchor_counts(mine)
+        if not len(indices):
+            return indices, no_paraboloids(0)
+        newest, (anchors, counts) = self.views[-1].surface_gray, self._anchor_counts(indices)
         # Contrast at the sampled places; that at the prediction would bias the scale.
-        strengths = self.distances.strengths(here, np.rint(places).astype(np.int64))
-        contrasts = contrast_ratios(strengths, self.landmarks.strengths[mine], counts)
+        strengths = self.distances.strengths(newest, np.rint(places).astype(np.int64))
+        contrasts = contrast_ratios(strengths, self.landmarks.strengths[indices], counts)
         references = self.distances.shifted_references(
             [(self.views[anchor].surface_gray, count) for anchor, count in zip(anchors, counts)],
-            self.landmarks.anchor_pixels[mine], places, warps, contrasts)
-        fits = self.distances.fit_around(references, here, places, radius)
+            self.landmarks.anchor_pixels[indices], places, warps, contrasts)
+        fits = self.distances.fit_around(references, newest, places, radius)
         fits, _ = resolve_indefinite(fits, 'drop')
-        good = fits.usable & fits.minimum_within(radius)
-        return mine[good], fits.of(good)
+        usable = fits.usable & fits.minimum_within(radius)
+        return indices[usable], fits.of(usable)
 
-    def _aligned(self, mine: NDArray[np.int64], warps: Array, places: Array) -> Aligned:
+    def _aligned(self, indices: NDArray[np.int64], warps: Array, places: Array) -> Aligned:
         """Align patches of landmarks (M,), ordered by their anchors, from places (M, 2)."""
         images = [(self.views[anchor].gray, count)
-                  for anchor, count in zip(*self._anchor_counts(mine))]
-        return align_all(images, self.landmarks.anchor_pixels[mine], warps, self.views[-1].gray,
+                  for anchor, count in zip(*self._anchor_counts(indices))]
+        return align_all(images, self.landmarks.anchor_pixels[indices], warps, self.views[-1].gray,
                          places)
 
-    def _anchor_counts(self, mine: NDArray[np.int64]
+    def _anchor_counts(self, indices: NDArray[np.int64]
                        ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the distinct anchors of landmarks (M,), ordered by them, and their counts."""
-        counts = np.bincount(self.landmarks.anchors[mine])
+        counts = np.bincount(self.landmarks.anchors[indices])
         anchors = np.flatnonzero(counts)
         return anchors, counts[anchors]

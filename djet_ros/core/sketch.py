@@ -44,13 +44,13 @@ class Sketch:
     def __len__(self) -> int:
         return len(self.R)
 
-    def pose(self, number: int) -> Pose:
+    def pose(self, index: int) -> Pose:
         """Return one of the poses."""
-        return Pose(self.R[number], self.t[number])
+        return Pose(self.R[index], self.t[index])
 
     def poses(self) -> list[Pose]:
         """Return all poses."""
-        return [self.pose(number) for number in range(len(self))]
+        return [self.pose(index) for index in range(len(self))]
 
     def scales(self) -> Array:
         """Return the robust standard deviations (S,) of the residuals."""
@@ -71,10 +71,10 @@ class _Evaluation:
     weights: Array
     roots: Array
 
-    def restore(self, other: _Evaluation, which: NDArray[np.int64]) -> None:
+    def restore(self, other: _Evaluation, indices: NDArray[np.int64]) -> None:
         """Take the values of some of the poses from another evaluation."""
         for name in ('costs', 'r', 'sign', 'weights', 'roots'):
-            getattr(self, name)[which] = getattr(other, name)[which]
+            getattr(self, name)[indices] = getattr(other, name)[indices]
 
 
 @dataclass(frozen=True)
@@ -98,22 +98,22 @@ def refine_all(problem: JetProblem, starts: Sequence[Pose], loss: Loss, steps: i
         return Sketch(*compiled.refine_all(problem.matches, loss.encoded, steps,
                                            INITIAL_DAMPING, R, t))
     products = _products(problem)
-    here = _evaluate(problem, products, R, t, loss, rotation_prior)
+    current = _evaluate(problem, products, R, t, loss, rotation_prior)
     damping = np.full(len(R), INITIAL_DAMPING)
     for _ in range(steps):
-        tangents, H, gradient = _normal_equations(products, R, t, here, rotation_prior)
+        tangents, H, gradient = _normal_equations(products, R, t, current, rotation_prior)
         R_new, t_new = moved_all(R, t, tangents, _damped_steps(H, gradient, damping))
-        there = _evaluate(problem, products, R_new, t_new, loss, rotation_prior)
-        better = there.costs < here.costs
+        trial = _evaluate(problem, products, R_new, t_new, loss, rotation_prior)
+        better = trial.costs < current.costs
         damping = np.where(better, np.maximum(damping / 10, 1e-9), damping * 10)
         if not better.any():
             continue
         # Starts whose step was rejected return to where they were.
         if len(worse := np.flatnonzero(~better)):
             R_new[worse], t_new[worse] = R[worse], t[worse]
-            there.restore(here, worse)
-        R, t, here = R_new, t_new, there
-    return Sketch(R, t, here.costs, here.r, here.sign)
+            trial.restore(current, worse)
+        R, t, current = R_new, t_new, trial
+    return Sketch(R, t, current.costs, current.r, current.sign)
 
 
 def costs_in_front(problem: JetProblem, sketch: Sketch, loss: Loss) -> Array:
@@ -141,10 +141,11 @@ def losses_in_front(problem: JetProblem, sketch: Sketch, loss: Loss,
     a1, a2 = along[:, 0], along[:, 1]
     s11, s12, s22 = problem.covariances
     variance = np.abs(s11 * a1**2 + 2 * s12 * a1 * a2 + s22 * a2**2) + problem.blur
-    way = ((problem.rays_y[:2] - infinite) * along).sum(1) / np.sqrt(np.maximum(variance, 1e-24))
+    root = np.sqrt(np.maximum(variance, 1e-24))
+    position = ((problem.rays_y[:2] - infinite) * along).sum(1) / root
     squared = sketch.r**2
     losses = np.stack([sketch.sign * loss(
-        squared + np.where(ahead, np.minimum(sign * way, 0), 0)**2)[0] for sign in signs])
+        squared + np.where(ahead, np.minimum(sign * position, 0), 0)**2)[0] for sign in signs])
     return np.asarray(losses[losses.sum(2).argmin(0), np.arange(len(sketch))])
 
 
@@ -177,7 +178,7 @@ def _evaluate(problem: JetProblem, products: Array, R: Array, t: Array, loss: Lo
     return _Evaluation(costs, r, sign, weights, roots)
 
 
-def _normal_equations(products: Array, R: Array, t: Array, here: _Evaluation,
+def _normal_equations(products: Array, R: Array, t: Array, current: _Evaluation,
                       rotation_prior: RotationPrior | None) -> tuple[Array, Array, Array]:
     """
     Tangents (S, 3, 2) of t, H (S, 5, 5) and gradients (S, 5) of the costs.
@@ -188,10 +189,10 @@ def _normal_equations(products: Array, R: Array, t: Array, here: _Evaluation,
     by_rotation = skew(t)[:, None] @ (GENERATORS @ R[:, None])
     by_direction = skew(tangents.transpose(0, 2, 1)) @ R[:, None]
     slopes = np.concatenate([by_rotation, by_direction], axis=1).reshape(-1, 9)
-    J = (slopes @ products).reshape(len(R), 5, -1) / here.roots[:, None]
-    weighted = J * here.weights[:, None]
+    J = (slopes @ products).reshape(len(R), 5, -1) / current.roots[:, None]
+    weighted = J * current.weights[:, None]
     H = weighted @ J.transpose(0, 2, 1)
-    gradient = (weighted @ (here.sign * here.r)[..., None])[..., 0]
+    gradient = (weighted @ (current.sign * current.r)[..., None])[..., 0]
     if rotation_prior is not None:
         H[:, :3, :3] += rotation_prior.weight
         gradient[:, :3] += rotation_log(R @ rotation_prior.R.T) @ rotation_prior.weight

@@ -46,18 +46,19 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
     """
     if len(x) < _MIN_POINTS or not len(points):
         return np.zeros((len(points), 2))
-    away, near = cKDTree(x).query(
+    distances, neighbours = cKDTree(x).query(
         points, k=min(_NEIGHBOURS, len(x)), distance_upper_bound=_REACH)
-    there = np.isfinite(away)
-    near = np.where(there, near, 0)
-    value = rho[near]
-    count = np.maximum(there.sum(1), 1)
+    is_near = np.isfinite(distances)
+    neighbours = np.where(is_near, neighbours, 0)
+    value = rho[neighbours]
+    count = np.maximum(is_near.sum(1), 1)
     # The lower median of the neighbours.
-    level = np.take_along_axis(np.sort(np.where(there, value, np.inf), axis=1),
+    level = np.take_along_axis(np.sort(np.where(is_near, value, np.inf), axis=1),
                                (count - 1)[:, None] // 2, axis=1)[:, 0]
-    level = np.where(there.any(1), level, 1.0)
-    J = np.concatenate([np.ones_like(value)[:, :, None], (x[near] - points[:, None]) / _REACH], 2)
-    trusted = there / (sigma[near]**2 + (_NONPLANARITY * level[:, None])**2)
+    level = np.where(is_near.any(1), level, 1.0)
+    offsets = (x[neighbours] - points[:, None]) / _REACH
+    J = np.concatenate([np.ones_like(value)[:, :, None], offsets], 2)
+    trusted = is_near / (sigma[neighbours]**2 + (_NONPLANARITY * level[:, None])**2)
     prior = np.diag([1e-9, 1.0, 1.0]) / (_PRIOR_SLOPE * level)[:, None, None]**2
     weights = trusted
     for _ in range(_ROUNDS):
@@ -65,11 +66,11 @@ def slopes(x: Array, rho: Array, sigma: Array, points: Array) -> Array:
         plane = np.linalg.solve(back @ J + prior, back @ value[:, :, None])
         squares = (value - (J @ plane)[:, :, 0])**2 * trusted
         weights = trusted / (1 + squares / 4)
-    here, slope = plane[:, 0, 0], plane[:, 1:, 0]
-    flat = ((there & (squares < _INLIER)).sum(1) >= _MIN_POINTS) & (here > 0)
-    found = slope / (_REACH * np.where(flat, here, 1.0)[:, None])
-    flat &= np.abs(found).max(1) < _MAX_SLOPE
-    return np.where(flat[:, None], found, 0.0)
+    level_at_point, slope = plane[:, 0, 0], plane[:, 1:, 0]
+    flat = ((is_near & (squares < _INLIER)).sum(1) >= _MIN_POINTS) & (level_at_point > 0)
+    gradients = slope / (_REACH * np.where(flat, level_at_point, 1.0)[:, None])
+    flat &= np.abs(gradients).max(1) < _MAX_SLOPE
+    return np.where(flat[:, None], gradients, 0.0)
 
 
 def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
@@ -85,11 +86,11 @@ def slopes_of_all(x: Array, rho: Array, sigma: Array) -> Array:
         return np.zeros((len(x), 2))
     u, v = x.T / _HALF_SIDE - np.floor(x.min(0) / _HALF_SIDE)[:, None]
     trusted = 1 / np.maximum(sigma**2 + (_NONPLANARITY * rho)**2, 1e-18)
-    planes, off, fitting = planes_at(u, v, rho, trusted)
-    found, improvement = planes[:, 1:3] / _HALF_SIDE, planes[:, 3]
-    flat = ((off < _INLIER) & (fitting >= _MIN_POINTS) & (improvement > _SIGNIFICANT)
-            & (np.abs(found).max(1) < _MAX_SLOPE * np.abs(rho)))
-    return np.where(flat[:, None], found, 0.0)
+    planes, squared, counts = planes_at(u, v, rho, trusted)
+    gradients, improvement = planes[:, 1:3] / _HALF_SIDE, planes[:, 3]
+    flat = ((squared < _INLIER) & (counts >= _MIN_POINTS) & (improvement > _SIGNIFICANT)
+            & (np.abs(gradients).max(1) < _MAX_SLOPE * np.abs(rho)))
+    return np.where(flat[:, None], gradients, 0.0)
 
 
 def planes_at(u: Array, v: Array, rho: Array, trusted: Array) -> tuple[Array, Array, Array]:
@@ -107,19 +108,19 @@ def planes_at(u: Array, v: Array, rho: Array, trusted: Array) -> tuple[Array, Ar
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, rho, u * rho, v * rho])
     weights = trusted
     for _ in range(_SQUARE_ROUNDS):
-        planes = _planes(squares.sums(weights * terms), usual)[:, squares.which]
-        here, along_u, along_v, _ = planes
-        off = (rho - here - along_u * u - along_v * v)**2 * trusted
-        weights = trusted / (1 + off / 4)
-    fits = (off < _INLIER)[None].astype(float)
-    return planes.T, off, squares.sums(fits)[0, squares.which]
+        planes = _planes(squares.sums(weights * terms), usual)[:, squares.indices]
+        offset, along_u, along_v, _ = planes
+        squared = (rho - offset - along_u * u - along_v * v)**2 * trusted
+        weights = trusted / (1 + squared / 4)
+    fits = (squared < _INLIER)[None].astype(float)
+    return planes.T, squared, squares.sums(fits)[0, squares.indices]
 
 
 class _Squares:
     """
     Squares of side two that overlap by half, and the points (N,) at u, v >= 0 in them.
 
-    which: (N,) index of the square whose centre is nearest to each point, among the S in use.
+    indices: (N,) index of the square whose centre is nearest to each point, among the S in use.
     """
 
     def __init__(self, u: Array, v: Array) -> None:
@@ -128,7 +129,7 @@ class _Squares:
         self._shape = int(rows.max()) + 3, int(columns.max()) + 3
         self._quarter = (rows + 1) * self._shape[1] + columns + 1
         middles = np.rint(v).astype(np.int64) * (self._shape[1] - 1) + np.rint(u).astype(np.int64)
-        self._used, self.which = np.unique(middles, return_inverse=True)
+        self._used, self.indices = np.unique(middles, return_inverse=True)
 
     def sums(self, values: Array) -> Array:
         """Sum values (V, N) over the points in each square; returns (V, S)."""

@@ -61,8 +61,9 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
     motion, if any.
     """
     x, y = x[:_RANSAC_MATCHES], y[:_RANSAC_MATCHES]
-    found = five_point(K, x, y, threshold, robust=True)
-    return [*likely_starts(found[0] if found else None, prior), *planar_starts(K, x, y, threshold)]
+    estimate = five_point(K, x, y, threshold, robust=True)
+    return [*likely_starts(estimate[0] if estimate else None, prior),
+            *planar_starts(K, x, y, threshold)]
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,9 @@ def external_starts(K: Array, x: Array, y: Array, known: KnownMotion) -> list[Po
     """
     starts = [] if known.guess is None else [known.guess]
     if known.rotation is not None:
-        some = subsampled(len(x), _MAX_MATCHES)
+        subset = subsampled(len(x), _MAX_MATCHES)
         starts += [Pose(known.rotation.R, t)
-                   for t in translation_directions(K, x[some], y[some], known.rotation.R)]
+                   for t in translation_directions(K, x[subset], y[subset], known.rotation.R)]
         if known.guess is not None:
             starts.append(Pose(known.rotation.R, known.guess.t))
         starts.append(Pose(known.rotation.R, FORWARD))
@@ -112,19 +113,19 @@ def translation_directions(K: Array, x: Array, y: Array, R: Array) -> list[Array
     normals = np.cross(rays(K, x) @ R.T, rays(K, y)) * focal
     # A match with hardly any parallax does not constrain t.
     normals = normals[np.linalg.norm(normals, axis=1) > _MIN_PARALLAX]
-    found: list[Array] = []
-    while len(found) < _DIRECTIONS and len(normals) > 2:
+    directions: list[Array] = []
+    while len(directions) < _DIRECTIONS and len(normals) > 2:
         one, other = np.random.default_rng(0).integers(0, len(normals), (2, _PAIRS))
         tried = unit(np.cross(normals[one], normals[other]))
-        off = np.abs(tried @ normals.T)
+        distances = np.abs(tried @ normals.T)
         # A match paired with itself gives a zero vector, which fits everything.
-        agreement = np.maximum(1 - (off / _TOLERANCE)**2, 0).sum(1) * tried.any(1)
+        agreement = np.maximum(1 - (distances / _TOLERANCE)**2, 0).sum(1) * tried.any(1)
         best = int(agreement.argmax())
         if not agreement[best]:
             break
-        found.append(tried[best])
-        normals = normals[off[best] > _OUTLIER]
-    return found
+        directions.append(tried[best])
+        normals = normals[distances[best] > _OUTLIER]
+    return directions
 
 
 def subsampled(count: int, most: int) -> slice:

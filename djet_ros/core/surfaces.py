@@ -101,13 +101,13 @@ class _ImageSurface:
 
     def __init__(self, previous: View, current: View, x: Array) -> None:
         self.x = x
-        self._there, self._here = previous.gray, current.gray
+        self._previous_gray, self._current_gray = previous.gray, current.gray
 
     def aligned(self, y: Array, warp: Array | None, chosen: NDArray[np.bool_]) -> Aligned:
         """Return positions from patch alignment through the warp; y itself without a warp."""
         if warp is None:
             return unaligned(y[chosen])
-        return align_patches(self._there, self._here, *(
+        return align_patches(self._previous_gray, self._current_gray, *(
             values.compress(chosen, axis=0) for values in (self.x, y, warp)))
 
 
@@ -148,9 +148,10 @@ class DescriptorSurface(_ImageSurface):
         stale = usable & (moved | warped | ~self._latest.usable)
         self._warp = np.where(stale[:, None, None], warp, self._warp)
         self._is_warped |= stale
-        there, here, seen = (values.compress(stale, axis=0) for values in (self.x, y, warp))
+        x_stale, y_stale, warp_stale = (
+            values.compress(stale, axis=0) for values in (self.x, y, warp))
         return self._merged(stale, usable, y, self._distances.between_pixels(
-            self._previous.surface_gray, there, self._current, here, seen,
+            self._previous.surface_gray, x_stale, self._current, y_stale, warp_stale,
             self._contrast_around(y, usable), SMALL_WINDOW // 2))
 
     def _around_pixels(self, y: Array) -> Paraboloids:
@@ -172,12 +173,12 @@ class DescriptorSurface(_ImageSurface):
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
         """Estimate the contrast ratio at the initial matches, once."""
         if self._contrast is None:
-            there = np.flatnonzero(usable)
-            there = there[subsampled(len(there), _CONTRAST_MATCHES)]
+            chosen = np.flatnonzero(usable)
+            chosen = chosen[subsampled(len(chosen), _CONTRAST_MATCHES)]
             self._contrast = self._distances.contrast(
-                self._previous.surface_gray, np.rint(self.x[there]).astype(np.int64),
+                self._previous.surface_gray, np.rint(self.x[chosen]).astype(np.int64),
                 self._current,
-                np.rint(y[there]).astype(np.int64))
+                np.rint(y[chosen]).astype(np.int64))
         return self._contrast
 
     def _merged(self, stale: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
@@ -201,7 +202,7 @@ class DescriptorDistances:
         self._sigma = config.window_sigma
         self._tests = pattern(config.binary_tests, config.patch_scale)
 
-    def seen(self, gray: Image) -> NDArray[Any]:
+    def smoothed(self, gray: Image) -> NDArray[Any]:
         """Smooth an image (H, W) for the tests: View.surface_gray, the input of all methods."""
         return (smooth_finely if self._grading else smooth)(gray, self._scale)
 
@@ -210,23 +211,25 @@ class DescriptorDistances:
         """Return a mask (N,) of the points with a descriptor at every pixel within `radius`."""
         return describable(np.rint(points).astype(np.int64), shape, radius, self._tests)
 
-    def contrast(self, there: NDArray[Any], x: Pixels, here: NDArray[Any], y: Pixels) -> float:
+    def contrast(self, previous: NDArray[Any], x: Pixels, current: NDArray[Any], y: Pixels
+                 ) -> float:
         """
-        Return the contrast of an image around pixels y (N, 2) over another's around x (N, 2).
+        Return the contrast of the current image around y (N, 2) over the previous around x (N, 2).
 
         A change of exposure changes it. Binary tests are invariant to contrast: 1.
         """
-        some = subsampled(len(x), _CONTRAST_MATCHES)
-        return contrast_ratio(self.strengths(here, y[some]), self.strengths(there, x[some]))
+        subset = subsampled(len(x), _CONTRAST_MATCHES)
+        return contrast_ratio(self.strengths(current, y[subset]),
+                              self.strengths(previous, x[subset]))
 
-    def strengths(self, seen: NDArray[Any], points: Pixels) -> Array:
+    def strengths(self, image: NDArray[Any], points: Pixels) -> Array:
         """Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_ratio``."""
         if not self._grading:
             return np.ones(len(points))
-        p, q = intensities(seen, points, self._tests[:_CONTRAST_TESTS])
+        p, q = intensities(image, points, self._tests[:_CONTRAST_TESTS])
         return np.asarray(np.abs(p - q).sum(0, dtype=float) + 1)
 
-    def reference(self, seen: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
+    def reference(self, image: NDArray[Any], points: NDArray[Any], contrast: float = 1.0,
                   warp: Array | None = None) -> NDArray[Any]:
         """
         Return descriptors (T, N) at whole pixels, or through warps (N, 3, 2) at any points (N, 2).
@@ -235,8 +238,8 @@ class DescriptorDistances:
         ValueError if a point is too close to the border for a descriptor and there is no warp.
         """
         if warp is not None:
-            return self._warped_descriptors(warp, [(seen, len(points))], points, contrast)
-        p, q = intensities(seen, np.asarray(points, np.int64), self._tests)
+            return self._warped_descriptors(warp, [(image, len(points))], points, contrast)
+        p, q = intensities(image, np.asarray(points, np.int64), self._tests)
         return grades(p, q, self._grading, contrast) if self._grading else p < q
 
     def _warped_descriptors(self, warp: Array, images: Sequence[ImagePoints], points: Array,
@@ -245,14 +248,14 @@ class DescriptorDistances:
             return warped_grades(warp, images, points, self._grading, contrast, self._tests)
         return np.less(*warped_intensities(warp, images, points, self._tests))
 
-    def surfaces(self, reference: NDArray[Any], seen: NDArray[Any], centres: Pixels,
+    def surfaces(self, reference: NDArray[Any], image: NDArray[Any], centres: Pixels,
                  radius: int) -> NDArray[Any]:
         """Return distances (P, P, N) in bits from references (T, N) to all pixels of windows."""
         if self._grading:
-            return graded_surfaces(reference, seen, centres, radius, self._grading, self._tests)
-        return hamming_surfaces(reference, seen, centres, radius, self._tests)
+            return graded_surfaces(reference, image, centres, radius, self._grading, self._tests)
+        return hamming_surfaces(reference, image, centres, radius, self._tests)
 
-    def between_pixels(self, there: NDArray[Any], x: Array, here: NDArray[Any], y: Array,
+    def between_pixels(self, previous: NDArray[Any], x: Array, current: NDArray[Any], y: Array,
                        warp: Array, contrast: float, radius: int) -> Paraboloids:
         """
         Fit paraboloids to the distances around y (N, 2), with references around x (N, 2).
@@ -260,25 +263,25 @@ class DescriptorDistances:
         References are taken between pixels, so that a minimum at y falls on a whole pixel, where
         the fit has no bias. warp: (N, 3, 2) from the patches around x to those around y.
         """
-        references = self.shifted_references([(there, len(x))], x, y, warp, contrast)
-        return self.fit_around(references, here, y, radius)
+        references = self.shifted_references([(previous, len(x))], x, y, warp, contrast)
+        return self.fit_around(references, current, y, radius)
 
-    def shifted_references(self, there: Sequence[ImagePoints], x: Array, y: Array, warp: Array,
+    def shifted_references(self, images: Sequence[ImagePoints], x: Array, y: Array, warp: Array,
                            contrast: float | Array) -> NDArray[Any]:
         """
         Return descriptors (T, N) next to x for which a minimum at y falls on a whole pixel.
 
-        there: the images of the points x, in their order; contrast: one for all, or (N,).
+        images: of the points x, in their order; contrast: one for all, or (N,).
         """
         back = times(inverses(warp[:, :2]), y - np.rint(y))
-        return self._warped_descriptors(warp, there, x - back, contrast)
+        return self._warped_descriptors(warp, images, x - back, contrast)
 
-    def fit_around(self, references: NDArray[Any], here: NDArray[Any], y: Array,
+    def fit_around(self, references: NDArray[Any], image: NDArray[Any], y: Array,
                    radius: int) -> Paraboloids:
         """Fit paraboloids to the distances around y (N, 2) from shifted references (T, N)."""
         centres = np.rint(y).astype(np.int64)
         return _without_pixel_locking(
-            fit_paraboloids(self.surfaces(references, here, centres, radius), y, self._sigma))
+            fit_paraboloids(self.surfaces(references, image, centres, radius), y, self._sigma))
 
 
 class PhotometricSurface(_ImageSurface):
@@ -355,16 +358,16 @@ class ReprojectionSurface:
         return unaligned(y[chosen])
 
 
-def contrast_ratio(here: Array, there: Array) -> float:
+def contrast_ratio(current: Array, previous: Array) -> float:
     """Return the contrast ratio of two images, by texture strengths (N,) at the same points."""
-    if not len(here):
+    if not len(current):
         return 1.0
-    return min(max(median(here / there), 1 / _MAX_CONTRAST_RATIO), _MAX_CONTRAST_RATIO)
+    return min(max(median(current / previous), 1 / _MAX_CONTRAST_RATIO), _MAX_CONTRAST_RATIO)
 
 
-def contrast_ratios(here: Array, there: Array, counts: NDArray[np.int64]) -> Array:
+def contrast_ratios(current: Array, previous: Array, counts: NDArray[np.int64]) -> Array:
     """Return contrast ratios (N,) for points of several images, `counts` of each in turn."""
-    ratios = medians_of_parts(here / there, counts)
+    ratios = medians_of_parts(current / previous, counts)
     return np.repeat(np.clip(ratios, 1 / _MAX_CONTRAST_RATIO, _MAX_CONTRAST_RATIO), counts)
 
 
@@ -381,12 +384,12 @@ def resolve_indefinite(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloi
     policy: 'project' replaces them by the nearest positive definite ones, 'drop' marks them
     unusable, 'keep' leaves them as in the paper.
     """
-    bad = indefinite(paraboloids) & paraboloids.usable
+    is_indefinite = indefinite(paraboloids) & paraboloids.usable
     if policy == 'project':
         paraboloids = project_to_positive(paraboloids)
     elif policy == 'drop':
-        paraboloids = replace(paraboloids, usable=paraboloids.usable & ~bad)
-    return paraboloids, int(bad.sum())
+        paraboloids = replace(paraboloids, usable=paraboloids.usable & ~is_indefinite)
+    return paraboloids, int(is_indefinite.sum())
 
 
 def _weight_window(offsets: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
@@ -415,8 +418,8 @@ def _replaced(paraboloids: Paraboloids, fitted: Paraboloids,
               places: NDArray[np.bool_]) -> Paraboloids:
     """Return the paraboloids with those in a mask (N,) replaced by the fitted ones."""
     # np.take is several times as fast as assignment by a mask for arrays of several axes.
-    which = np.arange(len(places))
-    which[places] = len(places) + np.arange(len(fitted.c))
+    indices = np.arange(len(places))
+    indices[places] = len(places) + np.arange(len(fitted.c))
     return replace(paraboloids, **{
         name: np.concatenate([getattr(paraboloids, name), getattr(fitted, name)]).take(
-            which, axis=0) for name in ('centres', 'A', 'b', 'c')})
+            indices, axis=0) for name in ('centres', 'A', 'b', 'c')})

@@ -122,10 +122,10 @@ def _limited_by_chirality(algorithm: Algorithm, track: Track) -> Track:
                                 for rival in track.rivals)
             or not is_planar(algorithm.pair.x[agree], track.placed.places[agree], track.scale)):
         return track
-    ours = first.nearest(track.pose)
-    preferred = preferences(first.chirality_losses(), first.x, ours)
+    basin = first.nearest(track.pose)
+    preferred = preferences(first.chirality_losses(), first.x, basin)
     # A rival that was in the same basin in round one is not compared by it.
-    preferred[ours] = np.inf
+    preferred[basin] = np.inf
     return replace(track, rivals=tuple(replace(rival, preference=min(
         rival.preference, float(preferred[first.nearest(rival.pose)])))
         for rival in track.rivals))
@@ -193,7 +193,7 @@ def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> 
         members[first.voting] = second.members
         track = algorithm.rerun(second.pose, alive=members) or track
     if decided is None:
-        other = second.both[1 - camera]
+        other = second.motions[1 - camera]
         return replace(track, rivals=(Rival(other, 0.0),), body_ambiguous=True)
     return track
 
@@ -207,12 +207,12 @@ def _decide_camera(second: SecondMotion, prior: Pose | None,
     matches over a much larger area; or the one whose points span near to far depths while those of
     the other do not.
     """
-    both, orders = second.both, ((0, 1), (1, 0))
+    motions, orders = second.motions, ((0, 1), (1, 0))
     for one, other in orders:
-        if measured is not None and measured.prefers(both[one].R, both[other].R):
+        if measured is not None and measured.prefers(motions[one].R, motions[other].R):
             return one
     for one, other in orders:
-        if prior is not None and continues_motion(prior, both[one], both[other]):
+        if prior is not None and continues_motion(prior, motions[one], motions[other]):
             return one
     if second.width < _SMALL_BODY:
         return 0

@@ -86,10 +86,10 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         status, t = Status.DEGENERATE, np.zeros(3)
     elif _false_alarm(pair, track, count, config):
         status = Status.TOO_FEW_INLIERS
-    elif (alone := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
+    elif (pure_rotation := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
         # t is not determined.
-        status, R, t = Status.NO_PARALLAX, alone.R, np.zeros(3)
-        if alone.is_biased:
+        status, R, t = Status.NO_PARALLAX, pure_rotation.R, np.zeros(3)
+        if pure_rotation.is_biased:
             covariance = _widened_by_rotation(covariance, pose.R, R)
     else:
         status, covariance, rivals = _compare_with_rivals(

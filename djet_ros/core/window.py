@@ -193,7 +193,8 @@ class Window:
         # the limit.
         self.final_landmarks = np.empty((0, 3))
         if len(self._views) > 2 and not self._is_keyframe[-2]:
-            self._marginalise_landmarks(self._landmarks.seen[:, -2] & ~self._landmarks.seen[:, -1])
+            observed = self._landmarks.observed
+            self._marginalise_landmarks(observed[:, -2] & ~observed[:, -1])
             self._marginalise_frame(len(self._views) - 2)
         if sum(self._is_keyframe) > self._tuning.keyframes:
             self._update_lens()
@@ -230,7 +231,7 @@ class Window:
         Only its images that are still needed: landmarks are not created in it again.
         """
         gray, _ = undistort_image(view.gray, self._K, self.lens.corrected_k1, before=before)
-        return replace(view, gray=gray, surface_gray=self._distances.seen(gray))
+        return replace(view, gray=gray, surface_gray=self._distances.smoothed(gray))
 
     def landmarks(self) -> Array:
         """Return the reliable landmarks as points (M, 3) in the newest frame."""
@@ -238,10 +239,10 @@ class Window:
 
     def _places(self, chosen: NDArray[np.bool_]) -> Array:
         """Return the reliable ones of landmarks (N,), as points (M, 3) in the newest frame."""
-        sure = self._landmarks.of(np.asarray(
-            chosen & (self._landmarks.seen.sum(1) > 1) & (self._landmarks.rho > 0)))
-        places = points_in_frame(self._K, self._poses, sure, len(self._views) - 1)
-        return np.asarray(places / sure.rho[:, None])
+        reliable = self._landmarks.of(np.asarray(
+            chosen & (self._landmarks.observed.sum(1) > 1) & (self._landmarks.rho > 0)))
+        places = points_in_frame(self._K, self._poses, reliable, len(self._views) - 1)
+        return np.asarray(places / reliable.rho[:, None])
 
     def _projected(self, places: Array) -> Array:
         """Project points (N, 3) in a camera to distorted pixels (N, 2)."""
@@ -302,9 +303,10 @@ class Window:
 
     def _known_depths(self, chosen: NDArray[np.bool_] | None = None) -> KnownDepths:
         """Return the landmarks that the newest frame observes, or the chosen (N,) ones of them."""
-        seen = self._landmarks.seen[:, -1]
+        observed = self._landmarks.observed[:, -1]
         return KnownDepths.of_landmarks(
-            self._K, self._poses, self._landmarks.of(seen if chosen is None else seen & chosen),
+            self._K, self._poses,
+            self._landmarks.of(observed if chosen is None else observed & chosen),
             len(self._views) - 1)
 
     def _choose_keyframe(self) -> None:
@@ -318,7 +320,7 @@ class Window:
             return
         newest = len(self._views) - 1
         last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
-        visible = self._landmarks.of(self._landmarks.seen[:, newest])
+        visible = self._landmarks.of(self._landmarks.observed[:, newest])
         due = len(visible) < (1 - self._tuning.lost) * self._tuning.landmarks
         if not due:
             R = self._poses.R[newest] @ self._poses.R[last].T
@@ -373,7 +375,7 @@ class Window:
         surfaces = x[ahead], rho[ahead], noise[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].surface_gray.shape)
         x, rho = x[usable], rho[usable]
-        visible = self._landmarks.of(self._landmarks.seen[:, anchor])
+        visible = self._landmarks.of(self._landmarks.observed[:, anchor])
         present = self._projected(points_in_frame(self._K, self._poses, visible, anchor))
         side = tuning.cell * np.sqrt(self._views[anchor].surface_gray.size / tuning.landmarks)
         chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(visible))
@@ -387,12 +389,12 @@ class Window:
     def _observe_landmarks(self) -> None:
         """Observe landmarks in the newest frame."""
         sighted = Sighting(self._distances, self._K, self._views, self._poses,
-                           self._landmarks).look(self._config.window // 2)
+                           self._landmarks).observe(self._config.window // 2)
         if sighted is not None:
-            self._landmarks.minima[sighted.which, -1] = sighted.places
-            self._landmarks.roots[sighted.which, -1] = sighted.roots
-            self._landmarks.seen[sighted.which, -1] = True
-            self._landmarks.observation_counts[sighted.which] += 1
+            self._landmarks.minima[sighted.indices, -1] = sighted.places
+            self._landmarks.roots[sighted.indices, -1] = sighted.roots
+            self._landmarks.observed[sighted.indices, -1] = True
+            self._landmarks.observation_counts[sighted.indices] += 1
 
     def _refine(self) -> Array:
         """Refine poses and depths by Gauss-Newton; returns the Hessian over the poses."""
@@ -403,13 +405,14 @@ class Window:
             H, g = self._prior.H + reduced.H, prior.gradient + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
             observed, prior = self._line_search(observed, prior, step, reduced.change(step))
-        false = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
-        self._landmarks.seen[observed.landmark[false], observed.frame[false]] = False
-        np.subtract.at(self._landmarks.observation_counts, observed.landmark[false], 1)
+        outliers = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
+        self._landmarks.observed[observed.landmark[outliers], observed.frame[outliers]] = False
+        np.subtract.at(self._landmarks.observation_counts, observed.landmark[outliers], 1)
         # Relative to the newest step: the unit may be much longer or shorter.
         length = float(np.linalg.norm(self._poses.relative_motions[1][-1, -2]))
         in_front = self._landmarks.rho * length > -self._tuning.negative_parallax
-        self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1) & in_front))
+        self._landmarks = self._landmarks.of(
+            np.asarray(self._landmarks.observed.any(1) & in_front))
         return H
 
     def _line_search(self, observed: Observed, prior: PriorCost, step: Array, change: Array
@@ -438,13 +441,13 @@ class Window:
 
     def _normalise_roots(self) -> None:
         """Scale the roots of precision in the newest frame to a median of one pixel."""
-        seen = self._landmarks.seen[:, -1]
-        roots = self._landmarks.roots[seen, -1]
+        observed = self._landmarks.observed[:, -1]
+        roots = self._landmarks.roots[observed, -1]
         if len(roots):
             sizes = np.linalg.norm(roots, axis=(1, 2)) / np.sqrt(2)
-            self._landmarks.roots[seen, -1] = roots / median(sizes)
+            self._landmarks.roots[observed, -1] = roots / median(sizes)
             # The anchor's patch is as noisy as the first one that observes it.
-            new = seen & ~self._landmarks.anchor_roots.any((1, 2))
+            new = observed & ~self._landmarks.anchor_roots.any((1, 2))
             self._landmarks.anchor_roots[new] = self._landmarks.roots[new, -1]
 
     def _observed(self) -> Observed:
@@ -509,20 +512,20 @@ class Window:
 
     def _marginalise_landmarks(self, chosen: NDArray[np.bool_]) -> None:
         """Marginalise the chosen landmarks (N,) into the prior, before a frame is removed."""
-        everything = self._landmarks
+        landmarks = self._landmarks
         self.final_landmarks = np.concatenate([self.final_landmarks, self._places(chosen)])
-        self._landmarks = everything.of(chosen)
+        self._landmarks = landmarks.of(chosen)
         reduced = self._reduced(observe(self._K, self._poses, self._landmarks))
         self._prior.add(reduced.H, reduced.g, self._poses)
-        self._landmarks = everything.of(~chosen)
+        self._landmarks = landmarks.of(~chosen)
 
     def _marginalise_frame(self, frame: int) -> None:
         """Marginalise a frame, and remove it with its landmarks."""
         self._poses = self._poses.without_frame(frame)
         self._prior = self._prior.without_frame(frame)
         self._landmarks = self._landmarks.without_frame(frame)
-        self._landmarks = self._landmarks.of(np.asarray(self._landmarks.seen.any(1)))
+        self._landmarks = self._landmarks.of(np.asarray(self._landmarks.observed.any(1)))
         lists: tuple[list[Any], ...] = (
             self._views, self._is_keyframe, self._has_landmarks)
-        for things in lists:
-            del things[frame]
+        for per_frame in lists:
+            del per_frame[frame]
