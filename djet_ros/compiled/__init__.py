@@ -27,7 +27,7 @@ Images = Sequence[tuple[NDArray[Any], int]]
 
 # Version of the C interface, see interface.c: an editable install may have newer sources than its
 # build.
-_INTERFACE = 9
+_INTERFACE = 10
 
 _NO_BYTES = c_char * 0
 
@@ -42,20 +42,20 @@ _TERMS = 27
 
 
 def _loaded() -> ctypes.CDLL | None:
-    found = find_spec('djet_ros.compiled._loops')
-    if found is None or found.origin is None or os.environ.get('DJET_COMPILED') == '0':
+    spec = find_spec('djet_ros.compiled._loops')
+    if spec is None or spec.origin is None or os.environ.get('DJET_COMPILED') == '0':
         return None
     try:
         # ctypes releases the GIL during calls.
-        built = ctypes.CDLL(found.origin)
+        library = ctypes.CDLL(spec.origin)
     except OSError as error:  # built for another machine, or damaged
         warn(f'{error}; ignored, reinstall djet_ros', stacklevel=2)
         return None
-    if not hasattr(built, 'djet_interface') or built.djet_interface() != _INTERFACE:
-        warn(f'{found.origin} is built of other sources; ignored, reinstall djet_ros',
+    if not hasattr(library, 'djet_interface') or library.djet_interface() != _INTERFACE:
+        warn(f'{spec.origin} is built of other sources; ignored, reinstall djet_ros',
              stacklevel=2)
         return None
-    return built
+    return library
 
 
 library = _loaded()
@@ -66,41 +66,40 @@ def in_use() -> str:
     return 'NumPy' if library is None else 'compiled'
 
 
-def align(there: Images, here: NDArray[np.uint8], points: Gray, inverse: Gray, began: Array,
+def align(images: Images, current: NDArray[np.uint8], points: Gray, inverse: Gray, start: Array,
           inside: NDArray[np.bool_], tuning: Array) -> tuple[Array, Array, Array]:
     """
     Align N patches of some gray images with another one (H, W): `core.patches.Templates.align`.
 
-    points: (N, 2) in `there`, ordered by image; inverse: (N, 2, 2) inverses of their warps; began:
-    (N, 2) initial positions in `here`, with room for the patches and all steps; inside: (N,) those
-    that may move; tuning: (4,) regularisation, least noise, number of steps and largest
+    points: (N, 2) in the images, in their order; inverse: (N, 2, 2) inverses of their warps;
+    start: (N, 2) initial positions in `current`, with room for the patches and all steps; inside:
+    (N,) those that may move; tuning: (4,) regularisation, least noise, number of steps and largest
     displacement. Returns positions (N, 2), variances (N,) of a pixel, and inverse normal matrices
     (N, 2, 2).
     """
     n = len(points)
     places, variances, inverses = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
-    _call('djet_place', *_images(there, np.uint8), _ptr(here, np.uint8), c_int(here.shape[1]),
-          _ptr(points, np.float32), _ptr(inverse, np.float32), _ptr(began),
-          _ptr(inside, np.bool_), _ptr(tuning), _ptr(places), _ptr(variances),
-          _ptr(inverses))
+    _call('djet_align', *_images(images, np.uint8), _ptr(current, np.uint8),
+          c_int(current.shape[1]), _ptr(points, np.float32), _ptr(inverse, np.float32),
+          _ptr(start), _ptr(inside, np.bool_), *map(_ptr, (tuning, places, variances, inverses)))
     return places, variances, inverses
 
 
-def warped_grades(images: Images, looks: tuple[Gray, Gray], points: Gray, contrast: Gray,
+def warped_grades(images: Images, warps: tuple[Gray, Gray], points: Gray, contrast: Gray,
                   ends: tuple[Gray, NDArray[np.int64]], reach: int, max_depth_ratio: float
                   ) -> NDArray[np.int16]:
     """
     Return grades (T, N) of tests on patches seen through warps: `core.graded.warped_grades`.
 
-    looks: (N, 2, 2) inverse warps, and (N, 2) their relative change of depth per pixel; points:
+    warps: (N, 2, 2) their inverses, and (N, 2) relative changes of depth per pixel; points:
     (N, 2) in the images, ordered by image; contrast: (N,); ends: (2, E) distinct test points, and
     (2, T) the indices of each test; reach: the largest grade; max_depth_ratio: limit of the depth
     ratio.
     """
     n, tests = len(points), ends[1].shape[1]
     grades = np.empty((tests, n), np.int16)
-    _call('djet_grades_through', *_images(images, np.int16), c_int(n),
-          _ptr(looks[0], np.float32), _ptr(looks[1], np.float32), c_float(max_depth_ratio),
+    _call('djet_warped_grades', *_images(images, np.int16), c_int(n),
+          _ptr(warps[0], np.float32), _ptr(warps[1], np.float32), c_float(max_depth_ratio),
           _ptr(points, np.float32), _ptr(contrast, np.float32), c_int(ends[0].shape[1]),
           _ptr(ends[0].T, np.float32), c_int(tests), _ptr(ends[1], np.int64), c_int(reach),
           _ptr(grades, np.int16))
@@ -150,12 +149,12 @@ def peaks(slopes: Gray, least: float, margin: int, after: tuple[int, int]
     last. Returns indices (M,) into the flat array, and a mask (M,) of the maxima of their wider
     neighbourhood.
     """
-    places, around = np.empty(slopes.size, np.int64), np.empty(slopes.size, np.bool_)
+    places, strongest = np.empty(slopes.size, np.int64), np.empty(slopes.size, np.bool_)
     count = _call('djet_peaks', _ptr(slopes, np.float32), c_int(slopes.shape[1]),
                   c_float(least), c_int(margin), *map(c_int, after),
                   _ptr(np.empty(slopes.shape[1], np.uint8), np.uint8),
-                  _ptr(places, np.int64), _ptr(around, np.bool_))
-    return places[:count], around[:count]
+                  _ptr(places, np.int64), _ptr(strongest, np.bool_))
+    return places[:count], strongest[:count]
 
 
 def exact_peaks(slopes: Gray, places: NDArray[np.int64]) -> Array:
@@ -187,26 +186,27 @@ def spread_out(points: NDArray[np.int64], by_strength: NDArray[np.int64],
     return chosen[:count]
 
 
-def curved_blocks(image: NDArray[np.uint8], side: int, apart: int) -> NDArray[np.int32]:
+def block_curvatures(image: NDArray[np.uint8], side: int, spacing: int) -> NDArray[np.int32]:
     """
-    Sum absolute curvatures in blocks (B,) of an image (H, W): `core.corners._curved_blocks`.
+    Sum absolute curvatures in blocks (B,) of an image (H, W): `core.corners._block_curvatures`.
 
-    side: of blocks in pixels; the image has room for one; apart: rows from one row of blocks to
+    side: of blocks in pixels; the image has room for one; spacing: rows from one row of blocks to
     the next.
     """
     height, width = image.shape
-    rows, across = -(-(height - side - 1) // apart), width // side
-    sums, memory = np.empty(rows * across, np.int32), np.empty((2, width + 2), np.int32)
-    _call('djet_curved_blocks', _ptr(image, np.uint8), c_int(width), c_int(rows), c_int(apart),
-          c_int(side), c_int(across), _ptr(memory, np.int32), _ptr(sums, np.int32))
+    rows, columns = -(-(height - side - 1) // spacing), width // side
+    sums, memory = np.empty(rows * columns, np.int32), np.empty((2, width + 2), np.int32)
+    _call('djet_block_curvatures', _ptr(image, np.uint8),
+          *map(c_int, (width, rows, spacing, side, columns)), _ptr(memory, np.int32),
+          _ptr(sums, np.int32))
     return sums
 
 
-def nearest(points: Array, others: Array) -> NDArray[np.int64]:
-    """Return the index of the nearest of points (N, 2), N > 0, for each of others (M, 2), (M,)."""
-    indices = np.empty(len(others), np.int64)
+def nearest(points: Array, queries: Array) -> NDArray[np.int64]:
+    """Return indices (M,) of the nearest of points (N, 2), N > 0, to each of queries (M, 2)."""
+    indices = np.empty(len(queries), np.int64)
     memory = np.empty(4 * len(points) + 2, np.int32)
-    _call('djet_nearest', c_int(len(points)), _ptr(points), c_int(len(others)), _ptr(others),
+    _call('djet_nearest', c_int(len(points)), _ptr(points), c_int(len(queries)), _ptr(queries),
           _ptr(memory, np.int32), _ptr(indices, np.int64))
     return indices
 
@@ -224,7 +224,7 @@ def describe(image: NDArray[np.uint8], pixels: NDArray[np.int64], tests: NDArray
     return descriptors
 
 
-def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8], y: Array,
+def match_distances(previous: NDArray[np.uint8], x: Array, current: NDArray[np.uint8], y: Array,
                     tests: NDArray[np.int64], reach: int) -> Array:
     """
     Return Hamming distances (N,) between two images of one size: `core.hamming.match_distances`.
@@ -233,28 +233,28 @@ def match_distances(there: NDArray[np.uint8], x: Array, here: NDArray[np.uint8],
     """
     n = len(x)
     distances = np.empty(n)
-    _call('djet_match_distances', _ptr(there, np.uint8), _ptr(here, np.uint8),
-          *map(c_int, there.shape), c_int(n), _ptr(x), _ptr(y), _ptr(tests, np.int64),
+    _call('djet_match_distances', _ptr(previous, np.uint8), _ptr(current, np.uint8),
+          *map(c_int, previous.shape), c_int(n), _ptr(x), _ptr(y), _ptr(tests, np.int64),
           c_int(reach), _ptr(distances))
     return distances
 
 
-def most_similar(strips: NDArray[np.int64], there: tuple[NDArray[np.uint8], Array],
-                 here: tuple[NDArray[np.uint8], Array]
+def most_similar(strips: NDArray[np.int64], previous: tuple[NDArray[np.uint8], Array],
+                 current: tuple[NDArray[np.uint8], Array]
                  ) -> tuple[NDArray[np.int64], Gray, Gray]:
     """
     Find the most similar features in strips of two images: `core.features.most_similar`.
 
-    strips: (S, 4); there, here: descriptors (N, 32) and places (N, 2) of each.
+    strips: (S, 4); previous, current: descriptors (N, 32) and positions (N, 2) of each.
     """
-    strips, (n, m) = strips.reshape(-1, 4), (len(there[0]), len(here[0]))
-    nearest, best_there, best_here = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(
-        m, np.float32)
+    strips, (n, m) = strips.reshape(-1, 4), (len(previous[0]), len(current[0]))
+    nearest, best_previous = np.empty(n, np.int64), np.empty(n, np.float32)
+    best_current = np.empty(m, np.float32)
     _call('djet_most_similar', c_int(len(strips)), _ptr(strips, np.int64), c_int(n), c_int(m),
-          _ptr(there[0], np.uint8), _ptr(there[1], np.float32), _ptr(here[0], np.uint8),
-          _ptr(here[1], np.float32), _ptr(nearest, np.int64), _ptr(best_there, np.float32),
-          _ptr(best_here, np.float32))
-    return nearest, best_there, best_here
+          _ptr(previous[0], np.uint8), _ptr(previous[1], np.float32), _ptr(current[0], np.uint8),
+          _ptr(current[1], np.float32), _ptr(nearest, np.int64), _ptr(best_previous, np.float32),
+          _ptr(best_current, np.float32))
+    return nearest, best_previous, best_current
 
 
 def minimise(matches: tuple[Array, Array, Array, Array], loss: tuple[int, float], steps: int,
@@ -317,20 +317,20 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int) -> Array:
     return R
 
 
-def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, usual: float
+def planes(u: Array, v: Array, r: Array, trusted: Array, rounds: int, prior_slope: float
            ) -> tuple[Array, Array, Array]:
     """
     Fit planes to values r (N,) at points u, v >= 0 (N,): `core.slants.planes_at`.
 
-    trusted: (N,) inverse variances of r; usual: prior standard deviation of the slopes, relative
+    trusted: (N,) inverse variances of r; prior_slope: standard deviation of the slopes, relative
     to the mean value. Returns planes (N, 4), squared residuals (N,), and numbers of inliers (N,).
     """
     n, columns, rows = len(u), int(u.max()) + 3, int(v.max()) + 3
-    off, found, fitting = np.empty(n), np.empty((n, 4)), np.empty(n)
+    squared, fitted, counts = np.empty(n), np.empty((n, 4)), np.empty(n)
     _call('djet_planes', c_int(n), *map(_ptr, (u, v, r, trusted)), c_int(columns), c_int(rows),
-          c_int(rounds), c_double(usual), _ptr(np.empty((_PLANE_ROWS, rows * columns))),
-          *map(_ptr, (off, found, fitting)))
-    return found, off, fitting
+          c_int(rounds), c_double(prior_slope), _ptr(np.empty((_PLANE_ROWS, rows * columns))),
+          *map(_ptr, (squared, fitted, counts)))
+    return fitted, squared, counts
 
 
 def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
@@ -353,63 +353,63 @@ def sums_of_cells(J: Array, weights: Array, r: Array, order: NDArray[np.int64],
     return sums[:count].T, first[:count], pulls, products
 
 
-def leave_one_out(whole: Array, sums: Array) -> tuple[Array, Array]:
+def leave_one_out(H: Array, sums: Array) -> tuple[Array, Array]:
     """
     Leave out each of C cells in turn: `core.covariance.leave_one_out`.
 
-    whole: (5, 5); sums: (27, C). Returns the changes (5, C) of the pose, and the sum (5, 5) of
-    inverse Hessians.
+    H: (5, 5) of all matches; sums: (27, C). Returns the shifts (5, C) of the pose, and the sum
+    (5, 5) of inverse Hessians.
     """
-    moves, inverses = np.empty((sums.shape[1], 5)), np.empty((5, 5))
-    _call('djet_without_each', c_int(len(moves)), *map(_ptr, (whole, sums.T, moves, inverses)))
-    return moves.T, inverses
+    shifts, inverses = np.empty((sums.shape[1], 5)), np.empty((5, 5))
+    _call('djet_leave_one_out', c_int(len(shifts)), *map(_ptr, (H, sums.T, shifts, inverses)))
+    return shifts.T, inverses
 
 
-def observe(seen: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[np.int64],
+def observe(observations: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[np.int64],
             between: tuple[Array, Array], landmarks: tuple[Array, ...], K: tuple[Array, Array],
             tuning: Sequence[float]) -> tuple[NDArray[np.int64], tuple[Array, ...]]:
     """
     Return residuals of M observations of N landmarks by F frames: `core.bundle.observe`.
 
-    seen: landmark and frame of each (M,); anchors: (N,); between: R (F, F, 3, 3) and t (F, F, 3);
-    landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), anchor_roots (N, 2,
-    2) and anchor_pixels (N, 2); K: (3, 3) and its inverse; tuning: k1, least depth, largest
+    observations: landmark and frame of each (M,); anchors: (N,); between: R (F, F, 3, 3) and t (F,
+    F, 3); landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), anchor_roots
+    (N, 2, 2) and anchor_pixels (N, 2); K: (3, 3) and its inverse; tuning: k1, least depth, largest
     relative displacement by k1, and bound of pixels. Returns anchors (M,), and an Observed's
     residuals, anchor_residuals, normalised, R, t, ray, rho, place and root.
     """
-    m, n, frames = len(seen[0]), len(anchors), len(between[0])
+    m, n, frames = len(observations[0]), len(anchors), len(between[0])
     anchor = np.empty(m, np.int64)
     results = tuple(np.empty(shape) for shape in (
         (m, 2), (n, 2), (n, 2), (m, 3, 3), (m, 3), (m, 3), m, (m, 3), (m, 2, 2)))
     _call('djet_observe', c_int(m), c_int(n), c_int(frames),
-          *(_ptr(one, np.int64) for one in (*seen, anchors)), *map(_ptr, between),
+          *(_ptr(one, np.int64) for one in (*observations, anchors)), *map(_ptr, between),
           *map(_ptr, landmarks), *map(_ptr, K), _ptr(np.array(tuning, float)),
           _ptr(anchor, np.int64), *map(_ptr, results))
     return anchor, results
 
 
-def eliminate(which: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+def eliminate(indices: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
               observed: tuple[Array, ...], points: tuple[Array, Array, Array, float],
-              with_k1: bool, K: tuple[Array, Array], tuning: Sequence[float], trace: float,
-              frames: int) -> tuple[Array, Array, Array, Array, Array]:
+              with_k1: bool, K: tuple[Array, Array], tuning: Sequence[float],
+              depth_information: float, frames: int) -> tuple[Array, Array, Array, Array, Array]:
     """
     Sum the normal equations of M observations, and eliminate N landmarks: `core.bundle.eliminate`.
 
-    which: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M, 2),
-    R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,); points:
-    normalised (N, 2), anchor_roots (N, 2, 2), anchor_residuals (N, 2) and their weight; with_k1:
-    whether k1 is a parameter; K, tuning: as in `observe`; trace: information added to a landmark;
-    frames: F. Returns the arrays of a Reduced.
+    indices: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M,
+    2), R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,);
+    points: normalised (N, 2), anchor_roots (N, 2, 2), anchor_residuals (N, 2) and their weight;
+    with_k1: whether k1 is a parameter; K, tuning: as in `observe`; depth_information: added to a
+    landmark; frames: F. Returns the arrays of a Reduced.
     """
     *of_points, weight = points
     n, size = len(of_points[0]), with_k1 + 6 * frames
     H, g = np.zeros((size, size)), np.zeros(size)
     coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
     slopes, gain = np.zeros((n, 3)), np.empty((3, size))
-    _call('djet_eliminate', c_int(len(which[0])), c_int(n), c_int(frames), c_int(with_k1),
-          *(_ptr(one, np.int64) for one in which), *map(_ptr, observed),
+    _call('djet_eliminate', c_int(len(indices[0])), c_int(n), c_int(frames), c_int(with_k1),
+          *(_ptr(one, np.int64) for one in indices), *map(_ptr, observed),
           *map(_ptr, of_points), c_double(weight), *map(_ptr, K),
-          _ptr(np.array(tuning, float)), c_double(trace),
+          _ptr(np.array(tuning, float)), c_double(depth_information),
           *map(_ptr, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 

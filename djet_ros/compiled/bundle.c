@@ -44,89 +44,92 @@ INLINE void whitened_residual(const Lens *lens, const double place[3], const dou
                          const double *root, double *residual)
 {
     const double depth = depth_of(lens, place), u[2] = {place[0] / depth, place[1] / depth};
-    const double by = stretch(lens, u), x = u[0] * by, y = u[1] * by;
-    double off[2];
+    const double factor = stretch(lens, u), x = u[0] * factor, y = u[1] * factor;
+    double error[2];
     for (int i = 0; i < 2; i++) {
         const double *row = lens->K + 3 * i;
-        off[i] = limited(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
+        error[i] = limited(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
     }
     for (int i = 0; i < 2; i++)
-        residual[i] = root[2 * i] * off[0] + root[2 * i + 1] * off[1];
+        residual[i] = root[2 * i] * error[0] + root[2 * i + 1] * error[1];
 }
 
 /* bundle._by_undistorted, of one root (2, 2) at u. */
 INLINE void by_undistorted(const Lens *lens, const double u[2], const double *root,
-                           double turned[4])
+                           double whitened[4])
 {
-    const double *K = lens->K, *back = lens->K_inverse, by = stretch(lens, u);
+    const double *K = lens->K, *K_inverse = lens->K_inverse, factor = stretch(lens, u);
     for (int i = 0; i < 2; i++) {
-        double row[2], bent[2];
+        double row[2], distorted[2];
         for (int j = 0; j < 2; j++)
             row[j] = root[2 * i] * K[j] + root[2 * i + 1] * K[3 + j];
         const double along = 2 * lens->k1 * (row[0] * u[0] + row[1] * u[1]);
         for (int j = 0; j < 2; j++)
-            bent[j] = along * u[j] + by * row[j];
+            distorted[j] = along * u[j] + factor * row[j];
         for (int j = 0; j < 2; j++)
-            turned[2 * i + j] = bent[0] * back[j] + bent[1] * back[3 + j];
+            whitened[2 * i + j] = distorted[0] * K_inverse[j] + distorted[1] * K_inverse[3 + j];
     }
 }
 
 /* bundle._by_k1, of one root (2, 2) at u. */
-INLINE void by_k1(const Lens *lens, const double u[2], const double *root, double moved[2])
+INLINE void by_k1(const Lens *lens, const double u[2], const double *root, double derivatives[2])
 {
     const double *K = lens->K, squared = u[0] * u[0] + u[1] * u[1];
     const double x = squared * (K[0] * u[0] + K[1] * u[1]);
     const double y = squared * (K[3] * u[0] + K[4] * u[1]);
     for (int i = 0; i < 2; i++)
-        moved[i] = root[2 * i] * x + root[2 * i + 1] * y;
+        derivatives[i] = root[2 * i] * x + root[2 * i + 1] * y;
 }
 
 /* bundle.observe: M observations of N landmarks by F frames. points: (N, 2) in the anchors;
    R_between (F, F, 3, 3) and t_between (F, F, 3) lead from each frame (second index) to each
    other one; minima (N, F, 2), roots (N, F, 2, 2); tuning: k1, least depth, largest relative
-   displacement by k1, and bound of pixels. */
+   displacement by k1, and bound of pixels. Writes the anchor of each observation, and the fields
+   of a bundle.Observed. */
 WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
                        const int64_t *anchors, const double *R_between, const double *t_between,
                        const double (*points)[2], const double *depths, const double *minima,
-                       const double *roots, const double *held, const double (*found)[2],
-                       const double *K, const double *K_inverse, const double *tuning,
-                       int64_t *anchor, double (*residuals)[2], double (*off)[2],
-                       double (*straight)[2], double (*R)[9], double (*t)[3], double (*ray)[3],
-                       double *rho, double (*place)[3], double (*root)[4])
+                       const double *roots, const double *anchor_roots,
+                       const double (*anchor_pixels)[2], const double *K, const double *K_inverse,
+                       const double *tuning, int64_t *anchor, double (*residuals)[2],
+                       double (*anchor_residuals)[2], double (*normalised)[2], double (*R)[9],
+                       double (*t)[3], double (*ray)[3], double *rho, double (*place)[3],
+                       double (*root)[4])
 {
     const Lens lens = lens_of(K, K_inverse, tuning);
     for (int n = 0; n < N; n++) {
-        double towards[3] = {0, 0, 1};
+        double ray_of_point[3] = {0, 0, 1};
         for (int i = 0; i < 2; i++)
-            towards[i] = straight[n][i] = points[n][0] * K_inverse[3 * i]
-                                          + points[n][1] * K_inverse[3 * i + 1]
-                                          + K_inverse[3 * i + 2];
-        whitened_residual(&lens, towards, found[n], held + 4 * n, off[n]);
+            ray_of_point[i] = normalised[n][i] = points[n][0] * K_inverse[3 * i]
+                                                 + points[n][1] * K_inverse[3 * i + 1]
+                                                 + K_inverse[3 * i + 2];
+        whitened_residual(&lens, ray_of_point, anchor_pixels[n], anchor_roots + 4 * n,
+                          anchor_residuals[n]);
     }
     for (int m = 0; m < M; m++) {
-        const int64_t n = landmark[m], seen = n * F + frame[m];
+        const int64_t n = landmark[m], observation = n * F + frame[m];
         anchor[m] = anchors[n];
         const int64_t motion = frame[m] * F + anchor[m];
         memcpy(R[m], R_between + 9 * motion, sizeof R[m]);
         memcpy(t[m], t_between + 3 * motion, sizeof t[m]);
-        memcpy(root[m], roots + 4 * seen, sizeof root[m]);
+        memcpy(root[m], roots + 4 * observation, sizeof root[m]);
         rho[m] = depths[n];
-        ray[m][0] = straight[n][0];
-        ray[m][1] = straight[n][1];
+        ray[m][0] = normalised[n][0];
+        ray[m][1] = normalised[n][1];
         ray[m][2] = 1;
         for (int i = 0; i < 3; i++)
             place[m][i] = R[m][3 * i] * ray[m][0] + R[m][3 * i + 1] * ray[m][1]
                           + R[m][3 * i + 2] + rho[m] * t[m][i];
-        whitened_residual(&lens, place[m], minima + 2 * seen, root[m], residuals[m]);
+        whitened_residual(&lens, place[m], minima + 2 * observation, root[m], residuals[m]);
     }
 }
 
-INLINE int64_t least(int64_t a, int64_t b)
+INLINE int64_t smaller(int64_t a, int64_t b)
 {
     return a < b ? a : b;
 }
 
-INLINE int64_t most(int64_t a, int64_t b)
+INLINE int64_t larger(int64_t a, int64_t b)
 {
     return a > b ? a : b;
 }
@@ -138,34 +141,35 @@ static void cross(const double a[3], const double b[3], double product[3])
     product[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* bundle.jacobians. */
+/* bundle.jacobians of one observation, times a factor. */
 static void differentiate(const Lens *lens, const double *residuals, const double *R,
                           const double *t, const double *ray, double rho, const double *place,
-                          const double *root, double by, Row *row)
+                          const double *root, double factor, Row *row)
 {
     const double *K = lens->K, *K_inverse = lens->K_inverse, depth = depth_of(lens, place);
-    double turned[4];
+    double whitened[4];
     row->u[0] = place[0] / depth;
     row->u[1] = place[1] / depth;
-    by_undistorted(lens, row->u, root, turned);
+    by_undistorted(lens, row->u, root, whitened);
     for (int i = 0; i < 2; i++) {
-        double by_place[3], by_turned[3];
+        double by_place[3], by_ray[3];
         for (int j = 0; j < 2; j++)
-            by_place[j] = by * (turned[2 * i] * K[j] + turned[2 * i + 1] * K[3 + j]) / depth;
+            by_place[j] =
+                factor * (whitened[2 * i] * K[j] + whitened[2 * i + 1] * K[3 + j]) / depth;
         by_place[2] = -(by_place[0] * place[0] + by_place[1] * place[1]) / depth;
         for (int j = 0; j < 3; j++)
-            by_turned[j] = by_place[0] * R[j] + by_place[1] * R[3 + j] + by_place[2] * R[6 + j];
+            by_ray[j] = by_place[0] * R[j] + by_place[1] * R[3 + j] + by_place[2] * R[6 + j];
         cross(place, by_place, row->by_frame[i]);
-        cross(by_turned, ray, row->by_anchor[i]);
+        cross(by_ray, ray, row->by_anchor[i]);
         for (int j = 0; j < 3; j++) {
             row->by_frame[i][3 + j] = by_place[j] * rho;
-            row->by_anchor[i][3 + j] = -by_turned[j] * rho;
+            row->by_anchor[i][3 + j] = -by_ray[j] * rho;
         }
         row->by_own[i][0] = by_place[0] * t[0] + by_place[1] * t[1] + by_place[2] * t[2];
         for (int j = 0; j < 2; j++)
-            row->by_own[i][1 + j] = by_turned[0] * K_inverse[j] + by_turned[1] * K_inverse[3 + j]
-                                    + by_turned[2] * K_inverse[6 + j];
-        row->e[i] = by * residuals[i];
+            row->by_own[i][1 + j] = by_ray[0] * K_inverse[j] + by_ray[1] * K_inverse[3 + j]
+                                    + by_ray[2] * K_inverse[6 + j];
+        row->e[i] = factor * residuals[i];
     }
 }
 
@@ -222,34 +226,37 @@ WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landma
                          const int64_t *frame, const int64_t *anchor, const double *residuals,
                          const double *R, const double *t, const double *ray, const double *rho,
                          const double *place, const double *root, const double *weights,
-                         const double (*straight)[2], const double *held_before,
-                         const double *off, double weight, const double *K,
-                         const double *K_inverse, const double *tuning, double trace, double *H,
-                         double *g, double *coupling, double *variances, double *slopes,
+                         const double (*normalised)[2], const double *anchor_roots,
+                         const double *anchor_residuals, double weight, const double *K,
+                         const double *K_inverse, const double *tuning, double depth_information,
+                         double *H, double *g, double *coupling, double *variances, double *slopes,
                          double *gain)
 {
     const Lens lens = lens_of(K, K_inverse, tuning);
     const int64_t size = with_k1 + 6 * (int64_t)F;
     for (int n = 0, m = 0; n < N; n++) {
-        double information[9] = {trace, 0, 0, 0, trace, 0, 0, 0, trace}, held[4], by[2];
+        double information[9] = {
+            [0] = depth_information, [4] = depth_information, [8] = depth_information};
+        double by_point[4], by_lens[2];
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
-        const double *gone = off + 2 * n;
-        by_undistorted(&lens, straight[n], held_before + 4 * n, held);
-        by_k1(&lens, straight[n], held_before + 4 * n, by);
+        const double *anchor_residual = anchor_residuals + 2 * n;
+        by_undistorted(&lens, normalised[n], anchor_roots + 4 * n, by_point);
+        by_k1(&lens, normalised[n], anchor_roots + 4 * n, by_lens);
         /* Range of columns of the frames that observe the landmark. */
         int64_t from = with_k1 ? 0 : size, to = with_k1;
         if (with_k1) {
-            H[0] += weight * (by[0] * by[0] + by[1] * by[1]);
-            g[0] += weight * (by[0] * gone[0] + by[1] * gone[1]);
+            H[0] += weight * (by_lens[0] * by_lens[0] + by_lens[1] * by_lens[1]);
+            g[0] += weight * (by_lens[0] * anchor_residual[0] + by_lens[1] * anchor_residual[1]);
         }
         for (int i = 0; i < 2; i++) {
-            const double *column = held + i;
+            const double *column = by_point + i;
             for (int j = 0; j < 2; j++)
                 information[3 * (i + 1) + j + 1] +=
-                    weight * (column[0] * held[j] + column[2] * held[2 + j]);
-            slope[i + 1] += weight * (column[0] * gone[0] + column[2] * gone[1]);
+                    weight * (column[0] * by_point[j] + column[2] * by_point[2 + j]);
+            slope[i + 1] +=
+                weight * (column[0] * anchor_residual[0] + column[2] * anchor_residual[1]);
             if (with_k1)
-                C[(i + 1) * size] += weight * (column[0] * by[0] + column[2] * by[1]);
+                C[(i + 1) * size] += weight * (column[0] * by_lens[0] + column[2] * by_lens[1]);
         }
         for (; m < M && landmark[m] == n; m++) {
             const double root_of_weight = sqrt(weights[m]);
@@ -257,8 +264,8 @@ WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landma
             differentiate(&lens, residuals + 2 * m, R + 9 * m, t + 3 * m, ray + 3 * m, rho[m],
                           place + 3 * m, root + 4 * m, root_of_weight, &row);
             const int64_t f = with_k1 + 6 * frame[m], a = with_k1 + 6 * anchor[m];
-            from = least(from, least(f, a));
-            to = most(to, most(f, a) + 6);
+            from = smaller(from, smaller(f, a));
+            to = larger(to, larger(f, a) + 6);
             const double *by_frame = row.by_frame[0], *by_anchor = row.by_anchor[0],
                          *by_own = row.by_own[0];
             add_block(H + f * size + f, size, by_frame, 6, by_frame, 6);

@@ -7,7 +7,7 @@
    all sizes; the most sizes. */
 enum { POSE = 5, TERMS = 27, OF_SIDES = POSE + 2, MOST_SIDES = 8 };
 
-/* covariance._terms of one match. */
+/* Terms of one match: covariance._match_terms. */
 INLINE void terms_of(const double J[POSE], double weight, double r, double terms[TERMS])
 {
     double weighed[POSE];
@@ -67,10 +67,10 @@ WIDE int djet_sums_of_cells(int n, const double *J, const double *weights, const
             memset(sums[count++], 0, sizeof *sums);
         }
         const int64_t match = order[k];
-        double of_pose[POSE], terms[TERMS];
+        double J_match[POSE], terms[TERMS];
         for (int i = 0; i < POSE; i++)
-            of_pose[i] = J[i * n + match];
-        terms_of(of_pose, weights[match], r[match], terms);
+            J_match[i] = J[i * n + match];
+        terms_of(J_match, weights[match], r[match], terms);
         for (int i = 0; i < TERMS; i++)
             sums[count - 1][i] += terms[i];
         for (int i = 0; i < OF_SIDES; i++)
@@ -83,26 +83,26 @@ WIDE int djet_sums_of_cells(int n, const double *J, const double *weights, const
 INLINE void invert(double A[POSE][POSE])
 {
     for (int pivot = 0; pivot < POSE; pivot++) {
-        const double by = 1 / A[pivot][pivot];
+        const double reciprocal = 1 / A[pivot][pivot];
         A[pivot][pivot] = 1;
         for (int j = 0; j < POSE; j++)
-            A[pivot][j] *= by;
+            A[pivot][j] *= reciprocal;
         for (int i = 0; i < POSE; i++) {
-            const double share = A[i][pivot];
+            const double factor = A[i][pivot];
             if (i == pivot)
                 continue;
             A[i][pivot] = 0;
             for (int j = 0; j < POSE; j++)
-                A[i][j] -= share * A[pivot][j];
+                A[i][j] -= factor * A[pivot][j];
         }
     }
 }
 
-/* Change of a pose when each of C cells is left out in turn: covariance.leave_one_out. whole:
-   (5, 5) H of all matches; cells: (C, 27) sums. Writes changes (C, 5), and the sum (5, 5) of
-   the inverse Hessians. */
-WIDE void djet_without_each(int C, const double whole[POSE][POSE], const double (*cells)[TERMS],
-                            double (*moves)[POSE], double inverses[POSE][POSE])
+/* Shifts (C, 5) of a pose when each of C cells is left out in turn, and the sum (5, 5) of the
+   inverse Hessians without it: covariance.leave_one_out. H: (5, 5) of all matches; cells: (C,
+   27) sums. */
+WIDE void djet_leave_one_out(int C, const double H[POSE][POSE], const double (*cells)[TERMS],
+                             double (*shifts)[POSE], double inverses[POSE][POSE])
 {
     memset(inverses, 0, POSE * sizeof *inverses);
     for (int c = 0; c < C; c++) {
@@ -110,15 +110,15 @@ WIDE void djet_without_each(int C, const double whole[POSE][POSE], const double 
         double left[POSE][POSE];
         for (int i = 0, entry = 0; i < POSE; i++)
             for (int j = i; j < POSE; j++, entry++)
-                left[i][j] = left[j][i] = whole[i][j] - cells[c][entry];
+                left[i][j] = left[j][i] = H[i][j] - cells[c][entry];
         invert(left);
         for (int i = 0; i < POSE; i++) {
-            double move = 0;
+            double shift = 0;
             for (int j = 0; j < POSE; j++) {
-                move += left[i][j] * gradient[j];
+                shift += left[i][j] * gradient[j];
                 inverses[i][j] += left[i][j];
             }
-            moves[c][i] = move;
+            shifts[c][i] = shift;
         }
     }
 }

@@ -7,31 +7,35 @@
 /* Rows of blocks summed, and products of gradients along x and y: xx, xy, yy. */
 enum { NEAR = 3, PRODUCTS = 3 };
 
+/* Share of a pixel in the mean over a block of three by three pairs of rows and columns. */
+static const double PER_BLOCK = 0.25 * (1.0 / 9);
+
 /* Mirror an index at both ends: OpenCV's BORDER_REFLECT_101. */
-static int mirrored(int place, int count)
+static int mirrored(int index, int count)
 {
-    return place < 0 ? -place : place < count ? place : 2 * count - 2 - place;
+    return index < 0 ? -index : index < count ? index : 2 * count - 2 - index;
 }
 
-/* Sobel gradients of a row of pixels, along x and y. across, down: (width + 2,) scratch memory. */
-INLINE void slopes_at(const uint8_t *image, int height, int width, int row,
-                      int16_t *restrict across, int16_t *restrict down, int16_t *restrict dx,
-                      int16_t *restrict dy)
+/* Sobel gradients of a row of pixels, along x and y. smoothed, differences: (width + 2,) scratch
+   memory, for sums and differences of the rows above and below. */
+INLINE void gradients_of_row(const uint8_t *image, int height, int width, int row,
+                             int16_t *restrict smoothed, int16_t *restrict differences,
+                             int16_t *restrict dx, int16_t *restrict dy)
 {
-    const uint8_t *here = image + (int64_t)row * width,
+    const uint8_t *centre = image + (int64_t)row * width,
                   *above = image + (int64_t)mirrored(row - 1, height) * width,
                   *below = image + (int64_t)mirrored(row + 1, height) * width;
     for (int x = 0; x < width; x++) {
-        across[x + 1] = (int16_t)(above[x] + 2 * here[x] + below[x]);
-        down[x + 1] = (int16_t)(below[x] - above[x]);
+        smoothed[x + 1] = (int16_t)(above[x] + 2 * centre[x] + below[x]);
+        differences[x + 1] = (int16_t)(below[x] - above[x]);
     }
-    across[0] = across[2];
-    across[width + 1] = across[width - 1];
-    down[0] = down[2];
-    down[width + 1] = down[width - 1];
+    smoothed[0] = smoothed[2];
+    smoothed[width + 1] = smoothed[width - 1];
+    differences[0] = differences[2];
+    differences[width + 1] = differences[width - 1];
     for (int x = 0; x < width; x++) {
-        dx[x] = (int16_t)(across[x + 2] - across[x]);
-        dy[x] = (int16_t)(down[x] + 2 * down[x + 1] + down[x + 2]);
+        dx[x] = (int16_t)(smoothed[x + 2] - smoothed[x]);
+        dy[x] = (int16_t)(differences[x] + 2 * differences[x + 1] + differences[x + 2]);
     }
 }
 
@@ -59,11 +63,11 @@ INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
 {
     const int32_t *xx = sums, *xy = xx + n + 2, *yy = xy + n + 2;
     for (int j = 0; j < n; j++) {
-        const float x = (float)((xx[j] + xx[j + 1] + xx[j + 2]) * 0.25 * (1.0 / 9)),
-                    both = (float)((xy[j] + xy[j + 1] + xy[j + 2]) * 0.25 * (1.0 / 9)),
-                    y = (float)((yy[j] + yy[j + 1] + yy[j + 2]) * 0.25 * (1.0 / 9));
-        const float trace = x + y, apart = x - y;
-        const float spread = sqrtf(apart * apart + both * both * 4);
+        const float mean_xx = (float)((xx[j] + xx[j + 1] + xx[j + 2]) * PER_BLOCK),
+                    mean_xy = (float)((xy[j] + xy[j + 1] + xy[j + 2]) * PER_BLOCK),
+                    mean_yy = (float)((yy[j] + yy[j + 1] + yy[j + 2]) * PER_BLOCK);
+        const float trace = mean_xx + mean_yy, difference = mean_xx - mean_yy;
+        const float spread = sqrtf(difference * difference + mean_xy * mean_xy * 4);
         const float least = trace - spread, most = (trace + spread) * least_ratio;
         slopes[j] = (least < most ? 0 : least) * unit;
     }
@@ -76,7 +80,7 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
                              float unit, int32_t *sums, int16_t *rows, float *slopes)
 {
     const int n = width / 2, blocks = height / 2;
-    int16_t *across = rows, *down = across + width + 2, *dx = down + width + 2,
+    int16_t *smoothed = rows, *differences = smoothed + width + 2, *dx = differences + width + 2,
             *dy = dx + width + 2;
     int32_t *of_three = sums + NEAR * PRODUCTS * n;
     for (int row = 0; row <= blocks; row++) {
@@ -84,7 +88,7 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
             int32_t *latest = sums + row % NEAR * PRODUCTS * n;
             memset(latest, 0, (size_t)(PRODUCTS * n) * sizeof *latest);
             for (int i = 0; i < 2; i++) {
-                slopes_at(image, height, width, 2 * row + i, across, down, dx, dy);
+                gradients_of_row(image, height, width, 2 * row + i, smoothed, differences, dx, dy);
                 add_pairs(dx, dx, n, latest);
                 add_pairs(dx, dy, n, latest + n);
                 add_pairs(dy, dy, n, latest + 2 * n);
@@ -121,22 +125,23 @@ INLINE int is_highest(const float *value, int width)
    and whether they are maxima of the wider neighbourhood. memory: (width,). */
 WIDE int djet_peaks(const float *slopes, int width, float least, int margin, int after_column,
                     int after_row, uint8_t *restrict memory, int64_t *restrict places,
-                    uint8_t *restrict around)
+                    uint8_t *restrict strongest)
 {
     int count = 0;
     for (int row = margin; row < after_row; row++) {
-        const float *here = slopes + (int64_t)row * width, *above = here - width,
-                    *below = here + width;
+        const float *centre = slopes + (int64_t)row * width, *above = centre - width,
+                    *below = centre + width;
         for (int x = margin; x < after_column; x++)
-            memory[x] = (here[x] > least) & (here[x] >= here[x - 1]) & (here[x] >= here[x + 1])
-                        & (here[x] >= above[x - 1]) & (here[x] >= above[x])
-                        & (here[x] >= above[x + 1]) & (here[x] >= below[x - 1])
-                        & (here[x] >= below[x]) & (here[x] >= below[x + 1]);
+            memory[x] = (centre[x] > least) & (centre[x] >= centre[x - 1])
+                        & (centre[x] >= centre[x + 1]) & (centre[x] >= above[x - 1])
+                        & (centre[x] >= above[x]) & (centre[x] >= above[x + 1])
+                        & (centre[x] >= below[x - 1]) & (centre[x] >= below[x])
+                        & (centre[x] >= below[x + 1]);
         const uint8_t *end = memory + after_column, *next = memory + margin;
         while (next < end && (next = memchr(next, 1, (size_t)(end - next)))) {
             const int x = (int)(next++ - memory);
             places[count] = (int64_t)row * width + x;
-            around[count++] = (uint8_t)is_highest(here + x, width);
+            strongest[count++] = (uint8_t)is_highest(centre + x, width);
         }
     }
     return count;
@@ -148,15 +153,15 @@ WIDE void djet_exact_peaks(const float *slopes, int width, int n, const int64_t 
                            double (*points)[2])
 {
     for (int k = 0; k < n; k++) {
-        const int64_t whole[2] = {places[k] % width, places[k] / width}, steps[2] = {1, width};
+        const int64_t pixel[2] = {places[k] % width, places[k] / width}, steps[2] = {1, width};
         for (int axis = 0; axis < 2; axis++) {
             const float *at = slopes + places[k];
-            const float here = at[0], before = at[-steps[axis]], after = at[steps[axis]];
-            const float curved = 2 * here - before - after;
-            const float off = (after - before) / (2 * (curved > 1e-9f ? curved : 1e-9f));
+            const float value = at[0], before = at[-steps[axis]], after = at[steps[axis]];
+            const float curvature = 2 * value - before - after;
+            const float offset = (after - before) / (2 * (curvature > 1e-9f ? curvature : 1e-9f));
             /* The centre of two pixels is half a pixel beyond the first. */
-            points[k][axis] = 2 * ((double)whole[axis]
-                                   + (off < -0.5f ? -0.5f : off > 0.5f ? 0.5f : off)) + 0.5;
+            const float limited = offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
+            points[k][axis] = 2 * ((double)pixel[axis] + limited) + 0.5;
         }
     }
 }
@@ -196,29 +201,29 @@ int djet_spread_out(int n, const int64_t (*points)[2], const int64_t *by_strengt
 }
 
 /* Sums of absolute curvatures in blocks: core.corners._curved_blocks. Blocks are `side` wide
-   and high, in `across` columns; rows of them begin every `apart` rows of the image (height,
+   and high, in `columns` columns; rows of them begin every `spacing` rows of the image (height,
    width), one pixel below. memory: (2, width + 2). */
-WIDE void djet_curved_blocks(const uint8_t *image, int width, int rows, int apart, int side,
-                             int across, int32_t *restrict memory, int32_t *restrict sums)
+WIDE void djet_block_curvatures(const uint8_t *image, int width, int rows, int spacing, int side,
+                                int columns, int32_t *restrict memory, int32_t *restrict sums)
 {
-    int32_t *restrict down = memory + 1, *restrict sizes = memory + width + 2;
+    int32_t *restrict differences = memory + 1, *restrict sizes = memory + width + 2;
     for (int row = 0; row < rows; row++) {
         memset(sizes, 0, (size_t)width * sizeof *sizes);
         for (int j = 0; j < side; j++) {
-            const uint8_t *above = image + (int64_t)(row * apart + j) * width,
-                          *here = above + width, *below = here + width;
+            const uint8_t *above = image + (int64_t)(row * spacing + j) * width,
+                          *centre = above + width, *below = centre + width;
             for (int x = 0; x < width; x++)
-                down[x] = above[x] - 2 * here[x] + below[x];
-            down[-1] = down[1];
-            down[width] = down[width - 2];
+                differences[x] = above[x] - 2 * centre[x] + below[x];
+            differences[-1] = differences[1];
+            differences[width] = differences[width - 2];
             for (int x = 0; x < width; x++)
-                sizes[x] += abs(down[x - 1] - 2 * down[x] + down[x + 1]);
+                sizes[x] += abs(differences[x - 1] - 2 * differences[x] + differences[x + 1]);
         }
-        for (int block = 0; block < across; block++) {
+        for (int block = 0; block < columns; block++) {
             int32_t sum = 0;
             for (int i = 0; i < side; i++)
                 sum += sizes[block * side + i];
-            sums[row * across + block] = sum;
+            sums[row * columns + block] = sum;
         }
     }
 }

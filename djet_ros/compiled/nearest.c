@@ -9,6 +9,7 @@ typedef struct {
     int columns, rows;
 } Cells;
 
+/* Cells that cover points (n, 2). */
 static Cells cells_around(int n, const double (*points)[2])
 {
     double least[2] = {INFINITY, INFINITY}, most[2] = {-INFINITY, -INFINITY};
@@ -26,19 +27,20 @@ static Cells cells_around(int n, const double (*points)[2])
     return cells;
 }
 
-static int place_in(double way, int count)
+/* The cell of a position in units of cells, the nearest one outside of all `count`. */
+static int cell_index(double position, int count)
 {
-    return way > 0 ? way < count ? (int)way : count - 1 : 0;
+    return position > 0 ? position < count ? (int)position : count - 1 : 0;
 }
 
 static int column_of(const Cells *cells, double x)
 {
-    return place_in((x - cells->left) / cells->side, cells->columns);
+    return cell_index((x - cells->left) / cells->side, cells->columns);
 }
 
 static int row_of(const Cells *cells, double y)
 {
-    return place_in((y - cells->top) / cells->side, cells->rows);
+    return cell_index((y - cells->top) / cells->side, cells->rows);
 }
 
 /* Sort points (n, 2) by cells: `order` (n,), in which those of cell c are at [first[c], first[c
@@ -58,16 +60,16 @@ static void sort_into(const Cells *cells, int n, const double (*points)[2], int3
     }
 }
 
-/* Indices (m,) of the nearest of n points to each of m others, all (n, 2), n > 0, and finite.
-   memory: 4 n + 2. */
-WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*others)[2],
+/* Indices (m,) of the nearest of points (n, 2), n > 0, to each of queries (m, 2), all finite.
+   memory: (4 n + 2,). */
+WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*queries)[2],
                        int32_t *memory, int64_t *nearest)
 {
     const Cells cells = cells_around(n, points);
     int32_t *order = memory, *first = memory + n;
     sort_into(&cells, n, points, first, order);
     for (int k = 0; k < m; k++) {
-        const double x = others[k][0], y = others[k][1];
+        const double x = queries[k][0], y = queries[k][1];
         const int column = column_of(&cells, x), row = row_of(&cells, y);
         double least = INFINITY;
         nearest[k] = 0;
@@ -76,8 +78,8 @@ WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*o
             const int left = column - ring, right = column + ring, top = row - ring,
                       bottom = row + ring;
             for (int j = top > 0 ? top : 0; j <= bottom && j < cells.rows; j++) {
-                const int whole = j == top || j == bottom;
-                for (int i = left; i <= right; i += whole || !ring ? 1 : 2 * ring) {
+                const int is_edge = j == top || j == bottom;
+                for (int i = left; i <= right; i += is_edge || !ring ? 1 : 2 * ring) {
                     if (i < 0 || i >= cells.columns)
                         continue;
                     const int cell = j * cells.columns + i;
@@ -90,16 +92,16 @@ WIDE void djet_nearest(int n, const double (*points)[2], int m, const double (*o
                     }
                 }
             }
-            double room = INFINITY;
+            double margin = INFINITY;
             if (left > 0)
-                room = fmin(room, x - (cells.left + left * cells.side));
+                margin = fmin(margin, x - (cells.left + left * cells.side));
             if (right < cells.columns - 1)
-                room = fmin(room, cells.left + (right + 1) * cells.side - x);
+                margin = fmin(margin, cells.left + (right + 1) * cells.side - x);
             if (top > 0)
-                room = fmin(room, y - (cells.top + top * cells.side));
+                margin = fmin(margin, y - (cells.top + top * cells.side));
             if (bottom < cells.rows - 1)
-                room = fmin(room, cells.top + (bottom + 1) * cells.side - y);
-            if (room == INFINITY || (room > 0 && least < room * room))
+                margin = fmin(margin, cells.top + (bottom + 1) * cells.side - y);
+            if (margin == INFINITY || (margin > 0 && least < margin * margin))
                 break;
         }
     }

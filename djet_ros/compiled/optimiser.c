@@ -21,11 +21,11 @@ typedef struct {
     double scale;
 } Loss;
 
-/* Residuals of matches at a pose, rows of m. J: (5, m). */
-enum { ROWS_LEFT = 9, ROWS_GIVEN = 10 };
+/* Rows of m numbers: of the residuals of matches at a pose (J: (5, m)), and of a problem. */
+enum { RESIDUAL_ROWS = 9, MATCH_ROWS = 10 };
 typedef struct {
     double *r, *sign, *weight, *curvature, *J;
-} Left;
+} Residuals;
 
 typedef struct {
     double R[3][3], t[3];
@@ -88,14 +88,14 @@ static void sphere_tangents(const double t[3], double tangents[2][3])
 /* Derivatives of E = [t]_x R by a pose's five parameters. */
 static void derivatives_of(const Pose *pose, const double tangents[2][3], double slopes[5][9])
 {
-    double T[3][3], S[3][3], turned[3][3];
+    double T[3][3], S[3][3], rotated[3][3];
     cross_matrix(pose->t, T);
     for (int k = 0; k < 5; k++) {
         if (k < 3) {
             const double axis[3] = {k == 0, k == 1, k == 2};
             cross_matrix(axis, S);
-            multiply((const double (*)[3])S, pose->R, turned);
-            multiply((const double (*)[3])T, (const double (*)[3])turned,
+            multiply((const double (*)[3])S, pose->R, rotated);
+            multiply((const double (*)[3])T, (const double (*)[3])rotated,
                      (double (*)[3])slopes[k]);
         } else {
             cross_matrix(tangents[k - 3], S);
@@ -107,7 +107,7 @@ static void derivatives_of(const Pose *pose, const double tangents[2][3], double
 /* Compute the residuals at a pose, and J on demand, which includes the derivative of the
    variances if `exact`. */
 INLINE void residuals_at(const Problem *problem, const Pose *pose, const double tangents[2][3],
-                         int exact, int with_J, Left *left)
+                         int exact, int with_J, Residuals *residuals)
 {
     double T[3][3], E[3][3], slopes[5][9];
     cross_matrix(pose->t, T);
@@ -138,8 +138,8 @@ INLINE void residuals_at(const Problem *problem, const Pose *pose, const double 
             w[0] -= by_variance * M[0];
             w[1] -= by_variance * M[1];
         }
-        store(left->r + k, r);
-        store(left->sign + k, sign);
+        store(residuals->r + k, r);
+        store(residuals->sign + k, sign);
         if (!with_J)
             continue;
         Lanes products[9];
@@ -149,19 +149,19 @@ INLINE void residuals_at(const Problem *problem, const Pose *pose, const double 
             Lanes sum = slopes[j][0] * products[0];
             for (int i = 1; i < 9; i++)
                 sum += slopes[j][i] * products[i];
-            store(left->J + j * m + k, sum);
+            store(residuals->J + j * m + k, sum);
         }
     }
 }
 
 /* Sum the loss, and compute each match's weight and curvature: jet.Loss. */
-INLINE double cost_of(Loss loss, int m, Left *left)
+INLINE double cost_of(Loss loss, int m, Residuals *residuals)
 {
     const double square = loss.scale * loss.scale;
     const Lanes zero = {0}, one = zero + 1.0;
     Lanes sum = {0};
     for (int k = 0; k < m; k += LANES) {
-        const Lanes r = load(left->r + k), u = r * r / square;
+        const Lanes r = load(residuals->r + k), u = r * r / square;
         Lanes value = r * r, weight = one, curvature = one;
         if (loss.kind == GEMAN_MCCLURE) {
             const Lanes flat = 1 / (1 + u);
@@ -181,27 +181,27 @@ INLINE double cost_of(Loss loss, int m, Left *left)
                 curvature[l] = u[l] <= 1;
             }
         }
-        sum += load(left->sign + k) * value;
-        store(left->weight + k, weight);
-        store(left->curvature + k, curvature);
+        sum += load(residuals->sign + k) * value;
+        store(residuals->weight + k, weight);
+        store(residuals->curvature + k, curvature);
     }
     return sum_of(sum);
 }
 
 /* Hessian and gradient. The curvature of a match is its weight, or with `by_loss` that of its
    loss, but at least a share of its weight. */
-INLINE void sum_up(int m, const Left *left, int by_loss, double least_curved, double H[5][5],
-                   double gradient[5])
+INLINE void sum_up(int m, const Residuals *residuals, int by_loss, double least_curved,
+                   double H[5][5], double gradient[5])
 {
     Lanes a[15] = {{0}}, b[5] = {{0}};
     for (int k = 0; k < m; k += LANES) {
-        const Lanes weight = load(left->weight + k);
-        const Lanes curved = by_loss ? larger(load(left->curvature + k), least_curved * weight)
-                                     : weight;
-        const Lanes pull = weight * load(left->sign + k) * load(left->r + k);
+        const Lanes weight = load(residuals->weight + k);
+        const Lanes curved =
+            by_loss ? larger(load(residuals->curvature + k), least_curved * weight) : weight;
+        const Lanes pull = weight * load(residuals->sign + k) * load(residuals->r + k);
         Lanes J[5];
         for (int i = 0; i < 5; i++)
-            J[i] = load(left->J + i * m + k);
+            J[i] = load(residuals->J + i * m + k);
         for (int i = 0, entry = 0; i < 5; i++) {
             const Lanes weighed = J[i] * curved;
             b[i] += J[i] * pull;
@@ -240,13 +240,13 @@ static int damped_step(const double given[5][5], const double gradient[5], doubl
         for (int j = i + 1; j < 5; j++)
             pivot = fabs(H[j][i]) > fabs(H[pivot][i]) ? j : pivot;
         for (int k = 0; k < 5; k++) {
-            const double one = H[i][k];
+            const double swapped = H[i][k];
             H[i][k] = H[pivot][k];
-            H[pivot][k] = one;
+            H[pivot][k] = swapped;
         }
-        const double one = step[i];
+        const double swapped = step[i];
         step[i] = step[pivot];
-        step[pivot] = one;
+        step[pivot] = swapped;
         for (int j = i + 1; j < 5; j++) {
             const double share = H[j][i] / H[i][i];
             for (int k = i; k < 5; k++)
@@ -263,18 +263,19 @@ static int damped_step(const double given[5][5], const double gradient[5], doubl
 }
 
 /* jet.retract: rotation from the left, then t along the sphere. */
-static void move(const Pose *pose, const double tangents[2][3], const double step[5], Pose *moved)
+static void retract(const Pose *pose, const double tangents[2][3], const double step[5],
+                    Pose *moved)
 {
-    double S[3][3], square[3][3], turn[3][3];
+    double S[3][3], square[3][3], rotation[3][3];
     const double angle = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]);
     const double half = angle / 2 > 1e-9 ? angle / 2 : 1e-9, quotient = sin(half) / half;
     cross_matrix(step, S);
     multiply((const double (*)[3])S, (const double (*)[3])S, square);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
-            turn[i][j] = (i == j) + quotient * cos(half) * S[i][j]
-                         + quotient * quotient / 2 * square[i][j];
-    multiply((const double (*)[3])turn, pose->R, moved->R);
+            rotation[i][j] =
+                (i == j) + quotient * cos(half) * S[i][j] + quotient * quotient / 2 * square[i][j];
+    multiply((const double (*)[3])rotation, pose->R, moved->R);
     double t[3], length = 0;
     for (int i = 0; i < 3; i++) {
         t[i] = pose->t[i] + tangents[0][i] * step[3] + tangents[1][i] * step[4];
@@ -289,40 +290,43 @@ static void move(const Pose *pose, const double tangents[2][3], const double ste
 static Problem padded(int n, int m, const double *x, const double *y, const double *spread,
                          const double *blur, double *memory)
 {
-    for (int row = 0; row < ROWS_GIVEN; row++) {
+    for (int row = 0; row < MATCH_ROWS; row++) {
         const double *from = row < 3 ? x + row * n : row < 6 ? y + (row - 3) * n
                            : row < 9 ? spread + (row - 6) * n : blur;
         memcpy(memory + row * m, from, (size_t)n * sizeof(double));
         for (int k = n; k < m; k++)
-            memory[row * m + k] = row == ROWS_GIVEN - 1;
+            memory[row * m + k] = row == MATCH_ROWS - 1;
     }
     const Problem problem = {m, memory, memory + 3 * m, memory + 6 * m, memory + 9 * m};
     return problem;
 }
 
-static Left left_in(double *memory, int m)
+static Residuals residuals_in(double *memory, int m)
 {
-    const Left left = {memory, memory + m, memory + 2 * m, memory + 3 * m, memory + 4 * m};
-    return left;
+    const Residuals residuals = {memory, memory + m, memory + 2 * m, memory + 3 * m,
+                                 memory + 4 * m};
+    return residuals;
 }
 
+/* A pose with the tangents of its t, its cost, and its residuals. */
 typedef struct {
     Pose pose;
     double tangents[2][3], cost;
-    Left left;
-} Place;
+    Residuals residuals;
+} State;
 
-INLINE void arrive(const Problem *problem, Loss loss, int exact, int with_J, Place *place)
+/* Evaluate residuals and cost at the pose of a state. exact, with_J: as in residuals_at. */
+INLINE void evaluate(const Problem *problem, Loss loss, int exact, int with_J, State *state)
 {
-    sphere_tangents(place->pose.t, place->tangents);
-    residuals_at(problem, &place->pose, (const double (*)[3])place->tangents, exact, with_J,
-                 &place->left);
-    place->cost = cost_of(loss, problem->m, &place->left);
+    sphere_tangents(state->pose.t, state->tangents);
+    residuals_at(problem, &state->pose, (const double (*)[3])state->tangents, exact, with_J,
+                 &state->residuals);
+    state->cost = cost_of(loss, problem->m, &state->residuals);
 }
 
-static void swap(Place *one, Place *other)
+static void swap(State *one, State *other)
 {
-    const Place kept = *one;
+    const State kept = *one;
     *one = *other;
     *other = kept;
 }
@@ -333,30 +337,30 @@ typedef struct {
     double step, gain, damping, curved;
 } Limits;
 
-/* Levenberg-Marquardt from `here`, which is updated; `there` is for trials. `exact` as in
+/* Levenberg-Marquardt from `current`, which is updated; `trial` is for trials. `exact` as in
    residuals_at, also for curvatures by the loss; without it J is not computed at the end. */
 INLINE void descend(const Problem *problem, Loss loss, int exact, int most_steps, Limits limits,
-                    double damping, Place *here, Place *there)
+                    double damping, State *current, State *trial)
 {
     double H[5][5], gradient[5];
     int has_moved = 1;
-    arrive(problem, loss, exact, exact || most_steps > 0, here);
+    evaluate(problem, loss, exact, exact || most_steps > 0, current);
     for (int number = 0; number < most_steps; number++) {
         double step[5], length = 0;
         if (has_moved)
-            sum_up(problem->m, &here->left, exact, limits.curved, H, gradient);
+            sum_up(problem->m, &current->residuals, exact, limits.curved, H, gradient);
         if (!damped_step((const double (*)[5])H, gradient, damping, step))
             break;
         for (int i = 0; i < 5; i++)
             length += step[i] * step[i];
         const int is_small = sqrt(length) < limits.step;
-        move(&here->pose, (const double (*)[3])here->tangents, step, &there->pose);
-        arrive(problem, loss, exact, exact || number + 1 < most_steps, there);
-        has_moved = there->cost < here->cost;
+        retract(&current->pose, (const double (*)[3])current->tangents, step, &trial->pose);
+        evaluate(problem, loss, exact, exact || number + 1 < most_steps, trial);
+        has_moved = trial->cost < current->cost;
         if (has_moved) {
-            swap(here, there);
+            swap(current, trial);
             damping = fmax(damping / 10, 1e-9);
-            if (is_small || there->cost - here->cost < limits.gain * fabs(here->cost))
+            if (is_small || trial->cost - current->cost < limits.gain * fabs(current->cost))
                 break;
         } else {
             damping *= 10;
@@ -383,18 +387,18 @@ WIDE void djet_minimise(int n, const double *x, const double *y, const double *s
     const Problem problem = padded(n, m, x, y, spread, blur, memory);
     const Loss loss = {kind, scale};
     const Limits of = {limits[0], limits[1], limits[2], limits[3]};
-    Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
-    Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
-    memcpy(here.pose.R, R, sizeof here.pose.R);
-    memcpy(here.pose.t, t, sizeof here.pose.t);
-    descend(&problem, loss, 1, most_steps, of, damping, &here, &there);
-    memcpy(R, here.pose.R, sizeof here.pose.R);
-    memcpy(t, here.pose.t, sizeof here.pose.t);
-    memcpy(tangents, here.tangents, sizeof here.tangents);
-    memcpy(r, here.left.r, (size_t)n * sizeof(double));
-    memcpy(sign, here.left.sign, (size_t)n * sizeof(double));
+    State current = {.residuals = residuals_in(memory + MATCH_ROWS * m, m)};
+    State trial = {.residuals = residuals_in(memory + (MATCH_ROWS + RESIDUAL_ROWS) * m, m)};
+    memcpy(current.pose.R, R, sizeof current.pose.R);
+    memcpy(current.pose.t, t, sizeof current.pose.t);
+    descend(&problem, loss, 1, most_steps, of, damping, &current, &trial);
+    memcpy(R, current.pose.R, sizeof current.pose.R);
+    memcpy(t, current.pose.t, sizeof current.pose.t);
+    memcpy(tangents, current.tangents, sizeof current.tangents);
+    memcpy(r, current.residuals.r, (size_t)n * sizeof(double));
+    memcpy(sign, current.residuals.sign, (size_t)n * sizeof(double));
     for (int j = 0; j < 5; j++)
-        memcpy(J + j * n, here.left.J + j * m, (size_t)n * sizeof(double));
+        memcpy(J + j * n, current.residuals.J + j * m, (size_t)n * sizeof(double));
 }
 
 /* Refine each of S poses by some steps, with the variances of residuals held fixed in each
@@ -410,16 +414,16 @@ WIDE void djet_refine_all(int n, const double *x, const double *y, const double 
     const Loss loss = {kind, scale};
     const Limits none = {0, 0, INFINITY, 0};
     for (int start = 0; start < S; start++) {
-        Place here = {.left = left_in(memory + ROWS_GIVEN * m, m)};
-        Place there = {.left = left_in(memory + (ROWS_GIVEN + ROWS_LEFT) * m, m)};
-        memcpy(here.pose.R, R + 9 * start, sizeof here.pose.R);
-        memcpy(here.pose.t, t + 3 * start, sizeof here.pose.t);
-        descend(&problem, loss, 0, most_steps, none, damping, &here, &there);
-        memcpy(R + 9 * start, here.pose.R, sizeof here.pose.R);
-        memcpy(t + 3 * start, here.pose.t, sizeof here.pose.t);
-        costs[start] = here.cost;
-        memcpy(r + start * n, here.left.r, (size_t)n * sizeof(double));
-        memcpy(sign + start * n, here.left.sign, (size_t)n * sizeof(double));
+        State current = {.residuals = residuals_in(memory + MATCH_ROWS * m, m)};
+        State trial = {.residuals = residuals_in(memory + (MATCH_ROWS + RESIDUAL_ROWS) * m, m)};
+        memcpy(current.pose.R, R + 9 * start, sizeof current.pose.R);
+        memcpy(current.pose.t, t + 3 * start, sizeof current.pose.t);
+        descend(&problem, loss, 0, most_steps, none, damping, &current, &trial);
+        memcpy(R + 9 * start, current.pose.R, sizeof current.pose.R);
+        memcpy(t + 3 * start, current.pose.t, sizeof current.pose.t);
+        costs[start] = current.cost;
+        memcpy(r + start * n, current.residuals.r, (size_t)n * sizeof(double));
+        memcpy(sign + start * n, current.residuals.sign, (size_t)n * sizeof(double));
     }
 }
 
@@ -431,15 +435,15 @@ INLINE double value_of(int kind, double square, double squared)
            : kind == HUBER && u > 1 ? square * (2 * sqrt(u) - 1) : squared;
 }
 
-/* Add the cost of distances behind a camera to losses, of one pose and sign of t, as below;
-   returns the sum. */
-INLINE double add_losses(int n, int kind, double square, const double *restrict squared,
-                         const double *restrict way, const double *restrict curves,
-                         double towards, double *restrict losses)
+/* Losses (n,) with the cost of distances behind a camera, for one sign of t, see below; returns
+   their sum. */
+INLINE double losses_of_sign(int n, int kind, double square, const double *restrict squared,
+                             const double *restrict offset, const double *restrict curvature_signs,
+                             double t_sign, double *restrict losses)
 {
     for (int k = 0; k < n; k++) {
-        const double back = towards * way[k] < 0 ? way[k] : 0;
-        losses[k] = curves[k] * value_of(kind, square, squared[k] + back * back);
+        const double back = t_sign * offset[k] < 0 ? offset[k] : 0;
+        losses[k] = curvature_signs[k] * value_of(kind, square, squared[k] + back * back);
     }
     double sum = 0;
     for (int k = 0; k < n; k++)
@@ -449,10 +453,11 @@ INLINE double add_losses(int n, int kind, double square, const double *restrict 
 
 /* Signed distance of each match along its epipolar line from the point at infinity, and its
    squared residual. */
-INLINE void look_along(int n, const double *restrict x, const double *restrict y,
-                       const double *restrict spread, const double *restrict blur,
-                       const double *restrict R, const double *restrict t,
-                       const double *restrict r, double *restrict way, double *restrict squared)
+INLINE void along_lines(int n, const double *restrict x, const double *restrict y,
+                        const double *restrict spread, const double *restrict blur,
+                        const double *restrict R, const double *restrict t,
+                        const double *restrict r, double *restrict offset,
+                        double *restrict squared)
 {
     for (int k = 0; k < n; k++) {
         const double x1 = x[k], x2 = x[n + k], x3 = x[2 * n + k];
@@ -465,31 +470,33 @@ INLINE void look_along(int n, const double *restrict x, const double *restrict y
                                      + spread[2 * n + k] * a2 * a2) + blur[k];
         const double along = (y[k] - i1) * a1 + (y[n + k] - i2) * a2;
         const double units = along / sqrt(variance > 1e-24 ? variance : 1e-24);
-        way[k] = depth > 0 ? units : 0;
+        offset[k] = depth > 0 ? units : 0;
         squared[k] = r[k] * r[k];
     }
 }
 
 /* Losses (S, n) at S poses with chirality: points also have to lie in front of both cameras,
-   for the sign of t, among some, of least cost: sketch.losses_in_front. r, curves: (S, n)
+   for the sign of t, among some, of least cost: sketch.losses_in_front. r, curvature_signs: (S, n)
    residuals, and their signs of curvature; memory: (3, n). */
 WIDE void djet_losses_in_front(int n, const double *x, const double *y, const double *spread,
                                const double *blur, int kind, double scale, int S, const double *R,
-                               const double *t, const double *r, const double *curves, int signs,
-                               const double *towards, double *losses, double *memory)
+                               const double *t, const double *r, const double *curvature_signs,
+                               int signs, const double *t_signs, double *losses, double *memory)
 {
     const double square = scale * scale;
-    double *way = memory, *squared = memory + n, *other = memory + 2 * n;
-    for (int s = 0; s < S; s++, R += 9, t += 3, r += n, curves += n, losses += n) {
-        look_along(n, x, y, spread, blur, R, t, r, way, squared);
+    double *offset = memory, *squared = memory + n, *other = memory + 2 * n;
+    for (int s = 0; s < S; s++, R += 9, t += 3, r += n, curvature_signs += n, losses += n) {
+        along_lines(n, x, y, spread, blur, R, t, r, offset, squared);
         double least = INFINITY;
         for (int i = 0; i < signs; i++) {
             double *to = i == 0 ? losses : other;
             double cost = 0;
             if (kind == GEMAN_MCCLURE)
-                cost = add_losses(n, GEMAN_MCCLURE, square, squared, way, curves, towards[i], to);
+                cost = losses_of_sign(n, GEMAN_MCCLURE, square, squared, offset, curvature_signs,
+                                      t_signs[i], to);
             else
-                cost = add_losses(n, kind, square, squared, way, curves, towards[i], to);
+                cost = losses_of_sign(n, kind, square, squared, offset, curvature_signs,
+                                      t_signs[i], to);
             if (i > 0 && cost < least)
                 memcpy(losses, other, (size_t)n * sizeof *losses);
             least = cost < least ? cost : least;

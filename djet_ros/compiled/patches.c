@@ -1,19 +1,28 @@
 /* Patch alignment through known warps: see core/patches.py. */
 #include "between.h"
 
-/* RADIUS is that of core/patches.py; LANES patches are aligned in parallel. */
-enum { RADIUS = 5, SIDE = 2 * RADIUS + 1, PIXELS = SIDE * SIDE, ROOM = SIDE + 2, NEXT = SIDE + 1 };
+/* RADIUS and PARAMETERS (position, brightness and contrast) are those of core/patches.py. A
+   template is sampled with a pixel more on each side, for its gradients, and a patch of the
+   current image with one more row and column, for interpolation. LANES patches are aligned in
+   parallel. */
+enum { RADIUS = 5, SIDE = 2 * RADIUS + 1, PIXELS = SIDE * SIDE, PARAMETERS = 4 };
+enum { PADDED = SIDE + 2, EXTENDED = SIDE + 1 };
+
+/* core.patches.Templates. */
 
 typedef struct {
     Lanes slopes[2][PIXELS], gray[PIXELS], contrast;
     double inverse[LANES][2][2];
 } Templates;
 
+/* Patches of the current image around whole pixels, and products of them, at each of four
+   neighbouring pixels, with the gradients of the templates. */
 typedef struct {
-    Lanes around[NEXT * NEXT], products[2][2][2];
-    double whole[LANES][2];
-} Seen;
+    Lanes levels[EXTENDED * EXTENDED], products[2][2][2];
+    double pixel[LANES][2];
+} CurrentPatches;
 
+/* Sums of products over the pixels of patches. */
 INLINE Lanes products(const Lanes *a, const Lanes *b)
 {
     Lanes sum = {0};
@@ -22,7 +31,7 @@ INLINE Lanes products(const Lanes *a, const Lanes *b)
     return sum;
 }
 
-INLINE void take_mean_off(Lanes *values)
+INLINE void subtract_mean(Lanes *values)
 {
     Lanes sum = {0};
     for (int p = 0; p < PIXELS; p++)
@@ -31,35 +40,36 @@ INLINE void take_mean_off(Lanes *values)
         values[p] -= sum / PIXELS;
 }
 
-/* Sample patches (ROOM x ROOM) around points: dy of the other image at x + inverse dy. */
+/* Sample patches (PADDED x PADDED) around points: dy of the other image at x + inverse dy. */
 INLINE void sample(Image image, const Lanes points[2], const Lanes inverse[2][2], Lanes *wide)
 {
-    for (int j = 0; j < ROOM; j++)
-        for (int i = 0; i < ROOM; i++) {
+    for (int j = 0; j < PADDED; j++)
+        for (int i = 0; i < PADDED; i++) {
             const float x = i - (RADIUS + 1), y = j - (RADIUS + 1);
-            wide[j * ROOM + i] = between(image,
-                                         inverse[0][0] * x + inverse[0][1] * y + points[0],
-                                         inverse[1][0] * x + inverse[1][1] * y + points[1]);
+            wide[j * PADDED + i] =
+                between(image, inverse[0][0] * x + inverse[0][1] * y + points[0],
+                        inverse[1][0] * x + inverse[1][1] * y + points[1]);
         }
 }
 
+/* Make templates of sampled patches (PADDED x PADDED). */
 INLINE void make_templates(const Lanes *wide, float least_slope, Templates *to)
 {
     for (int j = 0; j < SIDE; j++)
         for (int i = 0; i < SIDE; i++) {
-            const Lanes *here = wide + (j + 1) * ROOM + i + 1;
+            const Lanes *at = wide + (j + 1) * PADDED + i + 1;
             const int p = j * SIDE + i;
-            to->gray[p] = here[0];
-            to->slopes[0][p] = (here[1] - here[-1]) * 0.5f;
-            to->slopes[1][p] = (here[ROOM] - here[-ROOM]) * 0.5f;
+            to->gray[p] = at[0];
+            to->slopes[0][p] = (at[1] - at[-1]) * 0.5f;
+            to->slopes[1][p] = (at[PADDED] - at[-PADDED]) * 0.5f;
         }
-    take_mean_off(to->gray);
+    subtract_mean(to->gray);
     to->contrast = products(to->gray, to->gray) + least_slope;
     for (int k = 0; k < 2; k++) {
         const Lanes share = products(to->slopes[k], to->gray) / to->contrast;
         for (int p = 0; p < PIXELS; p++)
             to->slopes[k][p] -= share * to->gray[p];
-        take_mean_off(to->slopes[k]);
+        subtract_mean(to->slopes[k]);
     }
     const Lanes xx = products(to->slopes[0], to->slopes[0]),
                 xy = products(to->slopes[0], to->slopes[1]),
@@ -73,19 +83,21 @@ INLINE void make_templates(const Lanes *wide, float least_slope, Templates *to)
     }
 }
 
-INLINE void gather(const uint8_t *image, int width, const double *place, int l, Seen *seen)
+/* Copy the patch around the pixel of a position (2,) into lane l. */
+INLINE void gather(const uint8_t *image, int width, const double *place, int l,
+                   CurrentPatches *current)
 {
     for (int axis = 0; axis < 2; axis++)
-        seen->whole[l][axis] = floor(place[axis]);
-    const uint8_t *first = image + ((int64_t)seen->whole[l][1] - RADIUS) * width
-                           + (int64_t)seen->whole[l][0] - RADIUS;
-    for (int j = 0; j < NEXT; j++)
-        for (int i = 0; i < NEXT; i++)
-            seen->around[j * NEXT + i][l] = first[(int64_t)j * width + i];
+        current->pixel[l][axis] = floor(place[axis]);
+    const uint8_t *first = image + ((int64_t)current->pixel[l][1] - RADIUS) * width
+                           + (int64_t)current->pixel[l][0] - RADIUS;
+    for (int j = 0; j < EXTENDED; j++)
+        for (int i = 0; i < EXTENDED; i++)
+            current->levels[j * EXTENDED + i][l] = first[(int64_t)j * width + i];
 }
 
 /* Sum products of gradients and of patches at four pixels. */
-INLINE void multiply(const Templates *expected, Seen *seen)
+INLINE void multiply(const Templates *expected, CurrentPatches *current)
 {
     for (int y = 0; y < 2; y++)
         for (int x = 0; x < 2; x++) {
@@ -94,75 +106,80 @@ INLINE void multiply(const Templates *expected, Seen *seen)
                 for (int i = 0; i < SIDE; i++)
                     for (int k = 0; k < 2; k++)
                         sums[k] += expected->slopes[k][j * SIDE + i]
-                                   * seen->around[(j + y) * NEXT + i + x];
-            seen->products[y][x][0] = sums[0];
-            seen->products[y][x][1] = sums[1];
+                                   * current->levels[(j + y) * EXTENDED + i + x];
+            current->products[y][x][0] = sums[0];
+            current->products[y][x][1] = sums[1];
         }
 }
 
 /* Move patches to new positions; few of them move to other pixels. */
-INLINE void follow(const uint8_t *image, int width, const double (*places)[2],
-                   const Templates *expected, Seen *seen)
+INLINE void move_patches(const uint8_t *image, int width, const double (*places)[2],
+                         const Templates *expected, CurrentPatches *current)
 {
-    int crossed = 0;
+    int changed = 0;
     for (int l = 0; l < LANES; l++)
-        if (floor(places[l][0]) != seen->whole[l][0] || floor(places[l][1]) != seen->whole[l][1]) {
-            gather(image, width, places[l], l, seen);
-            crossed = 1;
+        if (floor(places[l][0]) != current->pixel[l][0]
+            || floor(places[l][1]) != current->pixel[l][1]) {
+            gather(image, width, places[l], l, current);
+            changed = 1;
         }
-    if (crossed)
-        multiply(expected, seen);
+    if (changed)
+        multiply(expected, current);
 }
 
-INLINE double interpolated(const Seen *seen, int k, int l, double x, double y)
+/* Product with gradient k in lane l, at the fraction (x, y) of a pixel. */
+INLINE double interpolated(const CurrentPatches *current, int k, int l, double x, double y)
 {
     double rows[2];
     for (int i = 0; i < 2; i++) {
-        const double top = seen->products[0][i][k][l];
-        rows[i] = top + y * (seen->products[1][i][k][l] - top);
+        const double top = current->products[0][i][k][l];
+        rows[i] = top + y * (current->products[1][i][k][l] - top);
     }
     return rows[0] + x * (rows[1] - rows[0]);
 }
 
-/* Residuals of patches after fitting their brightness and contrast: sums of squares. */
-INLINE Lanes left_over(const Templates *expected, const Seen *seen, const double (*places)[2])
+/* Sums of squared residuals of patches at positions (LANES, 2), after fitting their brightness
+   and contrast. */
+INLINE Lanes residual_sums(const Templates *expected, const CurrentPatches *current,
+                           const double (*places)[2])
 {
-    Lanes patches[PIXELS];
+    Lanes gray[PIXELS];
     float parts[2][LANES];
     for (int l = 0; l < LANES; l++)
         for (int axis = 0; axis < 2; axis++)
-            parts[axis][l] = (float)(places[l][axis] - seen->whole[l][axis]);
+            parts[axis][l] = (float)(places[l][axis] - current->pixel[l][axis]);
     const Lanes x = load(parts[0]), y = load(parts[1]);
     for (int j = 0; j < SIDE; j++)
         for (int i = 0; i < SIDE; i++) {
-            const Lanes *here = seen->around + j * NEXT + i;
-            const Lanes first = here[0] + y * (here[NEXT] - here[0]);
-            const Lanes second = here[1] + y * (here[NEXT + 1] - here[1]);
-            patches[j * SIDE + i] = first + x * (second - first);
+            const Lanes *level = current->levels + j * EXTENDED + i;
+            const Lanes first = level[0] + y * (level[EXTENDED] - level[0]);
+            const Lanes second = level[1] + y * (level[EXTENDED + 1] - level[1]);
+            gray[j * SIDE + i] = first + x * (second - first);
         }
-    take_mean_off(patches);
-    const Lanes alike = products(patches, expected->gray);
-    return products(patches, patches) - alike * alike / expected->contrast;
+    subtract_mean(gray);
+    const Lanes product = products(gray, expected->gray);
+    return products(gray, gray) - product * product / expected->contrast;
 }
 
-/* djet_place, for patches [from, to) of one image. */
-INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there_height,
-                       int there_width, const uint8_t *here, int here_width,
-                       const float (*points)[2], const float (*inverse)[2][2],
-                       const double (*began)[2], const uint8_t *inside, const double *tuning,
-                       double (*places)[2], double *variances, double (*inverses)[2][2])
+/* djet_align, for patches [from, to) of one image `gray` (height, width). */
+INLINE void align_patches(const uint8_t *gray, int64_t from, int64_t to, int height, int width,
+                          const uint8_t *current, int current_width, const float (*points)[2],
+                          const float (*inverse)[2][2], const double (*start)[2],
+                          const uint8_t *inside, const double *tuning, double (*places)[2],
+                          double *variances, double (*inverses)[2][2])
 {
-    const Image image = {there, 1, there_height, there_width};
-    const double least_noise = tuning[1], steps = tuning[2], farthest = tuning[3], fitted = 4;
+    const Image image = {gray, 1, height, width};
+    const double least_noise = tuning[1], steps = tuning[2], max_shift = tuning[3];
     for (int64_t first = from; first < to; first += LANES) {
         const int count = to - first < LANES ? (int)(to - first) : LANES;
-        double at_first[LANES][2], at[LANES][2];
+        double initial[LANES][2], position[LANES][2];
         for (int l = 0; l < LANES; l++)
             for (int axis = 0; axis < 2; axis++)
-                at[l][axis] = at_first[l][axis] = began[first + (l < count ? l : count - 1)][axis];
-        Lanes wide[ROOM * ROOM];
+                position[l][axis] = initial[l][axis] =
+                    start[first + (l < count ? l : count - 1)][axis];
+        Lanes wide[PADDED * PADDED];
         Templates expected;
-        Seen seen;
+        CurrentPatches patches;
         const float *W = inverse[first][0];
         const Lanes points_of[2] = {gathered(points[first], 2, count),
                                     gathered(points[first] + 1, 2, count)};
@@ -172,32 +189,37 @@ INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there
         sample(image, points_of, inverse_of, wide);
         make_templates(wide, (float)tuning[0], &expected);
         for (int l = 0; l < LANES; l++)
-            gather(here, here_width, at[l], l, &seen);
-        multiply(&expected, &seen);
+            gather(current, current_width, position[l], l, &patches);
+        multiply(&expected, &patches);
         for (int step = 0; step < steps; step++) {
-            follow(here, here_width, (const double (*)[2])at, &expected, &seen);
+            move_patches(current, current_width, (const double (*)[2])position, &expected,
+                         &patches);
             for (int l = 0; l < LANES; l++) {
-                const double x = at[l][0] - seen.whole[l][0], y = at[l][1] - seen.whole[l][1];
-                const double along[2] = {interpolated(&seen, 0, l, x, y),
-                                         interpolated(&seen, 1, l, x, y)};
+                const double x = position[l][0] - patches.pixel[l][0],
+                             y = position[l][1] - patches.pixel[l][1];
+                const double along[2] = {interpolated(&patches, 0, l, x, y),
+                                         interpolated(&patches, 1, l, x, y)};
                 for (int axis = 0; axis < 2; axis++) {
-                    const double to = at[l][axis] - (expected.inverse[l][axis][0] * along[0]
-                                                     + expected.inverse[l][axis][1] * along[1]);
-                    at[l][axis] = fmin(fmax(to, at_first[l][axis] - farthest),
-                                       at_first[l][axis] + farthest);
+                    const double moved = position[l][axis]
+                                         - (expected.inverse[l][axis][0] * along[0]
+                                            + expected.inverse[l][axis][1] * along[1]);
+                    position[l][axis] = fmin(fmax(moved, initial[l][axis] - max_shift),
+                                             initial[l][axis] + max_shift);
                 }
             }
         }
         for (int l = 0; l < count; l++) {
-            const int near = inside[first + l] && fabs(at[l][0] - at_first[l][0]) < farthest
-                             && fabs(at[l][1] - at_first[l][1]) < farthest;
+            const int converged = inside[first + l]
+                                  && fabs(position[l][0] - initial[l][0]) < max_shift
+                                  && fabs(position[l][1] - initial[l][1]) < max_shift;
             for (int axis = 0; axis < 2; axis++)
-                places[first + l][axis] = at[l][axis] = near ? at[l][axis] : at_first[l][axis];
+                places[first + l][axis] = position[l][axis] =
+                    converged ? position[l][axis] : initial[l][axis];
         }
-        follow(here, here_width, (const double (*)[2])at, &expected, &seen);
-        const Lanes left = left_over(&expected, &seen, (const double (*)[2])at);
+        move_patches(current, current_width, (const double (*)[2])position, &expected, &patches);
+        const Lanes left = residual_sums(&expected, &patches, (const double (*)[2])position);
         for (int l = 0; l < count; l++) {
-            const double variance = left[l] / (PIXELS - fitted);
+            const double variance = (double)left[l] / (PIXELS - PARAMETERS);
             variances[first + l] = variance > least_noise ? variance : least_noise;
             for (int axis = 0; axis < 2; axis++) {
                 inverses[first + l][axis][0] = expected.inverse[l][axis][0];
@@ -207,18 +229,18 @@ INLINE void place_some(const uint8_t *there, int64_t from, int64_t to, int there
     }
 }
 
-/* Align patches of some gray images `there` with another one, starting from `began` (n, 2),
-   where there is room for the steps. there: (I,) of one size, with `counts` patches each, in
+/* Align patches of some gray images with another one, starting from `start` (n, 2), where
+   there is room for the steps. images: (I,) of one size, with `counts` patches each, in
    order; tuning: regularisation, least noise, number of steps, and largest displacement;
    inside: (n,) those that may move. Writes positions (n, 2), variances (n,) of a pixel, and
    inverse normal matrices (n, 2, 2). */
-WIDE void djet_place(int I, const uint8_t *const *there, const int64_t *counts, int there_height,
-                     int there_width, const uint8_t *here, int here_width,
+WIDE void djet_align(int I, const uint8_t *const *images, const int64_t *counts, int height,
+                     int width, const uint8_t *current, int current_width,
                      const float (*points)[2], const float (*inverse)[2][2],
-                     const double (*began)[2], const uint8_t *inside, const double *tuning,
+                     const double (*start)[2], const uint8_t *inside, const double *tuning,
                      double (*places)[2], double *variances, double (*inverses)[2][2])
 {
     for (int64_t i = 0, first = 0; i < I; first += counts[i++])
-        place_some(there[i], first, first + counts[i], there_height, there_width, here, here_width,
-                   points, inverse, began, inside, tuning, places, variances, inverses);
+        align_patches(images[i], first, first + counts[i], height, width, current, current_width,
+                      points, inverse, start, inside, tuning, places, variances, inverses);
 }

@@ -4,22 +4,25 @@
 #include "common.h"
 
 /* Lower bound of the median squared residual. */
-static const double LEAST = 1e-18;
+static const double LEAST_MEDIAN = 1e-18;
 
 /* Relative size of an off-diagonal entry that counts as zero. */
-static const double NOTHING = 1e-20;
+static const double NEGLIGIBLE = 1e-20;
+
+/* Most sweeps over a matrix; they converge quadratically, in four or five. */
+enum { MOST_SWEEPS = 30 };
 
 /* Diagonalise a symmetric matrix (4, 4) by Jacobi rotations, and apply them to V. */
 static void diagonalise(double A[4][4], double V[4][4])
 {
-    int turned = 1;
-    for (int sweep = 0; turned && sweep < 30; sweep++) {
-        turned = 0;
+    int changed = 1;
+    for (int sweep = 0; changed && sweep < MOST_SWEEPS; sweep++) {
+        changed = 0;
         for (int p = 0; p < 4; p++)
             for (int q = p + 1; q < 4; q++) {
-                if (fabs(A[p][q]) <= NOTHING * (fabs(A[p][p]) + fabs(A[q][q])))
+                if (fabs(A[p][q]) <= NEGLIGIBLE * (fabs(A[p][p]) + fabs(A[q][q])))
                     continue;
-                turned = 1;
+                changed = 1;
                 const double theta = (A[q][q] - A[p][p]) / (2 * A[p][q]);
                 const double tangent = copysign(1.0, theta)
                                        / (fabs(theta) + sqrt(theta * theta + 1));
@@ -64,7 +67,7 @@ static void nearest_rotation(const double M[3][3], double R[3][3])
 }
 
 /* The value of a given rank, after a partial sort (Hoare's FIND). */
-static double selected(double *values, int n, int place)
+static double selected(double *values, int n, int rank)
 {
     for (int first = 0, last = n - 1; first < last;) {
         const double pivot = values[first + (last - first) / 2];
@@ -75,19 +78,19 @@ static double selected(double *values, int n, int place)
             while (values[j] > pivot)
                 j--;
             if (i <= j) {
-                const double one = values[i];
+                const double swapped = values[i];
                 values[i++] = values[j];
-                values[j--] = one;
+                values[j--] = swapped;
             }
         }
-        if (place <= j)
+        if (rank <= j)
             last = j;
-        else if (place >= i)
+        else if (rank >= i)
             first = i;
         else
             break;
     }
-    return values[place];
+    return values[rank];
 }
 
 /* Unit rays (n, 3), components first. */
@@ -122,15 +125,15 @@ WIDE void djet_fit_rotation(int n, const double (*rays_x)[3], const double (*ray
         for (int k = 0; k < n; k++) {
             squared[k] = 0;
             for (int i = 0; i < 3; i++) {
-                const double off = y[i * n + k] - (R[i][0] * x[k] + R[i][1] * x[n + k]
-                                                   + R[i][2] * x[2 * n + k]);
-                squared[k] += off * off;
+                const double residual =
+                    y[i * n + k] - (R[i][0] * x[k] + R[i][1] * x[n + k] + R[i][2] * x[2 * n + k]);
+                squared[k] += residual * residual;
             }
         }
         /* Scale by the median. */
         memcpy(ordered, squared, (size_t)n * sizeof *ordered);
         const double median = n ? selected(ordered, n, n / 2) : 0;
         for (int k = 0; k < n; k++)
-            weights[k] = 1 / (1 + squared[k] / (median > LEAST ? median : LEAST));
+            weights[k] = 1 / (1 + squared[k] / (median > LEAST_MEDIAN ? median : LEAST_MEDIAN));
     }
 }

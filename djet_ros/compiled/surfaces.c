@@ -2,23 +2,29 @@
    core/hamming.py. */
 #include "between.h"
 
-/* Limits: test points, tests, pixels from the centre of a window to the farthest test point,
+/* Limits: tests, test points, pixels from the centre of a window to the farthest test point,
    and the side of a patch. */
-enum { MOST_ENDS = 512, MOST_TESTS = 256, FARTHEST = 13 + 7, MOST_SIDE = 2 * FARTHEST + 1 };
+enum {
+    MOST_TESTS = 256,
+    MOST_ENDS = 2 * MOST_TESTS,
+    FARTHEST = 13 + 7,
+    MOST_SIDE = 2 * FARTHEST + 1
+};
 
 /* Points whose windows are computed in parallel, and the largest window. */
 enum { POINTS = 16, MOST_WINDOW = 15 };
 typedef int16_t Grades __attribute__((vector_size(POINTS * sizeof(int16_t))));
 typedef uint16_t Sums __attribute__((vector_size(POINTS * sizeof(uint16_t))));
 
-/* djet_grades_through, for patches [from, to) of one image. */
-INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int height, int width, int n,
-                       const float *inverse, const float *nearer, float max_depth_ratio,
-                       const float *points, const float *contrast, int E, const float (*ends)[2],
-                       int T, const int64_t *of_tests, int reach, int16_t *grades)
+/* djet_warped_grades, for patches [from, to) of one image. */
+INLINE void grade_patches(const int16_t *pixels, int64_t from, int64_t to, int height, int width,
+                          int n, const float *inverse, const float *nearer, float max_depth_ratio,
+                          const float *points, const float *contrast, int E,
+                          const float (*ends)[2], int T, const int64_t *of_tests, int reach,
+                          int16_t *grades)
 {
-    /* Adding and subtracting it rounds numbers far below it. */
-    const float whole = 3 << 22;
+    /* Adding and subtracting it rounds numbers far below it: floats from there on are integers. */
+    const float rounding = 3 << 22;
     const Image image = {pixels, sizeof *pixels, height, width};
     for (int64_t first = from; first < to; first += LANES) {
         const int count = to - first < LANES ? (int)(to - first) : LANES;
@@ -28,17 +34,17 @@ INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int heig
                     by_x = gathered(c, 2, count), by_y = gathered(c + 1, 2, count),
                     x = gathered(at, 2, count), y = gathered(at + 1, 2, count),
                     strength = gathered(contrast + first, 1, count);
-        Lanes seen[MOST_ENDS];
+        Lanes samples[MOST_ENDS];
         for (int e = 0; e < E; e++) {
             const float dx = ends[e][0], dy = ends[e][1];
             const Lanes depth = clipped(1 - (by_x * dx + by_y * dy), 1 / max_depth_ratio,
                                         max_depth_ratio);
-            seen[e] = between(image, x + (xx * dx + xy * dy) / depth,
-                              y + (yx * dx + yy * dy) / depth);
+            samples[e] =
+                between(image, x + (xx * dx + xy * dy) / depth, y + (yx * dx + yy * dy) / depth);
         }
         for (int t = 0; t < T; t++) {
-            const Lanes differences = (seen[of_tests[t]] - seen[of_tests[T + t]]) * strength;
-            const Lanes rounded = clipped((differences + whole) - whole, -reach, reach);
+            const Lanes differences = (samples[of_tests[t]] - samples[of_tests[T + t]]) * strength;
+            const Lanes rounded = clipped((differences + rounding) - rounding, -reach, reach);
             for (int l = 0; l < count; l++)
                 grades[(int64_t)t * n + first + l] = (int16_t)rounded[l];
         }
@@ -49,15 +55,15 @@ INLINE void grade_some(const int16_t *pixels, int64_t from, int64_t to, int heig
    inverse dy, for the test points dy. images: (I,) of one size, with `counts` patches each, in
    order; inverse: (n, 2, 2); nearer: (n, 2), 0 if negligible; contrast: (n,); ends: (E, 2)
    distinct test points; of_tests: (2, T) indices of each test. */
-WIDE void djet_grades_through(int I, const int16_t *const *images, const int64_t *counts, int height,
-                              int width, int n, const float *inverse, const float *nearer,
-                              float max_depth_ratio, const float *points, const float *contrast, int E,
-                              const float (*ends)[2], int T, const int64_t *of_tests, int reach,
-                              int16_t *grades)
+WIDE void djet_warped_grades(int I, const int16_t *const *images, const int64_t *counts,
+                             int height, int width, int n, const float *inverse,
+                             const float *nearer, float max_depth_ratio, const float *points,
+                             const float *contrast, int E, const float (*ends)[2], int T,
+                             const int64_t *of_tests, int reach, int16_t *grades)
 {
     for (int64_t i = 0, first = 0; i < I; first += counts[i++])
-        grade_some(images[i], first, first + counts[i], height, width, n, inverse, nearer,
-                   max_depth_ratio, points, contrast, E, ends, T, of_tests, reach, grades);
+        grade_patches(images[i], first, first + counts[i], height, width, n, inverse, nearer,
+                      max_depth_ratio, points, contrast, E, ends, T, of_tests, reach, grades);
 }
 
 /* Copy the patches of side x side pixels around some centres, points last. */
@@ -84,8 +90,8 @@ INLINE void add_test(const Grades *p, const Grades *q, int side, int window, Gra
             Grades grade = p[j * side + i] - q[j * side + i];
             grade = ((grade < most) & grade) | (~(grade < most) & most);
             grade = ((grade > least) & grade) | (~(grade > least) & least);
-            const Grades off = grade - reference, sign = off >> 15;
-            sums[j * window + i] += (Sums)((off ^ sign) - sign);
+            const Grades difference = grade - reference, sign = difference >> 15;
+            sums[j * window + i] += (Sums)((difference ^ sign) - sign);
         }
 }
 

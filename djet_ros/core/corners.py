@@ -125,7 +125,7 @@ def image_noise(image: Image) -> float:
 def _block_curvatures(image: Image) -> NDArray[np.int32]:
     """Return the sums (B,) of absolute mixed second differences in blocks of some rows."""
     if compiled.library is not None:
-        return compiled.curved_blocks(image, _NOISE_BLOCK, _ROW_SPACING)
+        return compiled.block_curvatures(image, _NOISE_BLOCK, _ROW_SPACING)
     first = np.arange(0, len(image) - _NOISE_BLOCK - 1, _ROW_SPACING)
     rows = image[first[:, None] + np.arange(_NOISE_BLOCK + 2)]
     curved = cv2.filter2D(rows.reshape(-1, image.shape[1]), cv2.CV_16S, _MIXED_DIFFERENCE)
